@@ -1,0 +1,207 @@
+"""From a config to the objects it names."""
+
+import importlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.config import Config, CostConfig, SystemConfig
+from lyapnet.cost import QuadraticCost
+from lyapnet.errors import UsageError
+from lyapnet.networks import NETWORKS, GoalAnchor, Scaling, TerminalAnchor
+from lyapnet.policy import POLICIES
+from lyapnet.programs import PROGRAMS, Program
+from lyapnet.rollout import Horizon, Rollout
+from lyapnet.sets import Box
+from lyapnet.systems import SYSTEMS, ControlAffineSystem, Linear
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+class Task(NamedTuple):
+    """minimise J over u(·) for every x₀ ∈ X₀."""
+
+    system: ControlAffineSystem
+    cost: QuadraticCost
+    initial_states: Box
+    horizon: Horizon
+
+
+def build_task(config: Config, system: ControlAffineSystem | None = None) -> Task:
+    """The task of a config, in its precision.
+
+    Args:
+        system: taken instead of the one that the config names.
+
+    Raises:
+        UsageError: a parameter, matrix, bound or dimension does not fit; names the section.
+    """
+    dtype = DTYPES[config.training.precision]
+    with _float64_defaults():
+        system = system or build_system(config.system)
+        with _section("initial_states"):
+            initial_states = Box(config.initial_states.lower, config.initial_states.upper)
+            _require_length("initial_states.lower", initial_states.dimension, system)
+        with _section("cost"):
+            cost = build_cost(config.cost, system)
+            cost.check(initial_states.sample(256, torch.Generator().manual_seed(0)))
+        with _section("horizon"):
+            horizon = Horizon(config.horizon.steps, config.horizon.dt)
+    return Task(system.to(dtype), cost.to(dtype), initial_states.to(dtype), horizon)
+
+
+def build_system(config: SystemConfig) -> ControlAffineSystem:
+    """The system of a config, registered or the user's own."""
+    cls = resolve(config.name, SYSTEMS, "system.name")
+    with _section(f"system.parameters of {config.name}"):
+        return cls(**config.parameters)
+
+
+def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost:
+    """The cost of a config, its shapes held against the system's."""
+    R: Any = config.R
+    if R == "inverse_mass":
+        inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
+        if inverse_mass is None:
+            raise ValueError(
+                f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} does not have; "
+                "write R as a list of rows."
+            )
+        # constant for a linear system: a matrix then, as the Riccati equation needs it
+        R = inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
+    else:
+        R = _rows(R)
+        _require_length("cost.R", len(R), system, system.m)
+    cost = QuadraticCost(_rows(config.Q), R, _rows(config.Q_T))
+    _require_length("cost.Q", len(cost.Q), system)
+    return cost
+
+
+def build_value_function(config: Config, task: Task, network: type[nn.Module] | None = None) -> nn.Module:
+    """V(t, x) with fresh weights drawn from the config's seed, in its precision.
+
+    Args:
+        network: the class taken instead of the one that the config names.
+
+    Raises:
+        UsageError: an option that the network does not have, or a value that it refuses.
+    """
+    options = config.network
+    cls = network or resolve(options.name, NETWORKS, "network.name")
+    chosen: dict[str, Any] = {
+        "hidden": options.hidden,
+        "activation": options.activation,
+        "epsilon": options.epsilon,
+        "embedded_angles": task.system.angles if options.embed_angles else None,
+    }
+    chosen = {key: value for key, value in chosen.items() if value is not None}
+    anchor = {"epsilon": chosen.pop("epsilon")} if options.name == "anchored" and options.epsilon else {}
+    accepted = inspect.signature(cls).parameters
+    for key in chosen:
+        if key not in accepted:
+            name = "embed_angles" if key == "embedded_angles" else key
+            raise UsageError(
+                f"Expected no network.{name} with {options.name}, got one; remove it or choose another network."
+            )
+    with _float64_defaults(), torch.random.fork_rng(devices=[]), _section("network"):
+        torch.manual_seed(config.seed)
+        V = cls(scaling=_scaling(config, task), **chosen)
+        if options.terminal == "exact":
+            V = TerminalAnchor(V, task.cost, task.horizon.duration)
+        if options.name == "anchored":
+            V = GoalAnchor(V, **anchor)
+    return V.to(DTYPES[config.training.precision])
+
+
+def build_rollout(config: Config, task: Task, V: nn.Module) -> Rollout:
+    """The closed loop of V under the config's control law, integrator and gradient route."""
+    options = config.rollout
+    policy = POLICIES[options.policy](task.system, task.cost, V)
+    return Rollout(
+        task.system, task.cost, policy, task.horizon, options.method, options.gradient, options.rtol, options.atol
+    )
+
+
+def build_program(config: Config) -> Program:
+    """The program of a config."""
+    options = {key: value for key, value in vars(config.program).items() if key != "name" and value is not None}
+    cls = PROGRAMS[config.program.name]
+    if "margin" in options and "margin" not in inspect.signature(cls).parameters:
+        raise UsageError("Expected no program.margin with the value program, got one; a residual has no margin.")
+    with _section("program"):
+        return cls(**options)
+
+
+def resolve(name: str, registry: Mapping[str, type], key: str) -> Any:
+    """A registered class, or the user's own from module:Class, found from the working directory.
+
+    Raises:
+        UsageError: no such module or class.
+    """
+    if name in registry:
+        return registry[name]
+    module_name, _, class_name = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        return getattr(importlib.import_module(module_name), class_name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise UsageError(
+            f"Expected {key} as one of {', '.join(registry)}, or module:Class, got {name!r} ({error}); "
+            "check the spelling and the working directory."
+        ) from error
+
+
+def _scaling(config: Config, task: Task) -> Scaling:
+    extent = task.initial_states.magnitude.double()
+    scale = config.network.state_scale or [v if v > 0 else 1.0 for v in extent.tolist()]
+    _require_length("network.state_scale", len(scale), task.system)
+    if not min(scale) > 0:
+        raise ValueError(f"Expected state_scale > 0, got {scale}; give the magnitude each state reaches.")
+    value = config.network.value_scale
+    if value is None:
+        state = torch.tensor(scale, dtype=torch.float64)
+        value = float(state @ task.cost.Q_T.double() @ state) or 1.0
+    return Scaling(scale, task.horizon.duration, value)
+
+
+def _rows(matrix: Any) -> Any:
+    """A flat list of numbers as the diagonal matrix it stands for."""
+    if isinstance(matrix, list | tuple) and all(isinstance(v, int | float) for v in matrix):
+        return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
+    return matrix
+
+
+def _require_length(key: str, length: int, system: ControlAffineSystem, expected: int | None = None) -> None:
+    expected = system.n if expected is None else expected
+    if length != expected:
+        names = ", ".join(system.state_names if expected == system.n else system.control_names)
+        raise UsageError(f"Expected {key} with {expected} entries ({names}), got {length}; give one for each.")
+
+
+@contextmanager
+def _section(name: str):
+    """Name the config's section in what a constructor refuses."""
+    try:
+        yield
+    except UsageError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise UsageError(f"{name}: {error}") from error
+
+
+@contextmanager
+def _float64_defaults():
+    """Build in float64 whatever the precision, so that float32 runs start from the rounded float64 weights."""
+    previous = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(previous)

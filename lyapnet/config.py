@@ -1,0 +1,293 @@
+"""The schema of an experiment: one dataclass a section, one sentence a field; and its loading, with clear refusals.
+
+A YAML file lists only what differs from these defaults; `key.sub=value` on the command line comes last.
+"""
+
+import dataclasses
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from lyapnet.errors import UsageError
+from lyapnet.networks import ACTIVATIONS, NETWORKS
+from lyapnet.policy import POLICIES
+from lyapnet.programs import PROGRAMS
+from lyapnet.rollout import GRADIENTS, METHODS
+from lyapnet.systems import SYSTEMS
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    choices: Sequence[str] = (),
+    user_class: bool = False,
+    above: float | None = None,
+    at_least: float | None = None,
+) -> Any:
+    """A field with its sentence and the values it admits; `user_class` also admits module:Class."""
+    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "above": above, "at_least": at_least}
+    if isinstance(default, list | dict):
+        return field(default_factory=lambda: type(default)(default), metadata=rule)
+    return field(default=default, metadata=rule)
+
+
+@dataclass
+class ProgramConfig:
+    """What is minimised; see Program for the loss and its units."""
+
+    name: str = option(MISSING, "The value program or the Lyapunov program.", choices=tuple(PROGRAMS))
+    constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
+    terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
+    trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
+    normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
+    margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
+
+
+@dataclass
+class SystemConfig:
+    """The dynamics ẋ = f(x) + g(x)u."""
+
+    name: str = option(
+        MISSING, "A registered system, or module:Class of your own.", choices=tuple(SYSTEMS), user_class=True
+    )
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor, in SI units.")
+
+
+@dataclass
+class CostConfig:
+    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal, a list of rows a matrix."""
+
+    Q: Any = option(MISSING, "State weight, symmetric positive semidefinite.")
+    R: Any = option(MISSING, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
+    Q_T: Any = option(MISSING, "Terminal weight, symmetric positive semidefinite.")
+
+
+@dataclass
+class InitialStatesConfig:
+    """X₀, the box of initial states."""
+
+    lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
+    upper: list[float] = option(MISSING, "Upper bounds, one for each state.")
+
+
+@dataclass
+class HorizonConfig:
+    """N steps of Δt."""
+
+    steps: int = option(MISSING, "N, the number of time steps.", at_least=1)
+    dt: float = option(0.01, "Δt in seconds.", above=0)
+
+
+@dataclass
+class NetworkConfig:
+    """V(t, x). Fields left at null take the network's own default."""
+
+    name: str = option(
+        MISSING, "A registered network, or module:Class of your own.", choices=tuple(NETWORKS), user_class=True
+    )
+    hidden: list[int] | None = option(None, "Widths of the hidden layers.")
+    activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
+    embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
+    epsilon: float | None = option(None, "ε of the lower bound V ≥ ε‖x‖² (icnn, anchored).", above=0)
+    terminal: str = option("free", "exact builds V(T, ·) = φ in (for anchored: φ + ε‖x‖²).", choices=("free", "exact"))
+    state_scale: list[float] | None = option(None, "Expected |x|; null: the extent of X₀, and 1 where it has none.")
+    value_scale: float | None = option(None, "Expected V; null: φ at the state scale.", above=0)
+
+
+@dataclass
+class RolloutConfig:
+    """How the closed loop is integrated and differentiated; see Rollout."""
+
+    policy: str = option("hjb", "The control law that V defines.", choices=tuple(POLICIES))
+    method: str = option("euler", "The integrator.", choices=METHODS)
+    gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
+    rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
+    atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
+
+
+@dataclass
+class TrainingConfig:
+    """The optimisation."""
+
+    iterations: int = option(200, "Gradient steps.", at_least=1)
+    batch_size: int = option(64, "Initial states in each step, per process.", at_least=1)
+    optimizer: str = option("adam", "adam, or adamw with decoupled weight decay.", choices=("adam", "adamw"))
+    learning_rate: float = option(1e-2, "Step size at the start.", above=0)
+    final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
+    betas: list[float] = option([0.9, 0.99], "Adam's averaging of the gradient and of its square.")
+    weight_decay: float = option(0.0, "Of the optimiser.", at_least=0)
+    precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
+    validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
+
+
+@dataclass
+class EvaluationConfig:
+    """What is measured on states that training never sees."""
+
+    validation_states: int = option(64, "States of each validation.", at_least=1)
+    test_states: int = option(256, "States of the table at the end of training.", at_least=1)
+    figures_every: int = option(5, "Validations between figures in TensorBoard; the last one always draws.", at_least=1)
+
+
+@dataclass
+class Config:
+    """One experiment."""
+
+    experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.")
+    logs: str = option("logs", "The folder of all runs.")
+    seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0)
+    program: ProgramConfig = field(default_factory=ProgramConfig)
+    system: SystemConfig = field(default_factory=SystemConfig)
+    cost: CostConfig = field(default_factory=CostConfig)
+    initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
+    horizon: HorizonConfig = field(default_factory=HorizonConfig)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The config of a YAML file with `key.sub=value` overrides.
+
+    Raises:
+        UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
+    """
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"Expected a config file, got {str(path)!r} ({error.strerror}); see conf/.") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
+    if not isinstance(content, Mapping):
+        raise UsageError(f"Expected sections in {str(path)!r}, got {type(content).__name__}; see conf/ for an example.")
+    return config_from_plain(content, overrides)
+
+
+def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
+    """The config of plain nested dictionaries, checked like a file.
+
+    Raises:
+        UsageError: as load_config.
+    """
+    for override in overrides:
+        if "=" not in override.lstrip("="):
+            raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
+    try:
+        layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
+        for layer in layers:
+            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), Config, "")
+        merged = OmegaConf.merge(OmegaConf.structured(Config), *layers)
+        config = OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise UsageError(_explain(error)) from error
+    except yaml.YAMLError as error:
+        raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
+    assert isinstance(config, Config)
+    _check_values(config)
+    return config
+
+
+def to_plain(config: Config) -> dict[str, Any]:
+    """The config as nested dictionaries, lists, numbers and strings, as a checkpoint holds it."""
+    return dataclasses.asdict(config)
+
+
+def to_yaml(config: Config) -> str:
+    """The resolved config as YAML."""
+    return yaml.safe_dump(to_plain(config), sort_keys=False, allow_unicode=True)
+
+
+def differing_keys(one: Config, other: Config) -> list[str]:
+    """Full names of the fields in which two configs differ."""
+    a, b = dict(_leaves(to_plain(one))), dict(_leaves(to_plain(other)))
+    return [key for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)]
+
+
+def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _refuse_unknown_keys(content: Any, schema: type, prefix: str) -> None:
+    known = {f.name: f for f in dataclasses.fields(schema)}
+    for key, value in content.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5) or _same_name_elsewhere(str(key))
+            hint = (
+                f"did you mean {near[0] if '.' in near[0] else prefix + near[0]}" if near else "see lyapnet/config.py"
+            )
+            raise UsageError(
+                f"Expected one of {', '.join(known)}, got unknown key {prefix}{key}; {hint}?".replace("py?", "py")
+            )
+        section = known[key].type
+        if isinstance(section, type) and dataclasses.is_dataclass(section):
+            if not isinstance(value, Mapping):
+                names = ", ".join(f.name for f in dataclasses.fields(section))
+                raise UsageError(
+                    f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
+                )
+            _refuse_unknown_keys(value, section, f"{prefix}{key}.")
+
+
+def _same_name_elsewhere(key: str) -> list[str]:
+    """The full name of a field of that name in some section: for a key written one level too high."""
+    return [
+        f"{section.name}.{key}"
+        for section in dataclasses.fields(Config)
+        if isinstance(section.type, type) and dataclasses.is_dataclass(section.type)
+        if key in {f.name for f in dataclasses.fields(section.type)}
+    ]
+
+
+def _explain(error: OmegaConfBaseException) -> str:
+    key = error.full_key or "a key"
+    kind = getattr(error.ref_type, "__name__", str(error.ref_type)).replace("typing.", "")
+    for section in dataclasses.fields(Config):
+        if isinstance(section.type, type) and dataclasses.is_dataclass(section.type):
+            for f in dataclasses.fields(section.type):
+                if key.split("[")[0] == f"{section.name}.{f.name}":
+                    kind = getattr(f.type, "__name__", str(f.type)) if not hasattr(f.type, "__args__") else str(f.type)
+        elif key == section.name:
+            kind = getattr(section.type, "__name__", str(section.type))
+    got = str(error).splitlines()[0]
+    if "mandatory" in got.lower() or "missing" in got.lower():
+        return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
+    return f"Expected {key} as {kind}, got: {got}; correct its value."
+
+
+def _check_values(config: Any, prefix: str = "") -> None:
+    """Hold every field against the rule it was declared with."""
+    for f in dataclasses.fields(config):
+        key, value = f"{prefix}{f.name}", getattr(config, f.name)
+        if dataclasses.is_dataclass(value):
+            _check_values(value, f"{key}.")
+        elif f.metadata and value is not None:
+            _check_value(key, value, f.metadata)
+
+
+def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
+    choices = rule["choices"]
+    if choices and value not in choices and not (rule["user_class"] and ":" in value):
+        near = difflib.get_close_matches(str(value), choices, n=1)
+        hint = f"did you mean {near[0]}?" if near else "choose one of them."
+        own = ", or module:Class" if rule["user_class"] else ""
+        raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
+    for bound, symbol, holds in (
+        (rule["above"], ">", lambda v, b: b < v < float("inf")),
+        (rule["at_least"], "≥", lambda v, b: b <= v < float("inf")),
+    ):
+        if bound is not None and not holds(value, bound):
+            raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")

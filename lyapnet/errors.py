@@ -1,0 +1,21 @@
+"""What lyapnet raises for its users: one line that says what was expected, what came, what to do."""
+
+
+class LyapnetError(Exception):
+    """A failure with a message meant for the user; the command line prints it and exits with `exit_status`."""
+
+    exit_status = 1
+
+
+class UsageError(LyapnetError, ValueError):
+    """The request itself cannot be met: a misspelt key, a missing file, an impossible combination."""
+
+    exit_status = 2
+
+
+class CheckpointError(LyapnetError):
+    """A checkpoint cannot be read, written, or used for what was asked."""
+
+
+class DivergenceError(LyapnetError):
+    """A rollout, a loss term or a gradient left the finite numbers."""

@@ -1,0 +1,33 @@
+"""TensorBoard event files of a run that resumes."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
+from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+
+def drop_events_after(folder: Path, step: int) -> None:
+    """Remove what a run logged after a step, so that going on from that step logs nothing twice.
+
+    The final metrics (tags hp/ and _hparams_) go too: the end of the run writes them again.
+    """
+    for path in event_files(folder):
+        kept = [record for record in RawEventFileLoader(str(path)).Load() if _keep(Event.FromString(record), step)]
+        temporary = path.with_name(f".{path.name}.tmp")
+        with temporary.open("wb") as file:
+            records = RecordWriter(file)
+            for record in kept:
+                records.write(record)
+        temporary.replace(path)
+
+
+def event_files(folder: Path) -> Iterator[Path]:
+    """The event files of a run, oldest first."""
+    yield from sorted(folder.glob("events.out.tfevents.*"))
+
+
+def _keep(event: Event, step: int) -> bool:
+    final = any(value.tag.startswith(("hp/", "_hparams_")) for value in event.summary.value)
+    return event.step <= step and not final

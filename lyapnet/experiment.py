@@ -1,0 +1,270 @@
+"""A run: its folder, its trainer, its end; started, resumed, or fine-tuned from another one."""
+
+import inspect
+import json
+import logging
+import os
+import platform
+import subprocess
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from rich.console import Console
+
+import lyapnet
+from lyapnet.build import build_task, resolve
+from lyapnet.callbacks import (
+    LAST,
+    AtomicCheckpointIO,
+    Checkpoints,
+    FigureLogger,
+    ScalarLogger,
+    Stopwatch,
+    TrainingProgress,
+)
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.config import Config, differing_keys, load_config, to_plain, to_yaml
+from lyapnet.controller import config_of, load, load_value_function
+from lyapnet.data import InitialStateDataModule
+from lyapnet.errors import DivergenceError, LyapnetError, UsageError
+from lyapnet.evaluation import evaluate
+from lyapnet.events import drop_events_after, event_files
+from lyapnet.modules import MODULES, ProgramModule
+from lyapnet.networks import NETWORKS
+
+EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
+TRAINER_OPTIONS = (
+    "accelerator", "strategy", "devices", "num_nodes", "gradient_clip_val", "gradient_clip_algorithm",
+    "deterministic", "benchmark", "detect_anomaly", "profiler",
+)  # fmt: skip
+CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every")
+
+
+@dataclass(frozen=True)
+class Run:
+    """The folder of one run: config.yaml, run.json, evaluation.json, checkpoints/ and TensorBoard's event files."""
+
+    folder: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where last.ckpt and best.ckpt are."""
+        return self.folder / "checkpoints"
+
+    @property
+    def last(self) -> Path:
+        """The newest checkpoint."""
+        return self.checkpoints / f"{LAST}.ckpt"
+
+    @property
+    def best(self) -> Path:
+        """The checkpoint of the least validation loss."""
+        return self.checkpoints / "best.ckpt"
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run reached its end."""
+        return (self.folder / EVALUATION).is_file()
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do: in which run's folder, and from which checkpoint if any."""
+
+    path: Path  # of the config file
+    config: Config
+    run: Run
+    resume_from: Path | None = None
+    finetune_from: Path | None = None
+
+
+def plan_run(path: Path | None, overrides: list[str], resume: str | None = None, finetune: Path | None = None) -> Plan:
+    """Read the config and decide the run's folder; nothing is written but the folder of a new run.
+
+    Raises:
+        UsageError: config and checkpoint contradict each other, or there is nothing to resume.
+        LyapnetError: the folder of a new run cannot be made.
+    """
+    if resume and finetune:
+        raise UsageError("Expected --resume or --finetune, got both; resume goes on, finetune starts a new run.")
+    if path is None:
+        raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
+    config = load_config(path, overrides)
+    _check_trainer_options(config)
+    if not resume:
+        build_task(config)  # refuse an impossible task before its folder exists
+        return Plan(path, config, _new_run(config), finetune_from=finetune)
+    run = _last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
+    checkpoint = run.last if resume == LAST else Path(resume)
+    if resume == LAST and not checkpoint.exists():
+        return Plan(path, config, run)  # stopped before its first checkpoint: the beginning is where it stands
+    _require_same_experiment(config, config_of(read_checkpoint(checkpoint)), checkpoint)
+    return Plan(path, config, run, resume_from=checkpoint)
+
+
+def fit(plan: Plan, console: Console) -> dict[str, Any]:
+    """Train to the end of the config's iterations; the evaluation of the best checkpoint.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM, after saving.
+        DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
+        LyapnetError: a checkpoint or event file cannot be read or written.
+    """
+    config, run = plan.config, plan.run
+    _quiet()
+    task = build_task(config)
+    module = MODULES[config.program.name](config, task)
+    if plan.finetune_from:
+        load_value_function(module.V, read_checkpoint(plan.finetune_from), plan.finetune_from)
+    data = InitialStateDataModule(
+        task.initial_states, config.training.batch_size, config.evaluation.validation_states, config.seed
+    )
+    trainer = _trainer(config, run, console)
+    if trainer.is_global_zero:
+        _prepare_folder(plan)
+    console.print(f"[bold]{config.experiment}[/]  {run.folder}", highlight=False)
+    try:
+        torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
+        trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
+    except DivergenceError as error:
+        kept = f" Kept: {run.last}." if run.last.exists() else ""
+        raise DivergenceError(f"{error}{kept}") from error
+    if not trainer.is_global_zero:
+        return {}
+    return _finish(trainer, module, plan)
+
+
+def _finish(trainer: L.Trainer, module: ProgramModule, plan: Plan) -> dict[str, Any]:
+    """Evaluate the best checkpoint, log it as the run's final metrics, and mark the run as finished."""
+    config, run = plan.config, plan.run
+    network = resolve(config.network.name, NETWORKS, "network.name")
+    controller = load(run.best, system=module.task.system, network=network)
+    result = evaluate(controller, config.evaluation.test_states, config.seed)
+    metrics = {f"hp/{key}": value for key, value in result.items() if isinstance(value, float)}
+    assert isinstance(trainer.logger, TensorBoardLogger)
+    trainer.logger.log_hyperparams(to_plain(config), metrics, step=trainer.global_step)
+    trainer.logger.finalize("success")
+    (run.folder / EVALUATION).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return result
+
+
+def _trainer(config: Config, run: Run, console: Console) -> L.Trainer:
+    training = config.training
+    return L.Trainer(
+        max_epochs=training.iterations,  # an epoch is one step
+        check_val_every_n_epoch=training.validate_every,
+        log_every_n_steps=1,
+        num_sanity_val_steps=0,
+        inference_mode=False,  # V_x needs gradients in validation too
+        enable_model_summary=False,
+        use_distributed_sampler=False,  # each process has a stream of its own
+        default_root_dir=run.folder,
+        logger=TensorBoardLogger(run.folder.parent, name="", version=run.folder.name, default_hp_metric=False),
+        callbacks=[
+            Stopwatch(),
+            ScalarLogger(),
+            FigureLogger(training.validate_every * config.evaluation.figures_every),
+            TrainingProgress(console),
+            Checkpoints(run.checkpoints, training.validate_every),
+        ],
+        plugins=[AtomicCheckpointIO()],
+        **{"accelerator": "cpu", "devices": 1, **config.trainer},
+    )
+
+
+def _prepare_folder(plan: Plan) -> None:
+    """Write what the run is; take back what it logged after the point from which it goes on."""
+    folder = plan.run.folder
+    (folder / EVALUATION).unlink(missing_ok=True)
+    (folder / "config.yaml").write_text(to_yaml(plan.config), encoding="utf-8")
+    if plan.resume_from:
+        drop_events_after(folder, int(read_checkpoint(plan.resume_from)["global_step"]))
+        return
+    for path in event_files(folder):
+        path.unlink()
+    (folder / "run.json").write_text(json.dumps(_provenance(plan), indent=2) + "\n", encoding="utf-8")
+
+
+def _provenance(plan: Plan) -> dict[str, Any]:
+    return {
+        "seed": plan.config.seed,
+        "finetuned_from": str(plan.finetune_from) if plan.finetune_from else None,
+        "lyapnet": lyapnet.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "lightning": L.__version__,
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """The commit of lyapnet's own source tree, where it is one."""
+    try:
+        here = Path(__file__).parent
+        git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return git.stdout.strip()
+
+
+def _new_run(config: Config) -> Run:
+    if int(os.environ.get("LOCAL_RANK", "0")) > 0:  # a further process of a run whose folder the first one made
+        return _last_run(config)
+    root = Path(config.logs) / config.experiment
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        version = max((v for v, _ in _versions(root)), default=-1) + 1
+        folder = root / f"version_{version}"
+        folder.mkdir()
+    except OSError as error:
+        raise LyapnetError(
+            f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
+        ) from error
+    return Run(folder)
+
+
+def _last_run(config: Config) -> Run:
+    root = Path(config.logs) / config.experiment
+    runs = sorted(_versions(root))
+    if not runs:
+        raise UsageError(f"Expected a run to resume in {str(root)!r}, got none; start one without --resume.")
+    return Run(runs[-1][1])
+
+
+def _versions(root: Path) -> list[tuple[int, Path]]:
+    numbered = [(path.name.removeprefix("version_"), path) for path in root.glob("version_*")]
+    return [(int(number), path) for number, path in numbered if number.isdigit()]
+
+
+def _require_same_experiment(config: Config, stored: Config, checkpoint: Path) -> None:
+    changed = [key for key in differing_keys(config, stored) if not key.startswith(CHANGEABLE_ON_RESUME)]
+    if changed:
+        raise UsageError(
+            f"Expected the config of {str(checkpoint)!r}, got another {', '.join(changed)}; resuming continues the "
+            "same run: undo the change, or start a new run with --finetune."
+        )
+
+
+def _check_trainer_options(config: Config) -> None:
+    known = set(inspect.signature(L.Trainer).parameters)
+    for key in config.trainer:
+        if key not in TRAINER_OPTIONS:
+            owner = "lyapnet sets it itself" if key in known else "lightning.Trainer does not know it"
+            raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got {key}; {owner}.")
+
+
+def _quiet() -> None:
+    """Lightning's notes that are wrong here: one epoch is one step, and drawing states needs no workers."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for message in (
+        ".*LeafSpec.*",
+        ".*does not have many workers.*",
+        ".*exists and is not empty.*",
+        ".*dirpath has changed.*",
+    ):
+        warnings.filterwarnings("ignore", message)

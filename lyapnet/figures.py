@@ -1,0 +1,237 @@
+"""Tables drawn as matplotlib figures: what a controller does, and where its condition holds."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from torch import Tensor
+
+from lyapnet.programs.terms import hinge
+from lyapnet.rollout import Rollout, Trajectory
+from lyapnet.sets import Box
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.types import State, Value
+
+# Okabe and Ito's colours, which colour-blind readers can tell apart.
+BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
+
+
+class Slice(NamedTuple):
+    """A grid in X₀ over its widest components, the others at the centre."""
+
+    axes: Sequence[int]  # one or two state indices
+    grid: Sequence[Tensor]  # the coordinates along each axis
+    states: State  # (b, n), the last axis running fastest
+
+
+def widest_slice(initial_states: Box, points: int) -> Slice:
+    """The slice of X₀ through its centre along its two widest components, or its only one that is not fixed."""
+    widths = initial_states.widths
+    axes = [int(i) for i in widths.argsort(descending=True, stable=True)[:2] if widths[i] > 0]
+    axes = sorted(axes) or [0]
+    middles = (
+        torch.arange(points).to(widths) + 0.5
+    ) / points  # of equal cells, so that a share of cells is a share of X₀
+    grid = [initial_states.lower[i] + widths[i] * middles for i in axes]
+    mesh = torch.meshgrid(*grid, indexing="ij")
+    states = initial_states.center.repeat(mesh[0].numel(), 1)
+    states[:, axes] = torch.stack([component.flatten() for component in mesh], -1)
+    return Slice(axes, grid, states)
+
+
+def certified_region(
+    V: Value, rollout: Rollout, system: ControlAffineSystem, initial_states: Box, tolerance: float = 1e-2
+) -> Figure:
+    """Which initial states of a slice of X₀ satisfy the Lyapunov condition along their whole closed loop.
+
+    The condition is the paper's, on samples: Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ tolerance · V(0, x₀). Level sets of
+    V(0, ·) and some closed-loop trajectories are drawn over it; with one free component, the sum itself.
+    """
+    region = widest_slice(initial_states, 41 if _free_components(initial_states) > 1 else 101)
+    with torch.no_grad():
+        trajectory = rollout(region.states)
+        values = V(trajectory.t[:, None], trajectory.x)
+    violation = hinge(values, trajectory.step_cost)
+    holds = violation <= tolerance * values[0]
+    share = float(holds.double().mean())
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(
+        f"holds on {share:.1%} of {len(holds)} states: Σₙ max(ΔVₙ + Δt ℓₙ, 0) ≤ {tolerance:.0%} of V(0, x₀)",
+        fontsize=8,
+    )
+    if len(region.axes) == 1:
+        _draw_line_region(figure, axes, region, system, violation, values[0], tolerance)
+    else:
+        _draw_plane_region(figure, axes, region, system, initial_states, holds, values[0], trajectory)
+    return figure
+
+
+def _draw_plane_region(
+    figure: Figure,
+    axes: Axes,
+    region: Slice,
+    system: ControlAffineSystem,
+    initial_states: Box,
+    holds: Tensor,
+    V0: Tensor,
+    trajectory: Trajectory,
+) -> None:
+    first, second = (_numpy(g) for g in region.grid)
+    shape = (len(first), len(second))
+    levels = ["#F4C9A8", "#CFE6F3"]
+    axes.pcolormesh(
+        first, second, _numpy(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
+        shading="nearest", rasterized=True,
+    )  # fmt: skip
+    contour = axes.contour(first, second, _numpy(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
+    axes.clabel(contour, fontsize=7, fmt="%.3g")
+    i, j = region.axes
+    corners = _spread(region)
+    paths = _numpy(trajectory.x[:, corners])
+    axes.plot(paths[..., i], paths[..., j], color=BLUE, linewidth=1)
+    axes.plot(paths[0, :, i], paths[0, :, j], "o", color=BLUE, markersize=3)
+    axes.plot(0, 0, "*", color=VERMILION, markersize=10)
+    (left, bottom), (width, height) = (
+        side[region.axes].tolist() for side in (initial_states.lower, initial_states.widths)
+    )
+    outline = axes.add_patch(
+        Rectangle((left, bottom), width, height, fill=False, edgecolor="black", linewidth=0.8, label="X₀")
+    )
+    axes.set_xlabel(state_label(system, i))
+    axes.set_ylabel(state_label(system, j))
+    axes.set_title(_others_at_center(system, initial_states, region.axes), fontsize=7, loc="right", y=-0.16, color=GREY)
+    handles: list[Artist] = [
+        outline,
+        Patch(color=levels[1], label="holds"),
+        Patch(color=levels[0], label="does not hold"),
+    ]
+    handles += axes.plot([], [], color=GREY, linewidth=0.8, label="level sets of V(0, x)")
+    handles += axes.plot([], [], color=BLUE, linewidth=1, label="closed loop")
+    handles += axes.plot([], [], "*", color=VERMILION, label="goal")
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=7, frameon=False, columnspacing=1)
+
+
+def _draw_line_region(
+    figure: Figure,
+    axes: Axes,
+    region: Slice,
+    system: ControlAffineSystem,
+    violation: Tensor,
+    V0: Tensor,
+    tolerance: float,
+) -> None:
+    x = _numpy(region.grid[0])
+    relative = torch.where(V0 > 0, violation / V0, torch.inf)
+    axes.semilogy(x, np.clip(_numpy(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
+    axes.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1, label="tolerance")
+    axes.set_xlabel(state_label(system, region.axes[0]))
+    axes.set_ylabel("summed violation / V(0, x₀)", color=BLUE)
+    twin = axes.twinx()
+    twin.plot(x, _numpy(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
+    twin.set_ylabel("V(0, x₀) (cost)", color=ORANGE)
+    figure.legend(loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+
+
+def trajectories(V: Value, trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
+    """States, controls, and V with the cost still to come, over time, of a batch (b,) of closed loops."""
+    with torch.no_grad():
+        values = V(trajectory.t[:, None], trajectory.x)
+    to_go = trajectory.cost - trajectory.running_cost
+    t = _numpy(trajectory.t)
+    curves = [(state_label(system, i), _numpy(trajectory.x[..., i]), BLUE) for i in range(system.n)]
+    curves += [(control_label(system, i), _numpy(trajectory.u[..., i]), GREEN) for i in range(system.m)]
+    columns = 1 if len(curves) < 4 else 2
+    rows = -(-(len(curves) + 1) // columns)
+    figure = Figure(figsize=(4.8 * columns, 1.6 * rows + 0.4), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    panels = list(grid.flatten(order="F"))
+    for panel, (label, values_over_time, color) in zip(panels, curves, strict=False):
+        panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
+        panel.axhline(0, color=GREY, linewidth=0.6, linestyle=":")
+        panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
+    last = panels[len(curves)]
+    for name, paths, style in (
+        ("cost to go", to_go, {"color": ORANGE}),
+        ("V(t, x)", values, {"color": BLUE, "ls": "--"}),
+    ):
+        lines = last.plot(t, _numpy(paths), linewidth=0.9, **style)
+        lines[0].set_label(name)
+    last.set_ylabel("cost", fontsize=8)
+    last.legend(fontsize=7, frameon=False)
+    for spare in panels[len(curves) + 1 :]:
+        spare.set_visible(False)
+    for panel in panels:
+        panel.tick_params(labelsize=7)
+    for column in grid.T:
+        lowest = [panel for panel in column if panel.get_visible()][-1]
+        lowest.set_xlabel("time (s)", fontsize=8)
+        lowest.tick_params(labelbottom=True)
+    return figure
+
+
+def value_slices(V: Value, system: ControlAffineSystem, initial_states: Box, duration: float) -> Figure:
+    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon."""
+    region = widest_slice(initial_states, 61)
+    times = [0.0, duration / 2, 0.95 * duration]
+    with torch.no_grad():
+        values = [V(torch.tensor(t).to(region.states), region.states) for t in times]
+    figure = Figure(figsize=(9, 3.1), layout="constrained")
+    if len(region.axes) == 1:
+        axes = figure.subplots()
+        for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN), strict=True):
+            axes.plot(_numpy(region.grid[0]), _numpy(value), color=color, label=f"t = {t:.2f} s")
+        axes.set_xlabel(state_label(system, region.axes[0]))
+        axes.set_ylabel("V(t, x) (cost)")
+        axes.legend(frameon=False)
+        return figure
+    first, second = (_numpy(g) for g in region.grid)
+    panels = figure.subplots(1, 3, sharey=True)
+    for panel, t, value in zip(panels, times, values, strict=True):
+        surface = _numpy(value).reshape(len(first), len(second)).T
+        filled = panel.contourf(first, second, surface, levels=12, cmap="cividis")
+        figure.colorbar(filled, ax=panel)
+        panel.set_title(f"V(t, x) at t = {t:.2f} s", fontsize=9)
+        panel.set_xlabel(state_label(system, region.axes[0]))
+    panels[0].set_ylabel(state_label(system, region.axes[1]))
+    return figure
+
+
+def state_label(system: ControlAffineSystem, index: int) -> str:
+    """A state's name and unit, for an axis."""
+    return _with_unit(system.state_names[index], system.state_units[index])
+
+
+def control_label(system: ControlAffineSystem, index: int) -> str:
+    """A control's name and unit, for an axis."""
+    return _with_unit(system.control_names[index], system.control_units[index])
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name
+
+
+def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Sequence[int]) -> str:
+    center = initial_states.center.tolist()
+    return ", ".join(f"{system.state_names[i]} = {center[i]:.3g}" for i in range(system.n) if i not in axes)
+
+
+def _spread(region: Slice) -> list[int]:
+    """Flat indices of a few states along the slice's border and middle."""
+    a, b = (len(g) - 1 for g in region.grid)
+    places = [(0, 0), (0, b), (a, 0), (a, b), (0, b // 2), (a, b // 2), (a // 2, 0), (a // 2, b)]
+    return [i * (b + 1) + j for i, j in places]
+
+
+def _free_components(box: Box) -> int:
+    return int((box.widths > 0).sum())
+
+
+def _numpy(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()

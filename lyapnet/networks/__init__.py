@@ -1,0 +1,28 @@
+"""Networks for V(t, x); a new one is a module that takes `scaling` and options, and one line here.
+
+The options are the fields of the config's network section that the constructor names.
+"""
+
+from torch import nn
+
+from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
+from lyapnet.networks.base import ACTIVATIONS, Scaling
+from lyapnet.networks.fcn import FCN
+from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
+
+NETWORKS: dict[str, type[nn.Module]] = {
+    "fcn": FCN,
+    "icnn": ICNN,
+    "anchored": PartiallyConvexNetwork,  # inside a GoalAnchor
+}
+
+__all__ = [
+    "ACTIVATIONS",
+    "FCN",
+    "ICNN",
+    "NETWORKS",
+    "GoalAnchor",
+    "PartiallyConvexNetwork",
+    "Scaling",
+    "TerminalAnchor",
+]

@@ -1,0 +1,58 @@
+"""Control laws that a value function defines."""
+
+import torch
+from torch import nn
+
+from lyapnet.calculus import gradients, input_lie_derivative, state_gradient
+from lyapnet.cost import QuadraticCost
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.types import Control, State, Time
+
+
+class HJBPolicy(nn.Module):
+    """u*(t, x) = argmin_u H(x, u, V_x) = −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+
+    def __init__(self, system: ControlAffineSystem, cost: QuadraticCost, V: nn.Module):
+        super().__init__()
+        self.system, self.cost, self.V = system, cost, V
+
+    def forward(self, t: Time, x: State) -> Control:
+        LgV = input_lie_derivative(self.system, x, state_gradient(self.V, t, x))
+        return -0.5 * self.cost.solve_R(x, LgV)
+
+
+class SontagPolicy(nn.Module):
+    """Sontag's universal formula, weighted by the cost: with a = V_t + LfV, b = LgV and σ = bᵀR⁻¹b,
+
+        u = −(a + √(a² + qσ))/σ · R⁻¹b,   and 0 where b = 0,
+
+    so that V̇ = −√(a² + qσ) wherever b ≠ 0: V decreases for every control-Lyapunov function V, however far from
+    the value function. With the true value function it is the HJB policy.
+
+    Sources: Sontag, "A 'universal' construction of Artstein's theorem on nonlinear stabilization", Systems & Control
+    Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
+    function and receding horizon perspective", Asian Journal of Control 1999 (this form).
+    """
+
+    def __init__(self, system: ControlAffineSystem, cost: QuadraticCost, V: nn.Module):
+        super().__init__()
+        self.system, self.cost, self.V = system, cost, V
+
+    def forward(self, t: Time, x: State) -> Control:
+        V_t, V_x = gradients(self.V, t, x)
+        LgV = input_lie_derivative(self.system, x, V_x)
+        direction = self.cost.solve_R(x, LgV)
+        a = V_t + (V_x * self.system.f(x)).sum(-1)
+        q = self.cost.state(x)
+        sigma = (LgV * direction).sum(-1)
+        # √ has no derivative at 0, which the goal reaches: keep its argument positive
+        root = torch.sqrt(a**2 + q * sigma + torch.finfo(x.dtype).tiny)
+        # Where a < 0 the quotient is q/(root − a), which stays finite as σ → 0; each branch guards the other's zero.
+        falling = a < 0
+        gain_falling = q / torch.where(falling, root - a, 1.0)
+        gain_rising = (a + root) / torch.where(falling | (sigma <= 0), 1.0, sigma)
+        gain = torch.where(falling, gain_falling, torch.where(sigma > 0, gain_rising, 0.0))
+        return -gain[..., None] * direction
+
+
+POLICIES: dict[str, type[HJBPolicy] | type[SontagPolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy}

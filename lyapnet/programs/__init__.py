@@ -1,0 +1,9 @@
+"""The two programs of the paper, with the terms that make them stronger."""
+
+from lyapnet.programs.base import Program, ProgramOutput
+from lyapnet.programs.lyapunov import LyapunovProgram
+from lyapnet.programs.value import ValueProgram
+
+PROGRAMS: dict[str, type[Program]] = {"value": ValueProgram, "lyapunov": LyapunovProgram}
+
+__all__ = ["PROGRAMS", "LyapunovProgram", "Program", "ProgramOutput", "ValueProgram"]

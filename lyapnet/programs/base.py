@@ -1,0 +1,92 @@
+"""What a program is: named, weighted terms of V along the closed loop."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.errors import DivergenceError
+from lyapnet.rollout import Trajectory
+from lyapnet.types import PerState, Value, ValuePath
+
+
+class ProgramOutput(NamedTuple):
+    """One evaluation of a program on a batch; every entry is a mean over the batch."""
+
+    loss: Float[Tensor, ""]  # what is minimised
+    terms: dict[str, Float[Tensor, ""]]  # each term before its weight
+    constraint_loss: Float[Tensor, ""]  # the paper's mean sum, without weight, margin or normalisation
+    trajectory_cost: Float[Tensor, ""]  # mean J_N
+
+
+@dataclass(frozen=True)
+class Program(ABC):
+    """loss = constraint · C + terminal · B + trajectory_cost · J: the weighted terms of one program.
+
+    C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop.
+    A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is the paper's program.
+
+    With `normalise`, the weights are numbers without units: C and B are measured against the batch's mean cost
+    J̄ (detached; C as the mean over time), and J enters as log J̄, whose gradient is ∇J̄/J̄.
+    """
+
+    constraint: float = 1.0
+    terminal: float = 0.0
+    trajectory_cost: float = 0.0
+    normalise: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("constraint", "terminal", "trajectory_cost"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"Expected weight {name} ≥ 0, got {getattr(self, name)}; terms are minimised.")
+        if not self.constraint + self.terminal + self.trajectory_cost > 0:
+            raise ValueError("Expected at least one positive weight, got none; nothing would be learned.")
+
+    def __call__(self, V: Value, trajectory: Trajectory) -> ProgramOutput:
+        """The program on one batch of trajectories, which must come from the policy of this V.
+
+        Raises:
+            DivergenceError: a term is not finite; names it and the initial state.
+        """
+        values = V(trajectory.t.reshape(-1, *[1] * (trajectory.x.ndim - 2)), trajectory.x)
+        J = trajectory.cost.mean()
+        unit = J.detach() if self.normalise else torch.ones_like(J)
+        per_state = {
+            "constraint": self._constraint_in_units(values, trajectory, unit),
+            "terminal": self._terminal_in_units(values, trajectory, unit),
+            "trajectory_cost": trajectory.cost,
+        }
+        for name, term in per_state.items():
+            _require_finite(name, term, trajectory)
+        terms = {name: term.mean() for name, term in per_state.items()}
+        if self.normalise:
+            terms["trajectory_cost"] = torch.log(J)
+        weights = {"constraint": self.constraint, "terminal": self.terminal, "trajectory_cost": self.trajectory_cost}
+        loss = torch.stack([weight * terms[name] for name, weight in weights.items() if weight]).sum()
+        return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
+
+    @abstractmethod
+    def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        """The paper's sum over the steps of each trajectory."""
+
+    @abstractmethod
+    def _constraint_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
+        """C, in units of the mean cost."""
+
+    @abstractmethod
+    def _terminal_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
+        """B, in units of the mean cost."""
+
+
+def _require_finite(name: str, term: PerState, trajectory: Trajectory) -> None:
+    broken = torch.nonzero(~torch.isfinite(term.flatten())).flatten()
+    if len(broken):
+        first = int(broken[0])
+        x0 = trajectory.x[0].flatten(0, -2)[first].tolist()
+        raise DivergenceError(
+            f"Expected a finite loss, got {float(term.flatten()[first])} in term {name} from x0 = {x0}; lower "
+            "training.learning_rate or the term's weight."
+        )

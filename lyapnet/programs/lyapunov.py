@@ -1,0 +1,36 @@
+"""The Lyapunov program: V falls along its own closed loop at least as fast as the cost accrues."""
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from lyapnet.programs.base import Program
+from lyapnet.programs.terms import hinge, terminal_hinge
+from lyapnet.rollout import Trajectory
+from lyapnet.types import PerState, ValuePath
+
+
+@dataclass(frozen=True)
+class LyapunovProgram(Program):
+    """C = Σ_n max(V_{n+1} − V_n + (1 + margin) Δt ℓ_n, 0) and B = max(φ(x_N) − V(T, x_N), 0).
+
+    Where both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 asks for a little more than is claimed, so that the
+    condition also holds between the sampled states; the constraint loss that is logged has none.
+    Source: P_L of arXiv 2305.15244.
+    """
+
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.margin >= 0:
+            raise ValueError(f"Expected margin ≥ 0, got {self.margin}; a negative one asks for less than is claimed.")
+
+    def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        return hinge(values, trajectory.step_cost)
+
+    def _constraint_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
+        return hinge(values, trajectory.step_cost, self.margin) / unit
+
+    def _terminal_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
+        return terminal_hinge(values, trajectory.terminal_cost) / unit

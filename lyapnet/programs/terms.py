@@ -1,0 +1,36 @@
+"""The terms of both programs: pure functions of V along a trajectory and of the cost of its steps.
+
+`values` is V(t_n, x_n) at the nodes, (N + 1, *batch); `step_cost` is ∫ℓ over each step, (N, *batch).
+"""
+
+import torch
+
+from lyapnet.types import PerState, StepPath, ValuePath
+
+
+def residual(values: ValuePath, step_cost: StepPath) -> PerState:
+    """Σ_n (V_{n+1} − V_n + Δt ℓ_n)²: zero where V is the cost-to-go of the closed loop. Source: P_V of the paper."""
+    return (violation(values, step_cost) ** 2).sum(0)
+
+
+def hinge(values: ValuePath, step_cost: StepPath, margin: float = 0.0) -> PerState:
+    """Σ_n max(V_{n+1} − V_n + (1 + margin) Δt ℓ_n, 0): zero where V falls at least as fast as the cost accrues.
+
+    Source: P_L of the paper, at margin 0.
+    """
+    return torch.relu(violation(values, step_cost, margin)).sum(0)
+
+
+def violation(values: ValuePath, step_cost: StepPath, margin: float = 0.0) -> StepPath:
+    """V_{n+1} − V_n + (1 + margin) Δt ℓ_n at each step."""
+    return values.diff(dim=0) + (1 + margin) * step_cost
+
+
+def terminal_residual(values: ValuePath, terminal_cost: PerState) -> PerState:
+    """(V(T, x_N) − φ(x_N))²: V ends as the terminal cost."""
+    return (values[-1] - terminal_cost) ** 2
+
+
+def terminal_hinge(values: ValuePath, terminal_cost: PerState) -> PerState:
+    """max(φ(x_N) − V(T, x_N), 0): V ends no lower than the terminal cost, so that V(0, x₀) bounds the whole cost."""
+    return torch.relu(terminal_cost - values[-1])

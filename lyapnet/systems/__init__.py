@@ -1,0 +1,15 @@
+"""The registered systems; a new one is a subclass and one line here, or `module:Class` in a config."""
+
+from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
+from lyapnet.systems.cartpole import Cartpole
+from lyapnet.systems.linear import DoubleIntegrator, Linear
+from lyapnet.systems.reacher import Reacher
+
+SYSTEMS: dict[str, type[ControlAffineSystem]] = {
+    "double_integrator": DoubleIntegrator,
+    "linear": Linear,
+    "cartpole": Cartpole,
+    "reacher": Reacher,
+}
+
+__all__ = ["SYSTEMS", "Cartpole", "ControlAffineSystem", "DoubleIntegrator", "Linear", "MechanicalSystem", "Reacher"]

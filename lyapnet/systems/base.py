@@ -1,0 +1,121 @@
+"""What a system is: dynamics affine in the control, and facts about its coordinates."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State
+
+
+class ControlAffineSystem(nn.Module, ABC):
+    """ẋ = f(x) + g(x)u with n states and m controls; the goal of every task is the origin.
+
+    A subclass writes f and g with torch operations on tensors of any leading shape, and declares its coordinates.
+    Physical parameters are constructor arguments; they stay Python floats or become buffers.
+    """
+
+    state_names: Sequence[str]
+    state_units: Sequence[str]
+    control_names: Sequence[str]
+    control_units: Sequence[str]
+    angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
+
+    @abstractmethod
+    def f(self, x: State) -> State:
+        """The drift: ẋ at u = 0, in state units per second."""
+
+    @abstractmethod
+    def g(self, x: State) -> InputMatrix:
+        """The input matrix ∂ẋ/∂u."""
+
+    def dynamics(self, x: State, u: Control) -> State:
+        """ẋ = f(x) + g(x)u."""
+        return self.f(x) + (self.g(x) @ u[..., None])[..., 0]
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.state_names)
+
+    @property
+    def m(self) -> int:
+        """Number of controls."""
+        return len(self.control_names)
+
+    @property
+    def equilibrium(self) -> Float[Tensor, " n"]:
+        """A state with f = 0: the origin unless a subclass knows another one."""
+        return torch.zeros(self.n)
+
+
+class MechanicalSystem(ControlAffineSystem):
+    """M(q)q̈ = Bu + h(q, q̇) − D q̇ with x = (q, q̇): the manipulator equation.
+
+    h collects Coriolis, centrifugal and gravity forces; D = diag(damping). Hence
+    f = (q̇, M⁻¹(h − D q̇)) and g = (0, M⁻¹B).
+    Source: Tedrake, Underactuated Robotics, ch. 1.
+    """
+
+    B: Float[Tensor, "d m"]
+    D: Float[Tensor, " d"]
+
+    def __init__(self, actuation: Sequence[Sequence[float]], damping: Sequence[float]):
+        super().__init__()
+        if min(damping) < 0:
+            raise ValueError(f"Expected damping ≥ 0, got {list(damping)}; friction takes energy away.")
+        self.register_buffer("B", torch.tensor(actuation, dtype=torch.get_default_dtype()))
+        self.register_buffer("D", torch.tensor(damping, dtype=torch.get_default_dtype()))
+
+    @abstractmethod
+    def mass_matrix(self, q: State) -> ControlMatrix:
+        """M(q), (*batch, d, d), symmetric positive definite."""
+
+    @abstractmethod
+    def forces(self, q: State, qdot: State) -> State:
+        """h(q, q̇), (*batch, d): all forces but control and friction, in N or N·m."""
+
+    @abstractmethod
+    def energy(self, x: State) -> PerState:
+        """Kinetic plus potential energy in J; constant along u = 0 without friction."""
+
+    def kinetic_energy(self, q: State, qdot: State) -> PerState:
+        """½ q̇ᵀM(q)q̇ in J."""
+        return ((self.mass_matrix(q) @ qdot[..., None])[..., 0] * qdot).sum(-1) / 2
+
+    def _split(self, x: State) -> tuple[State, State]:
+        d = self.n // 2
+        return x[..., :d], x[..., d:]
+
+    def _accelerate(self, q: State, qdot: State, force: State) -> State:
+        """(q̇, q̈) under a generalised force, friction included."""
+        qddot = torch.linalg.solve(self.mass_matrix(q), force - self.D * qdot)
+        return torch.cat([qdot, qddot], -1)
+
+    def f(self, x: State) -> State:
+        q, qdot = self._split(x)
+        return self._accelerate(q, qdot, self.forces(q, qdot))
+
+    def g(self, x: State) -> InputMatrix:
+        q, _ = self._split(x)
+        MinvB = torch.linalg.solve(self.mass_matrix(q), self.B)
+        return torch.cat([torch.zeros_like(MinvB), MinvB], -2)
+
+    def dynamics(self, x: State, u: Control) -> State:
+        # One solve instead of the three of f + g u; a test holds the two equal.
+        q, qdot = self._split(x)
+        return self._accelerate(q, qdot, self.forces(q, qdot) + u @ self.B.mT)
+
+    def inverse_mass(self, x: State) -> ControlMatrix:
+        """BᵀM(q)⁻¹B: the control weight R of the reference tasks."""
+        q, _ = self._split(x)
+        return self.B.mT @ torch.linalg.solve(self.mass_matrix(q), self.B)
+
+
+def require_positive(**parameters: float) -> None:
+    """Refuse physical parameters that are not positive, naming the first one."""
+    for name, value in parameters.items():
+        if not value > 0:
+            raise ValueError(f"Expected {name} > 0, got {value}; give it in SI units.")

@@ -1,0 +1,72 @@
+"""Linear systems, and the double integrator."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.systems.base import ControlAffineSystem, require_positive
+from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State
+
+
+class Linear(ControlAffineSystem):
+    """ẋ = Ax + Bu.
+
+    Args:
+        A: (n, n).
+        B: (n, m).
+
+    Raises:
+        ValueError: A is not square, or B has other rows.
+    """
+
+    A: Float[Tensor, "n n"]
+    B: Float[Tensor, "n m"]
+
+    def __init__(self, A: Sequence[Sequence[float]] | Tensor, B: Sequence[Sequence[float]] | Tensor):
+        super().__init__()
+        a, b = (torch.as_tensor(matrix, dtype=torch.get_default_dtype()) for matrix in (A, B))
+        if a.ndim != 2 or a.shape[0] != a.shape[1] or b.ndim != 2 or b.shape[0] != a.shape[0]:
+            raise ValueError(
+                f"Expected A of shape (n, n) and B of shape (n, m), got {tuple(a.shape)} and {tuple(b.shape)}; "
+                "write both as lists of rows."
+            )
+        self.register_buffer("A", a)
+        self.register_buffer("B", b)
+        self.state_names = tuple(f"x{i + 1}" for i in range(a.shape[0]))
+        self.state_units = ("",) * a.shape[0]
+        self.control_names = tuple(f"u{i + 1}" for i in range(b.shape[1]))
+        self.control_units = ("",) * b.shape[1]
+
+    def f(self, x: State) -> State:
+        return x @ self.A.mT
+
+    def g(self, x: State) -> InputMatrix:
+        return self.B.expand(*x.shape[:-1], *self.B.shape)
+
+    def dynamics(self, x: State, u: Control) -> State:
+        return x @ self.A.mT + u @ self.B.mT
+
+
+class DoubleIntegrator(Linear):
+    """m q̈ = u: a mass on a line, without friction.
+
+    Args:
+        mass: in kg.
+    """
+
+    def __init__(self, mass: float = 1.0):
+        require_positive(mass=mass)
+        super().__init__([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0 / mass]])
+        self.mass = mass
+        self.state_names, self.state_units = ("position", "velocity"), ("m", "m/s")
+        self.control_names, self.control_units = ("force",), ("N",)
+
+    def energy(self, x: State) -> PerState:
+        """½ m q̇² in J."""
+        return 0.5 * self.mass * x[..., 1] ** 2
+
+    def inverse_mass(self, x: State) -> ControlMatrix:
+        """1/m: the control weight R of the reference task."""
+        return torch.full((*x.shape[:-1], 1, 1), 1.0 / self.mass).to(x)

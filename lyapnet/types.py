@@ -1,0 +1,32 @@
+"""Shape aliases: the letters of the equations, checked by jaxtyping when the tests run.
+
+| letter  | meaning                                                              |
+|---------|----------------------------------------------------------------------|
+| n, m    | dimensions of the state x and of the control u                       |
+| N       | number of time steps of the horizon; t has N + 1 nodes               |
+| *batch  | any leading dimensions, one entry per state; may be empty            |
+
+A time broadcasts against the states it belongs to: one scalar for all of them, or one time each.
+"""
+
+from collections.abc import Callable
+
+from jaxtyping import Float
+from torch import Tensor
+
+Time = Float[Tensor, "*#batch"]
+State = Float[Tensor, "*batch n"]
+Control = Float[Tensor, "*batch m"]
+PerState = Float[Tensor, "*batch"]  # one number for each state: V, a running cost, an energy
+InputMatrix = Float[Tensor, "*batch n m"]
+ControlMatrix = Float[Tensor, "*batch m m"]
+Matrix = Float[Tensor, "rows columns"]
+
+Times = Float[Tensor, " nodes"]
+StatePath = Float[Tensor, "nodes *batch n"]
+ValuePath = Float[Tensor, "nodes *batch"]
+ControlPath = Float[Tensor, "steps *batch m"]
+StepPath = Float[Tensor, "steps *batch"]
+
+Value = Callable[[Tensor, Tensor], Tensor]  # V: (t, x) ↦ one number for each state
+Policy = Callable[[Tensor, Tensor], Tensor]  # u: (t, x) ↦ one control for each state

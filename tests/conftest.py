@@ -1,0 +1,86 @@
+"""Shared by all tests: shapes checked on every call, float64, fixed seeds, every registered system and its task."""
+
+import os
+
+os.environ["MPLBACKEND"] = "Agg"
+
+import hypothesis
+import pytest
+import torch
+from jaxtyping import install_import_hook
+from torch import nn
+
+# Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
+install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+
+from lyapnet.cost import QuadraticCost  # noqa: E402
+from lyapnet.networks import FCN, Scaling  # noqa: E402
+from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
+
+torch.set_num_threads(1)
+torch.set_warn_always(True)  # else a warning, an error here, would be raised by the first test that earns it only
+hypothesis.settings.register_profile("lyapnet", database=None, derandomize=True, deadline=None, max_examples=30)
+hypothesis.settings.load_profile("lyapnet")
+
+# What a registered system needs to be built; the others are built from their defaults.
+ARGUMENTS = {
+    "linear": {"A": [[0.1, 1.0, 0.0], [0.0, -0.2, 1.0], [0.5, 0.0, -0.3]], "B": [[0.0, 1.0], [0.2, 0.0], [1.0, 0.3]]}
+}
+
+
+@pytest.fixture(autouse=True)
+def _float64_and_seeded():
+    torch.set_default_dtype(torch.float64)
+    torch.manual_seed(0)
+
+
+@pytest.fixture
+def build_system():
+    """name ↦ system; a registered system that cannot be built fails the tests."""
+
+    def build(name: str) -> ControlAffineSystem:
+        try:
+            return SYSTEMS[name](**ARGUMENTS.get(name, {}))
+        except TypeError as error:
+            pytest.fail(
+                f"Expected arguments for {name!r} in conftest.ARGUMENTS, got none that fit ({error}); add them."
+            )
+
+    return build
+
+
+@pytest.fixture(params=SYSTEMS)
+def system(request, build_system) -> ControlAffineSystem:
+    """Each registered system in turn, present and future."""
+    return build_system(request.param)
+
+
+@pytest.fixture
+def cost(system) -> QuadraticCost:
+    """A positive definite cost of the system, with R(x) its inverse mass where it has one."""
+    Q = torch.diag(torch.linspace(1, 2, system.n)) + 0.1
+    return QuadraticCost(Q, getattr(system, "inverse_mass", None) or torch.eye(system.m) + 0.1, 2 * Q)
+
+
+@pytest.fixture
+def V(system) -> FCN:
+    """A small random network on the horizon [0, 1] s."""
+    return FCN(Scaling([1.0] * system.n, duration=1.0, value=3.0), hidden=(8, 8))
+
+
+class _Quadratic(nn.Module):
+    def __init__(self, P, dt: float = 1.0):
+        super().__init__()
+        P = torch.as_tensor(P, dtype=torch.get_default_dtype())
+        self.P = nn.Parameter(P if P.ndim == 3 else P[None])
+        self.dt = dt
+
+    def forward(self, t, x):
+        P = self.P[(t / self.dt).round().long().clamp(0, len(self.P) - 1)]
+        return ((P @ x[..., None])[..., 0] * x).sum(-1)
+
+
+@pytest.fixture
+def quadratic():
+    """V = xᵀPx from P (n, n), or xᵀP_n x at the nodes t = n·dt from P (N + 1, n, n); its gradient is autograd's."""
+    return _Quadratic

@@ -1,0 +1,419 @@
+"""Configs: what is refused and how, what overrides what, and the shipped files against the task sheet."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from omegaconf import MISSING
+from torch.testing import assert_close
+
+from lyapnet.build import build_program, build_rollout, build_task, build_value_function
+from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.errors import UsageError
+from lyapnet.programs import LyapunovProgram, ValueProgram
+from lyapnet.systems import Cartpole, DoubleIntegrator, Reacher
+
+CONF = Path(__file__).parents[1] / "conf"
+PLAIN = """
+experiment: small
+program: {name: lyapunov, margin: 0.1}
+system: {name: double_integrator}
+cost: {Q: [1, 1], R: [1], Q_T: [1, 1]}
+initial_states: {lower: [-1, -1], upper: [1, 1]}
+horizon: {steps: 4, dt: 0.1}
+network: {name: anchored, hidden: [4]}
+training: {iterations: 1, batch_size: 2}
+evaluation: {validation_states: 2, test_states: 2}
+"""
+
+
+HANGAR = """
+import torch
+from torch import nn
+from lyapnet import ControlAffineSystem
+
+class Drone(ControlAffineSystem):
+    state_names, state_units = ("height", "speed"), ("m", "m/s")
+    control_names, control_units = ("thrust",), ("N",)
+
+    def __init__(self, mass=1.0):
+        super().__init__()
+        self.mass = mass
+
+    def f(self, x):
+        return torch.stack([x[..., 1], -x[..., 1] ** 3], -1)
+
+    def g(self, x):
+        return torch.stack([torch.zeros_like(x[..., :1]), torch.ones_like(x[..., :1]) / self.mass], -2)
+
+class Bowl(nn.Module):
+    def __init__(self, scaling, hidden=(4,)):
+        super().__init__()
+        self.width = hidden[0]
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, t, x):
+        return self.weight * (x**2).sum(-1) + 0 * t
+"""
+
+# Many calls of the command line in one process, as a user meets it: without the shape checks of the tests.
+CALLS = """
+import contextlib, io, json, sys
+from pathlib import Path
+from lyapnet.cli import main
+
+def call(folder, arguments):
+    with contextlib.redirect_stderr(io.StringIO()) as message, contextlib.redirect_stdout(io.StringIO()):
+        status = main(["train", *arguments, f"logs={folder}"])
+    return status, message.getvalue(), Path(folder).exists()
+
+print(json.dumps([call(f"logs_{i}", arguments) for i, arguments in enumerate(json.load(sys.stdin))]))
+"""
+
+
+def train(folder, calls):
+    """(exit status, message, whether a run's folder was made) of `lyapnet train` with each list of arguments."""
+    arguments = [sys.executable, "-c", CALLS]
+    done = subprocess.run(arguments, cwd=folder, input=json.dumps(calls), capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def is_refused(outcome, *named):
+    """One line that says what was expected and names the culprit; exit status 2; nothing was made."""
+    status, message, made_a_folder = outcome
+    assert status == 2, message
+    assert message.count("\n") == 1, message
+    assert "Expected" in message
+    for name in named:
+        assert name in message
+    assert not made_a_folder, "refused only after the folder of the run was made"
+
+
+@pytest.fixture
+def plain():
+    return yaml.safe_load(PLAIN)
+
+
+def objects(config):
+    """Everything that a config names, built."""
+    task = build_task(config)
+    V = build_value_function(config, task)
+    return task, V, build_program(config), build_rollout(config, task, V)
+
+
+# Refusals: the overrides, joined by &, and what their message names.
+
+MISSPELT = {
+    "horizon.stepz=5": ("horizon.stepz", "horizon.steps?"),
+    "program.constrain=1": ("program.constrain;", "program.constraint?"),
+    "cost.QT=[1, 1]": ("cost.QT", "cost.Q_T?"),
+    "horizn.steps=5": ("horizn", "horizon?"),
+    "steps=5": ("unknown key steps", "horizon.steps?"),
+    "learning_rate=1": ("unknown key learning_rate", "training.learning_rate?"),
+    "trainer.acelerator=cpu": ("trainer.acelerator", "trainer.accelerator?"),
+    "system.parameters.mas=2": ("system.parameters.mas", "system.parameters.mass?"),
+    "rollout.method=rk5": ("rollout.method", "'rk5'", "rk4?"),
+    "rollout.gradient=ajoint": ("rollout.gradient", "'ajoint'", "adjoint?"),
+    "rollout.policy=sontang": ("rollout.policy", "sontag?"),
+    "network.name=fnc": ("network.name", "fcn?", "module:Class"),
+    "network.activation=softpuls": ("network.activation", "softplus?"),
+    "network.terminal=exactly": ("network.terminal", "exact?"),
+    "system.name=cartpol": ("system.name", "cartpole?", "module:Class"),
+    "program.name=lyapunof": ("program.name", "lyapunov?"),
+    "training.optimizer=adamm": ("training.optimizer", "adam?"),
+    "training.precision=float16": ("training.precision", "float64, float32"),
+}
+MISTYPED = {
+    "horizon.steps=ten": ("horizon.steps", "'ten'"),
+    "horizon.steps=1.5": ("horizon.steps", "1.5"),
+    "horizon.steps=true": ("horizon.steps",),
+    "horizon.steps=": ("horizon.steps",),
+    "horizon.dt=fast": ("horizon.dt", "'fast'"),
+    "horizon=5": ("horizon", "steps, dt", "5"),
+    "seed=a": ("seed", "'a'"),
+    "program.normalise=maybe": ("program.normalise", "maybe"),
+    "network.hidden=64": ("network.hidden",),
+    "network.hidden=[a]": ("network.hidden", "'a'"),
+    "training.betas=0.9": ("training.betas",),
+    "initial_states.lower=5": ("initial_states.lower",),
+    "initial_states.lower=[a, b]": ("initial_states.lower", "'a'"),
+    "trainer=5": ("trainer",),
+    "system.parameters=5": ("system.parameters",),
+    "system.parameters.mass=heavy": ("system.parameters", "mass", "heavy"),
+    "cost.Q=5": ("cost", "Q", "5"),
+    "cost.Q=abc": ("cost", "Q", "abc"),
+    "cost.Q=[a, b]": ("cost", "Q", "'a'"),
+    "cost.Q={a: 1}": ("cost.Q",),
+    "cost.R=1": ("cost", "R", "1"),
+    "cost.R=null": ("cost", "R"),
+    "cost.R=inverse_mas": ("cost", "R", "inverse_mas", "inverse_mass"),
+    "experiment=null": ("experiment",),
+    "horizon.steps=${nothing}": ("horizon.steps", "nothing"),
+}
+OUT_OF_RANGE = {
+    "horizon.dt=-0.01": ("horizon.dt", "> 0", "-0.01"),
+    "horizon.dt=0": ("horizon.dt", "> 0"),
+    "horizon.dt=.nan": ("horizon.dt", "nan"),
+    "horizon.dt=.inf": ("horizon.dt", "inf"),
+    "horizon.steps=0": ("horizon.steps", "1", "got 0"),
+    "horizon.steps=-3": ("horizon.steps", "-3"),
+    "seed=-1": ("seed", "-1"),
+    "program.constraint=-1": ("program.constraint", "-1"),
+    "program.constraint=0 & program.terminal=0 & program.trajectory_cost=0": ("program", "weight"),
+    "program.margin=-0.1": ("program.margin", "-0.1"),
+    "network.hidden=[]": ("network.hidden",),
+    "network.hidden=[0]": ("network.hidden", "0"),
+    "network.hidden=[-3]": ("network.hidden", "-3"),
+    "network.epsilon=0": ("network.epsilon", "> 0"),
+    "network.state_scale=[0, 1]": ("network", "state_scale", "> 0"),
+    "network.value_scale=-1": ("network.value_scale", "> 0"),
+    "rollout.rtol=0": ("rollout.rtol", "> 0"),
+    "training.iterations=0": ("training.iterations", "got 0"),
+    "training.batch_size=0": ("training.batch_size", "got 0"),
+    "training.learning_rate=0": ("training.learning_rate", "> 0"),
+    "training.betas=[0.9, 1.5]": ("training.betas", "1.5"),
+    "training.betas=[0.9]": ("training.betas", "0.9"),
+    "evaluation.test_states=0": ("evaluation.test_states", "got 0"),
+    "system.parameters.mass=-1": ("system.parameters", "mass > 0", "-1"),
+    "cost.Q=[[1, 2], [3, 4]]": ("cost", "Q", "symmetric", "[3.0, 4.0]"),
+    "cost.Q=[-1, 1]": ("cost", "Q", "semidefinite", "-1"),
+    "cost.Q=[1, .nan]": ("cost", "Q", "finite", "nan"),
+    "cost.Q_T=[[1, 2], [2, 1]]": ("cost", "Q_T", "semidefinite", "-1"),
+    "cost.R=[0]": ("cost", "R", "positive definite", "0"),
+    "cost.R=[-1]": ("cost", "R", "positive definite", "-1"),
+    "initial_states.lower=[1, 2]": ("initial_states", "lower ≤ upper", "2.0 > 1.0"),
+    "initial_states.lower=[-.inf, 0]": ("initial_states", "finite", "inf"),
+}
+WRONG_SHAPE = {
+    "cost.Q=[1, 1, 1]": ("cost", "Q", "3"),
+    "cost.Q=[[1, 2], [3]]": ("cost", "Q", "[3]"),
+    "cost.Q=[]": ("cost", "Q"),
+    "cost.Q_T=[1]": ("cost", "Q_T", "1"),
+    "cost.R=[1, 1]": ("cost.R", "1", "force", "2"),
+    "cost.R=[[1, 0]]": ("cost", "R", "square"),
+    "initial_states.lower=[-1]": ("initial_states", "lower", "upper", "(1,)", "(2,)"),
+    "initial_states={lower: [-1], upper: [1]}": ("initial_states", "position, velocity", "1"),
+    "network.state_scale=[1]": ("network.state_scale", "position, velocity", "1"),
+    "system={name: linear, parameters: {A: [[1, 2]], B: [[1]]}}": ("system.parameters", "A", "(1, 2)"),
+}
+IMPOSSIBLE = {
+    "program.name=value": ("program.margin", "value"),
+    "network.name=fcn & network.epsilon=0.1": ("network.epsilon", "fcn"),
+    "network.embed_angles=true": ("network.embed_angles", "anchored"),
+    "network.activation=tanh": ("network", "activation", "convex", "softplus"),
+    "system.name=linear": ("system.parameters", "linear", "A", "B"),
+    "system.name=cartpole & system.parameters.mass=1": ("system.parameters.mass", "cart_mass"),
+    "system.name=reacher": ("initial_states", "4", "shoulder angle"),
+    "system={name: linear, parameters: {A: [[0, 1], [0, 0]], B: [[0], [1]]}} & cost.R=inverse_mass": (
+        "cost",
+        "R",
+        "inverse_mass",
+    ),
+    "system.name=nowhere:Thing": ("system.name", "nowhere"),
+    "system.name=json:Nothing": ("system.name", "Nothing"),
+    "system.name=json:JSONDecoder": ("system.name", "ControlAffineSystem", "json:JSONDecoder"),
+    "network.name=json:JSONDecoder & network.hidden=null": ("network.name", "json:JSONDecoder"),
+    "system.name=hangar:Drone & system.parameters.mas=4": ("system.parameters.mas", "system.parameters.mass?"),
+    "network.name=hangar:Bowl & network.activation=sin": ("network.activation", "hangar:Bowl"),
+    "trainer.max_epochs=3": ("trainer.max_epochs", "lyapnet"),
+    "trainer.callbacks=[]": ("trainer.callbacks", "lyapnet"),
+    "trainer.nonsense=3": ("trainer.nonsense",),
+}
+UNREADABLE = {
+    "horizon.steps": ("key.sub=value", "'horizon.steps'"),
+    "=5": ("key.sub=value", "'=5'"),
+    "cost.Q=[1, 2": ("cost.Q=[1, 2",),
+}
+FILES = {
+    "open_list.yaml": "a: [1",
+    "list.yaml": "- 1\n- 2",
+    "empty.yaml": "",
+    "words.yaml": "just words",
+    "tab.yaml": "a:\tb: c",
+    "python.yaml": "experiment: !!python/object/apply:os.getcwd []",
+    "binary.yaml": bytes(range(128, 256)),
+}
+REFUSED = MISSPELT | MISTYPED | OUT_OF_RANGE | WRONG_SHAPE | IMPOSSIBLE | UNREADABLE
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory):
+    """What became of every override above, of the config without any, and of every file and own class below."""
+    folder = tmp_path_factory.mktemp("refused")
+    for name, content in {"good.yaml": PLAIN, "hangar.py": HANGAR, **FILES}.items():
+        (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    calls = {"": ["--config", "good.yaml"]}
+    calls |= {overrides: ["--config", "good.yaml", *overrides.split(" & ")] for overrides in REFUSED}
+    calls |= {name: ["--config", name] for name in [*FILES, "missing.yaml", "."]}
+    return dict(zip(calls, train(folder, list(calls.values())), strict=True))
+
+
+@pytest.mark.parametrize("overrides", REFUSED)
+def test_bad_value_is_refused(overrides, outcomes):
+    is_refused(outcomes[overrides], *REFUSED[overrides])
+
+
+@pytest.mark.parametrize("name", [*FILES, "missing.yaml", "."])
+def test_bad_file_is_refused(name, outcomes):
+    is_refused(outcomes[name], f"'{name}'")
+
+
+def test_without_bad_values_the_config_trains(outcomes):
+    assert outcomes[""] == [0, "", True]
+
+
+@pytest.mark.parametrize("override", ["horizon.stepz=5", "horizon.dt=-1", "cost.R=[-1]", "cost.R=[1, 1]"])
+def test_refusals_are_usage_errors_and_value_errors(override, plain):
+    with pytest.raises(UsageError) as raised:
+        objects(config_from_plain(plain, [override]))
+    assert isinstance(raised.value, ValueError)
+    assert raised.value.exit_status == 2
+
+
+def test_file_and_command_line_are_refused_alike(plain):
+    plain["horizon"]["stepz"] = 5
+    for content, overrides in ((plain, []), (yaml.safe_load(PLAIN), ["horizon.stepz=5"])):
+        with pytest.raises(UsageError, match=r"horizon\.stepz; did you mean horizon\.steps\?"):
+            config_from_plain(content, overrides)
+
+
+def mandatory(schema=Config, prefix=""):
+    """Full names of the fields without a default."""
+    for f in dataclasses.fields(schema):
+        if dataclasses.is_dataclass(f.type):
+            yield from mandatory(f.type, f"{prefix}{f.name}.")
+        elif f.default == MISSING:
+            yield prefix + f.name
+
+
+def test_mandatory_keys_are_these():
+    tasks = ["cost.Q", "cost.R", "cost.Q_T", "initial_states.lower", "initial_states.upper", "horizon.steps"]
+    assert list(mandatory()) == ["experiment", "program.name", "system.name", *tasks, "network.name"]
+
+
+@pytest.mark.parametrize("key", list(mandatory()))
+def test_missing_mandatory_key_is_refused(key, plain):
+    *sections, name = key.split(".")
+    section = plain
+    for part in sections:
+        section = section[part]
+    del section[name]
+    with pytest.raises(UsageError, match=f"^Expected .*{key}, got none"):
+        config_from_plain(plain)
+
+
+# Precedence and round trips
+
+
+def test_command_line_overrides_file_overrides_defaults(tmp_path, plain):
+    path = tmp_path / "experiment.yaml"
+    path.write_text(yaml.safe_dump({**plain, "training": {"batch_size": 7, "iterations": 3}}))
+    config = load_config(path, ["training.iterations=9", "initial_states.lower=[-2, -2]"])
+    assert (config.training.iterations, config.training.batch_size) == (9, 7)
+    assert config.training.optimizer == "adam"
+    assert config.initial_states.lower == [-2, -2]
+    assert config.initial_states.upper == [1, 1]
+
+
+def test_one_key_of_the_trainer_section_keeps_the_others(plain):
+    plain["trainer"] = {"gradient_clip_val": 3, "devices": 1}
+    config = config_from_plain(plain, ["trainer.accelerator=cpu", "trainer.devices=2"])
+    assert config.trainer == {"gradient_clip_val": 3, "devices": 2, "accelerator": "cpu"}
+
+
+@pytest.mark.parametrize("path", list(CONF.glob("*.yaml")), ids=lambda path: path.stem)
+def test_config_survives_plain_data_and_yaml(path, tmp_path):
+    config = load_config(path, ["seed=3"])
+    assert config_from_plain(to_plain(config)) == config
+    written = tmp_path / "written.yaml"
+    written.write_text(to_yaml(config))
+    assert load_config(written) == config
+
+
+def test_defaults_are_not_shared_between_configs(plain):
+    config_from_plain(plain).trainer["accelerator"] = "gpu"
+    config_from_plain(plain).training.betas.append(0.5)
+    assert config_from_plain(plain).trainer == {}
+    assert config_from_plain(plain).training.betas == [0.9, 0.99]
+
+
+# The shipped configs against the task sheet
+
+BALANCING = {"cart_mass": 1, "pole_mass": 0.1, "length": 0.3, "cart_damping": 0.1, "pole_damping": 0.1}
+SWINGUP = {"cart_mass": 1, "pole_mass": 1, "length": 1, "cart_damping": 0, "pole_damping": 0.1}
+DOUBLE_INTEGRATOR = (DoubleIntegrator, {"mass": 1}, 400, [10, 0.1], [10, 0.1], [0, 0], [1, 0.7])
+TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width of X₀
+    "double_integrator": (LyapunovProgram, *DOUBLE_INTEGRATOR),
+    "double_integrator_value": (ValueProgram, *DOUBLE_INTEGRATOR),
+    "cartpole_balancing": (
+        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
+        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
+    ),
+    "cartpole_swingup": (
+        ValueProgram, Cartpole, SWINGUP, 171, [0, 0, 0, 0], [80, 600, 0.8, 4.5],
+        [0, torch.pi, 0, 0], [0, 0.3, 0, 0],
+    ),
+    "reacher": (
+        ValueProgram, Reacher, {"damping": 0.25}, 170, [1, 1, 0, 0], [100, 100, 1, 1],
+        [0, 0, 0, 0], [3, 3, 0, 0],
+    ),
+}  # fmt: skip
+
+
+def test_every_shipped_config_is_a_task_of_the_sheet():
+    assert {path.stem for path in CONF.glob("*.yaml")} == set(TASKS)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_shipped_config_is_its_task(name):
+    config = load_config(CONF / f"{name}.yaml")
+    task, V, program, rollout = objects(config)
+    program_class, system_class, parameters, N, Q, Q_T, center, half_width = TASKS[name]
+    assert config.experiment == name
+    assert type(program) is program_class
+    assert type(task.system) is system_class
+    assert (task.horizon.steps, task.horizon.dt) == (N, 0.01)
+    assert_close(task.cost.Q, torch.tensor(Q, dtype=torch.float64).diag())
+    assert_close(task.cost.Q_T, torch.tensor(Q_T, dtype=torch.float64).diag())
+    assert_close(task.initial_states.center, torch.tensor(center, dtype=torch.float64))
+    assert_close(task.initial_states.widths, 2 * torch.tensor(half_width, dtype=torch.float64))
+    expected, x = system_class(**parameters), torch.randn(8, task.system.n)
+    assert_close(task.system.f(x), expected.f(x))
+    assert_close(task.system.g(x), expected.g(x))
+    assert_close(task.cost.R(x), expected.inverse_mass(x))
+    assert V(torch.tensor(0.0), x).shape == (8,)
+    assert config.rollout.policy == "hjb"
+    assert rollout.method == "euler"
+
+
+@pytest.mark.parametrize("path", list(CONF.glob("*.yaml")), ids=lambda path: path.stem)
+def test_first_line_of_a_shipped_config_runs_it(path):
+    assert path.read_text().splitlines()[0] == f"# python train.py --config conf/{path.name}"
+
+
+# The user's own classes
+
+
+@pytest.fixture
+def own_classes(tmp_path, monkeypatch):
+    """A module of the user's in the working directory; its name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "hangar.py").write_text(HANGAR)
+    yield "hangar"
+    sys.modules.pop("hangar", None)
+
+
+def test_classes_of_the_users_own_are_built(own_classes, plain):
+    plain["system"] = {"name": f"{own_classes}:Drone", "parameters": {"mass": 4}}
+    plain["network"] = {"name": f"{own_classes}:Bowl", "hidden": [6]}
+    task, V, _, rollout = objects(config_from_plain(plain))
+    x = torch.randn(3, 2)
+    assert task.system.mass == 4
+    assert V.width == 6
+    assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / 4)  # −½ R⁻¹gᵀV_x with V = ‖x‖²

@@ -58,7 +58,13 @@ def build_task(config: Config, system: ControlAffineSystem | None = None) -> Tas
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:
     """The system of a config, registered or the user's own."""
-    cls = resolve(config.name, SYSTEMS, "system.name")
+    cls = resolve(config.name, SYSTEMS, "system.name", ControlAffineSystem)
+    known = inspect.signature(cls).parameters
+    unknown = [key for key in config.parameters if key not in known]
+    missing = [key for key, p in known.items() if p.default is p.empty and key not in config.parameters]
+    if unknown or missing:
+        got = f"unknown system.parameters.{unknown[0]}" if unknown else f"no system.parameters.{missing[0]}"
+        raise UsageError(f"Expected the parameters of {config.name}: {', '.join(known)}; got {got}.")
     with _section(f"system.parameters of {config.name}"):
         return cls(**config.parameters)
 
@@ -66,7 +72,9 @@ def build_system(config: SystemConfig) -> ControlAffineSystem:
 def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost:
     """The cost of a config, its shapes held against the system's."""
     R: Any = config.R
-    if R == "inverse_mass":
+    if isinstance(R, str):
+        if R != "inverse_mass":
+            raise ValueError(f"Expected R as a matrix or inverse_mass, got {R!r}; write R as a list of rows.")
         inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
         if inverse_mass is None:
             raise ValueError(
@@ -76,9 +84,9 @@ def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost
         # constant for a linear system: a matrix then, as the Riccati equation needs it
         R = inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
     else:
-        R = _rows(R)
+        R = _rows("R", R)
         _require_length("cost.R", len(R), system, system.m)
-    cost = QuadraticCost(_rows(config.Q), R, _rows(config.Q_T))
+    cost = QuadraticCost(_rows("Q", config.Q), R, _rows("Q_T", config.Q_T))
     _require_length("cost.Q", len(cost.Q), system)
     return cost
 
@@ -93,7 +101,7 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
         UsageError: an option that the network does not have, or a value that it refuses.
     """
     options = config.network
-    cls = network or resolve(options.name, NETWORKS, "network.name")
+    cls = network or resolve(options.name, NETWORKS, "network.name", nn.Module)
     chosen: dict[str, Any] = {
         "hidden": options.hidden,
         "activation": options.activation,
@@ -103,12 +111,10 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
     chosen = {key: value for key, value in chosen.items() if value is not None}
     anchor = {"epsilon": chosen.pop("epsilon")} if options.name == "anchored" and options.epsilon else {}
     accepted = inspect.signature(cls).parameters
-    for key in chosen:
+    for key in ("scaling", *chosen):
         if key not in accepted:
-            name = "embed_angles" if key == "embedded_angles" else key
-            raise UsageError(
-                f"Expected no network.{name} with {options.name}, got one; remove it or choose another network."
-            )
+            name = {"embedded_angles": "embed_angles"}.get(key, key)
+            raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
     with _float64_defaults(), torch.random.fork_rng(devices=[]), _section("network"):
         torch.manual_seed(config.seed)
         V = cls(scaling=_scaling(config, task), **chosen)
@@ -138,11 +144,11 @@ def build_program(config: Config) -> Program:
         return cls(**options)
 
 
-def resolve(name: str, registry: Mapping[str, type], key: str) -> Any:
+def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> Any:
     """A registered class, or the user's own from module:Class, found from the working directory.
 
     Raises:
-        UsageError: no such module or class.
+        UsageError: no such module or class, or not a subclass of `base`.
     """
     if name in registry:
         return registry[name]
@@ -150,20 +156,21 @@ def resolve(name: str, registry: Mapping[str, type], key: str) -> Any:
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
-        return getattr(importlib.import_module(module_name), class_name)
+        cls = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
         raise UsageError(
             f"Expected {key} as one of {', '.join(registry)}, or module:Class, got {name!r} ({error}); "
             "check the spelling and the working directory."
         ) from error
+    if not (isinstance(cls, type) and issubclass(cls, base)):
+        raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
+    return cls
 
 
 def _scaling(config: Config, task: Task) -> Scaling:
     extent = task.initial_states.magnitude.double()
     scale = config.network.state_scale or [v if v > 0 else 1.0 for v in extent.tolist()]
     _require_length("network.state_scale", len(scale), task.system)
-    if not min(scale) > 0:
-        raise ValueError(f"Expected state_scale > 0, got {scale}; give the magnitude each state reaches.")
     value = config.network.value_scale
     if value is None:
         state = torch.tensor(scale, dtype=torch.float64)
@@ -171,8 +178,10 @@ def _scaling(config: Config, task: Task) -> Scaling:
     return Scaling(scale, task.horizon.duration, value)
 
 
-def _rows(matrix: Any) -> Any:
+def _rows(name: str, matrix: Any) -> Any:
     """A flat list of numbers as the diagonal matrix it stands for."""
+    if not isinstance(matrix, list | tuple):
+        raise ValueError(f"Expected {name} as a list of rows, or of the diagonal's numbers, got {matrix!r}.")
     if isinstance(matrix, list | tuple) and all(isinstance(v, int | float) for v in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix

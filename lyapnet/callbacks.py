@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
-from lyapnet.checkpoint import read_checkpoint, write_checkpoint
+from lyapnet.checkpoint import read_plain_data, write_checkpoint
 from lyapnet.config import to_yaml
 from lyapnet.errors import LyapnetError
 from lyapnet.modules import ProgramModule
@@ -149,7 +149,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         write_checkpoint(checkpoint, path)
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read_checkpoint(path, map_location or "cpu")
+        return read_plain_data(path, map_location or "cpu")
 
 
 class Interrupted(LyapnetError):
@@ -205,6 +205,13 @@ class Checkpoints(ModelCheckpoint):
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         self._previous.clear()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        # The folder may have moved since, and its checkpoints with it; Lightning would forget the best score.
+        best, last = (str(Path(str(self.dirpath)) / f"{name}.ckpt") for name in (BEST, LAST))
+        paths = {"dirpath": self.dirpath, "best_model_path": best, "kth_best_model_path": best, "last_model_path": last}
+        scores = {best: score for score in state_dict["best_k_models"].values()}
+        super().load_state_dict({**state_dict, **paths, "best_k_models": scores})
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
         writer(trainer).flush()

@@ -61,7 +61,7 @@ def evaluate(
 
     own = None
     if system is not None:
-        parameters = config_of(read_checkpoint(checkpoint)).system.parameters
+        parameters = config_of(read_checkpoint(checkpoint), checkpoint).system.parameters
         own = build_system(SystemConfig(name=system, parameters=parameters))
     result = measure(load(checkpoint, system=own), samples, seed)
     if as_json:
@@ -175,4 +175,4 @@ def _table(title: str, result: dict[str, Any]) -> Table:
 
 
 def _with_units(names: Any, units: Any) -> str:
-    return ", ".join(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
+    return ", ".join(f"{name} ({unit})" if unit else name for name, unit in zip(names, units, strict=True))

@@ -5,6 +5,8 @@ A YAML file lists only what differs from these defaults; `key.sub=value` on the 
 
 import dataclasses
 import difflib
+import math
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,9 +32,11 @@ def option(
     user_class: bool = False,
     above: float | None = None,
     at_least: float | None = None,
+    below: float | None = None,
 ) -> Any:
     """A field with its sentence and the values it admits; `user_class` also admits module:Class."""
-    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "above": above, "at_least": at_least}
+    bounds = {">": above, "≥": at_least, "<": below}
+    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "bounds": bounds}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=rule)
     return field(default=default, metadata=rule)
@@ -92,12 +96,14 @@ class NetworkConfig:
     name: str = option(
         MISSING, "A registered network, or module:Class of your own.", choices=tuple(NETWORKS), user_class=True
     )
-    hidden: list[int] | None = option(None, "Widths of the hidden layers.")
+    hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
     activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the lower bound V ≥ ε‖x‖² (icnn, anchored).", above=0)
     terminal: str = option("free", "exact builds V(T, ·) = φ in (for anchored: φ + ε‖x‖²).", choices=("free", "exact"))
-    state_scale: list[float] | None = option(None, "Expected |x|; null: the extent of X₀, and 1 where it has none.")
+    state_scale: list[float] | None = option(
+        None, "Expected |x|; null: the extent of X₀, 1 where it has none.", above=0
+    )
     value_scale: float | None = option(None, "Expected V; null: φ at the state scale.", above=0)
 
 
@@ -121,7 +127,8 @@ class TrainingConfig:
     optimizer: str = option("adam", "adam, or adamw with decoupled weight decay.", choices=("adam", "adamw"))
     learning_rate: float = option(1e-2, "Step size at the start.", above=0)
     final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
-    betas: list[float] = option([0.9, 0.99], "Adam's averaging of the gradient and of its square.")
+    beta1: float = option(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
+    beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
     weight_decay: float = option(0.0, "Of the optimiser.", at_least=0)
     precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
@@ -190,6 +197,10 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise UsageError(_explain(error)) from error
+    except TypeError as error:  # a section's field changed from a list to a mapping, or back
+        raise UsageError(
+            f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
+        ) from error
     except yaml.YAMLError as error:
         raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
     assert isinstance(config, Config)
@@ -225,13 +236,10 @@ def _refuse_unknown_keys(content: Any, schema: type, prefix: str) -> None:
     known = {f.name: f for f in dataclasses.fields(schema)}
     for key, value in content.items():
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5) or _same_name_elsewhere(str(key))
-            hint = (
-                f"did you mean {near[0] if '.' in near[0] else prefix + near[0]}" if near else "see lyapnet/config.py"
-            )
-            raise UsageError(
-                f"Expected one of {', '.join(known)}, got unknown key {prefix}{key}; {hint}?".replace("py?", "py")
-            )
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            names = _same_name_elsewhere(str(key)) or [prefix + name for name in near]
+            hint = f"did you mean {names[0]}?" if names else f"choose one of {', '.join(known)}."
+            raise UsageError(f"Expected a key of the schema, got unknown key {prefix}{key}; {hint}")
         section = known[key].type
         if isinstance(section, type) and dataclasses.is_dataclass(section):
             if not isinstance(value, Mapping):
@@ -285,9 +293,11 @@ def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
         hint = f"did you mean {near[0]}?" if near else "choose one of them."
         own = ", or module:Class" if rule["user_class"] else ""
         raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
-    for bound, symbol, holds in (
-        (rule["above"], ">", lambda v, b: b < v < float("inf")),
-        (rule["at_least"], "≥", lambda v, b: b <= v < float("inf")),
-    ):
-        if bound is not None and not holds(value, bound):
-            raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")
+    holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}
+    bounds = {symbol: bound for symbol, bound in rule["bounds"].items() if bound is not None}
+    if bounds and value == []:
+        raise UsageError(f"Expected {key} with at least one entry, got none; {rule['doc']}")
+    for symbol, bound in bounds.items():
+        for number in value if isinstance(value, list) else [value]:
+            if not (holds[symbol](number, bound) and math.isfinite(number)):
+                raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")

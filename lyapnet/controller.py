@@ -1,5 +1,6 @@
 """What training leaves behind: V, the control law, and the closed loop of a checkpoint."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, overload
 
@@ -65,7 +66,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones.
         """
-        return _like(x, self._V(*self._inputs(t, x)))
+        return self._answer(self._V, t, x)
 
     @overload
     def policy(self, t: Tensor | float, x: Tensor) -> Tensor: ...
@@ -77,7 +78,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones.
         """
-        return _like(x, self._rollout.closed_loop.policy(*self._inputs(t, x)))
+        return self._answer(self._rollout.closed_loop.policy, t, x)
 
     def rollout(self, x0: Any) -> Trajectory:
         """The closed loop from x₀ (*batch, n), over the whole horizon; a Trajectory of what x₀ is, tensors or arrays.
@@ -89,6 +90,11 @@ class Controller:
         with torch.no_grad():
             trajectory = self._rollout(self._state(x0))
         return Trajectory(*(_like(x0, field) for field in trajectory))
+
+    def _answer(self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any) -> Any:
+        time, state = self._inputs(t, x)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
+            return _like(x, function(time, state))
 
     def _inputs(self, t: Any, x: Any) -> tuple[Tensor, Tensor]:
         state = self._state(x)
@@ -134,7 +140,7 @@ def load(
         CheckpointError: the file is truncated, foreign, or does not fit its own config.
     """
     content = read_checkpoint(path, device)
-    config = config_of(content)
+    config = config_of(content, path)
     for argument, given, name, registry in (
         ("system", system, config.system.name, SYSTEMS),
         ("network", network, config.network.name, NETWORKS),
@@ -152,9 +158,21 @@ def load(
     return Controller(config, task, V)
 
 
-def config_of(content: dict) -> Config:
-    """The config in a checkpoint's content."""
-    return config_from_plain(content[KEY]["config"])
+def config_of(content: dict[str, Any], path: str | Path) -> Config:
+    """The config in the content of a checkpoint file.
+
+    Raises:
+        CheckpointError: there is none that this version understands.
+    """
+    plain = content[KEY].get("config")
+    try:
+        if not isinstance(plain, dict):
+            raise UsageError(f"Expected a config, got {type(plain).__name__}")
+        return config_from_plain(plain)
+    except UsageError as error:
+        raise CheckpointError(
+            f"Expected a checkpoint of this version of lyapnet, got {str(path)!r}: {error}"
+        ) from error
 
 
 def load_value_function(V: nn.Module, content: dict, path: str | Path) -> None:

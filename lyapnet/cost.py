@@ -79,7 +79,7 @@ class QuadraticCost(nn.Module):
         """
         R = self.R(x)
         asymmetry = (R - R.mT).abs().amax((-2, -1))
-        smallest = torch.linalg.eigvalsh(R)[..., 0]
+        smallest = torch.linalg.eigvalsh(torch.nan_to_num(R, nan=-1.0, posinf=-1.0, neginf=-1.0))[..., 0]
         bad = torch.nonzero(~((smallest > 0) & (asymmetry <= 1e-9 * R.abs().amax((-2, -1))))).flatten()
         if len(bad):
             i = int(bad[0])

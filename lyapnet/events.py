@@ -1,11 +1,14 @@
 """TensorBoard event files of a run that resumes."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 
 from tensorboard.backend.event_processing.event_file_loader import RawEventFileLoader
 from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboard.summary.writer.record_writer import RecordWriter
+
+from lyapnet.files import write_atomically
 
 
 def drop_events_after(folder: Path, step: int) -> None:
@@ -14,13 +17,12 @@ def drop_events_after(folder: Path, step: int) -> None:
     The final metrics (tags hp/ and _hparams_) go too: the end of the run writes them again.
     """
     for path in event_files(folder):
-        kept = [record for record in RawEventFileLoader(str(path)).Load() if _keep(Event.FromString(record), step)]
-        temporary = path.with_name(f".{path.name}.tmp")
-        with temporary.open("wb") as file:
-            records = RecordWriter(file)
-            for record in kept:
+        kept = io.BytesIO()
+        records = RecordWriter(kept)
+        for record in RawEventFileLoader(str(path)).Load():
+            if _keep(Event.FromString(record), step):
                 records.write(record)
-        temporary.replace(path)
+        write_atomically(path, kept.getbuffer())
 
 
 def event_files(folder: Path) -> Iterator[Path]:

@@ -1,11 +1,13 @@
 """A run: its folder, its trainer, its end; started, resumed, or fine-tuned from another one."""
 
+import difflib
 import inspect
 import json
 import logging
 import os
 import platform
 import subprocess
+import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +17,7 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from rich.console import Console
+from torch import nn
 
 import lyapnet
 from lyapnet.build import build_task, resolve
@@ -34,9 +37,11 @@ from lyapnet.data import InitialStateDataModule
 from lyapnet.errors import DivergenceError, LyapnetError, UsageError
 from lyapnet.evaluation import evaluate
 from lyapnet.events import drop_events_after, event_files
+from lyapnet.files import write_atomically
 from lyapnet.modules import MODULES, ProgramModule
 from lyapnet.networks import NETWORKS
 
+PROVENANCE = "run.json"
 EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
 TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "num_nodes", "gradient_clip_val", "gradient_clip_algorithm",
@@ -67,6 +72,12 @@ class Run:
         return self.checkpoints / "best.ckpt"
 
     @property
+    def finetuned_from(self) -> Path | None:
+        """The checkpoint whose weights the run started from."""
+        origin = json.loads((self.folder / PROVENANCE).read_text(encoding="utf-8"))["finetuned_from"]
+        return Path(origin) if origin else None
+
+    @property
     def finished(self) -> bool:
         """Whether the run reached its end."""
         return (self.folder / EVALUATION).is_file()
@@ -74,20 +85,22 @@ class Run:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do: in which run's folder, and from which checkpoint if any."""
+    """What to do: which module to train, in which run's folder, and from which checkpoint if any."""
 
     path: Path  # of the config file
     config: Config
+    module: ProgramModule
     run: Run
     resume_from: Path | None = None
     finetune_from: Path | None = None
 
 
 def plan_run(path: Path | None, overrides: list[str], resume: str | None = None, finetune: Path | None = None) -> Plan:
-    """Read the config and decide the run's folder; nothing is written but the folder of a new run.
+    """Build everything that a config names, and last of all, for a new run, its folder.
 
     Raises:
         UsageError: config and checkpoint contradict each other, or there is nothing to resume.
+        CheckpointError: a checkpoint cannot be read, or its weights do not fit.
         LyapnetError: the folder of a new run cannot be made.
     """
     if resume and finetune:
@@ -96,15 +109,16 @@ def plan_run(path: Path | None, overrides: list[str], resume: str | None = None,
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
     config = load_config(path, overrides)
     _check_trainer_options(config)
+    module = MODULES[config.program.name](config, build_task(config))
     if not resume:
-        build_task(config)  # refuse an impossible task before its folder exists
-        return Plan(path, config, _new_run(config), finetune_from=finetune)
+        return Plan(path, config, _start_from(module, finetune), _new_run(config, finetune), finetune_from=finetune)
     run = _last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
-    if resume == LAST and not checkpoint.exists():
-        return Plan(path, config, run)  # stopped before its first checkpoint: the beginning is where it stands
-    _require_same_experiment(config, config_of(read_checkpoint(checkpoint)), checkpoint)
-    return Plan(path, config, run, resume_from=checkpoint)
+    if resume == LAST and not checkpoint.exists():  # stopped before its first checkpoint: it stands where it began
+        origin = run.finetuned_from
+        return Plan(path, config, _start_from(module, origin), run, finetune_from=origin)
+    _require_same_experiment(config, config_of(read_checkpoint(checkpoint), checkpoint), checkpoint)
+    return Plan(path, config, module, run, resume_from=checkpoint)
 
 
 def fit(plan: Plan, console: Console) -> dict[str, Any]:
@@ -115,19 +129,15 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
         DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
         LyapnetError: a checkpoint or event file cannot be read or written.
     """
-    config, run = plan.config, plan.run
+    config, run, module = plan.config, plan.run, plan.module
     _quiet()
-    task = build_task(config)
-    module = MODULES[config.program.name](config, task)
-    if plan.finetune_from:
-        load_value_function(module.V, read_checkpoint(plan.finetune_from), plan.finetune_from)
     data = InitialStateDataModule(
-        task.initial_states, config.training.batch_size, config.evaluation.validation_states, config.seed
+        module.task.initial_states, config.training.batch_size, config.evaluation.validation_states, config.seed
     )
     trainer = _trainer(config, run, console)
     if trainer.is_global_zero:
         _prepare_folder(plan)
-    console.print(f"[bold]{config.experiment}[/]  {run.folder}", highlight=False)
+        console.print(f"[bold]{config.experiment}[/]  {run.folder}", soft_wrap=True)
     try:
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
         trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
@@ -136,20 +146,27 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
         raise DivergenceError(f"{error}{kept}") from error
     if not trainer.is_global_zero:
         return {}
-    return _finish(trainer, module, plan)
+    return _finish(trainer, plan)
 
 
-def _finish(trainer: L.Trainer, module: ProgramModule, plan: Plan) -> dict[str, Any]:
+def _start_from(module: ProgramModule, checkpoint: Path | None) -> ProgramModule:
+    """The module with the weights of a checkpoint, if there is one to fine-tune from."""
+    if checkpoint is not None:
+        load_value_function(module.V, read_checkpoint(checkpoint), checkpoint)
+    return module
+
+
+def _finish(trainer: L.Trainer, plan: Plan) -> dict[str, Any]:
     """Evaluate the best checkpoint, log it as the run's final metrics, and mark the run as finished."""
     config, run = plan.config, plan.run
-    network = resolve(config.network.name, NETWORKS, "network.name")
-    controller = load(run.best, system=module.task.system, network=network)
+    network = resolve(config.network.name, NETWORKS, "network.name", nn.Module)
+    controller = load(run.best, system=plan.module.task.system, network=network)
     result = evaluate(controller, config.evaluation.test_states, config.seed)
     metrics = {f"hp/{key}": value for key, value in result.items() if isinstance(value, float)}
     assert isinstance(trainer.logger, TensorBoardLogger)
     trainer.logger.log_hyperparams(to_plain(config), metrics, step=trainer.global_step)
     trainer.logger.finalize("success")
-    (run.folder / EVALUATION).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    _write_json(run.folder / EVALUATION, result)
     return result
 
 
@@ -181,19 +198,18 @@ def _prepare_folder(plan: Plan) -> None:
     """Write what the run is; take back what it logged after the point from which it goes on."""
     folder = plan.run.folder
     (folder / EVALUATION).unlink(missing_ok=True)
-    (folder / "config.yaml").write_text(to_yaml(plan.config), encoding="utf-8")
+    write_atomically(folder / "config.yaml", to_yaml(plan.config).encode())
     if plan.resume_from:
         drop_events_after(folder, int(read_checkpoint(plan.resume_from)["global_step"]))
         return
     for path in event_files(folder):
         path.unlink()
-    (folder / "run.json").write_text(json.dumps(_provenance(plan), indent=2) + "\n", encoding="utf-8")
 
 
-def _provenance(plan: Plan) -> dict[str, Any]:
+def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
     return {
-        "seed": plan.config.seed,
-        "finetuned_from": str(plan.finetune_from) if plan.finetune_from else None,
+        "seed": config.seed,
+        "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
         "lyapnet": lyapnet.__version__,
         "python": platform.python_version(),
         "torch": torch.__version__,
@@ -212,20 +228,26 @@ def _commit() -> str | None:
     return git.stdout.strip()
 
 
-def _new_run(config: Config) -> Run:
+def _new_run(config: Config, finetuned_from: Path | None) -> Run:
+    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on."""
     if int(os.environ.get("LOCAL_RANK", "0")) > 0:  # a further process of a run whose folder the first one made
         return _last_run(config)
     root = Path(config.logs) / config.experiment
     try:
         root.mkdir(parents=True, exist_ok=True)
-        version = max((v for v, _ in _versions(root)), default=-1) + 1
-        folder = root / f"version_{version}"
-        folder.mkdir()
+        draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
+        draft.chmod(0o755)
+        _write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
+        version = max((number for number, _ in _versions(root)), default=-1) + 1
+        return Run(draft.rename(root / f"version_{version}"))
     except OSError as error:
         raise LyapnetError(
             f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
         ) from error
-    return Run(folder)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def _last_run(config: Config) -> Run:
@@ -251,11 +273,14 @@ def _require_same_experiment(config: Config, stored: Config, checkpoint: Path) -
 
 
 def _check_trainer_options(config: Config) -> None:
-    known = set(inspect.signature(L.Trainer).parameters)
     for key in config.trainer:
         if key not in TRAINER_OPTIONS:
-            owner = "lyapnet sets it itself" if key in known else "lightning.Trainer does not know it"
-            raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got {key}; {owner}.")
+            near = difflib.get_close_matches(key, TRAINER_OPTIONS, n=1)
+            owned = key in inspect.signature(L.Trainer).parameters
+            hint = (
+                "lyapnet sets that one itself" if owned else f"did you mean trainer.{near[0]}?" if near else "remove it"
+            )
+            raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint}")
 
 
 def _quiet() -> None:

@@ -1,7 +1,8 @@
 """The LightningModules: each wraps one program. What they compute stands in programs/; what is logged, in callbacks."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import lightning as L
@@ -40,25 +41,41 @@ class ProgramModule(L.LightningModule):
 
     def training_step(self, x0: State, batch_idx: int) -> dict[str, Any]:
         """One evaluation of the program on a batch (b, n) of initial states."""
-        try:
+        with self._naming_iteration():
             output = self.program(self.V, self.closed_loop(x0))
-        except DivergenceError as error:
-            raise DivergenceError(f"Iteration {self.global_step}: {error}") from error
         return {
             "loss": output.loss,
             "constraint_loss": output.constraint_loss.detach(),
             "trajectory_cost": output.trajectory_cost.detach(),
         }
 
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Lightning's, which also meets an adaptive adjoint that gives up."""
+        try:
+            super().backward(loss, *args, **kwargs)
+        except AssertionError as error:
+            raise DivergenceError(
+                f"Iteration {self.global_step}: Expected the adjoint to reach t = 0, got {error}; lower "
+                "training.learning_rate, or take rollout.gradient=backprop."
+            ) from error
+
     def validation_step(self, x0: State, batch_idx: int) -> None:
         """The table of the fixed validation states, and the loss that picks the best checkpoint."""
-        self.log("loss/val", self.validate_on(x0), logger=False, batch_size=len(x0))
+        self.log("loss/val", self.validate_on(x0), logger=False, sync_dist=True)
 
     def validate_on(self, x0: State) -> Tensor:
         """Fill `validation` with the table of these states; the program's loss on them."""
-        trajectory = self.closed_loop(x0)
-        self.validation = measure(self.V, trajectory, self.program, self.oracle)
-        return self.program(self.V, trajectory).loss
+        with self._naming_iteration():
+            trajectory = self.closed_loop(x0)
+            self.validation = measure(self.V, trajectory, self.program, self.oracle)
+            return self.program(self.V, trajectory).loss
+
+    @contextmanager
+    def _naming_iteration(self) -> Iterator[None]:
+        try:
+            yield
+        except DivergenceError as error:
+            raise DivergenceError(f"Iteration {self.global_step}: {error}") from error
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Record the gradient's norm; refuse to step along one that is not finite."""
@@ -74,7 +91,10 @@ class ProgramModule(L.LightningModule):
         options = self.config.training
         classes = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
         optimizer = classes[options.optimizer](
-            self.V.parameters(), lr=options.learning_rate, betas=tuple(options.betas), weight_decay=options.weight_decay
+            self.V.parameters(),
+            lr=options.learning_rate,
+            betas=(options.beta1, options.beta2),
+            weight_decay=options.weight_decay,
         )
         schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: cosine_decay(step, options))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}

@@ -27,7 +27,8 @@ class SontagPolicy(nn.Module):
         u = −(a + √(a² + qσ))/σ · R⁻¹b,   and 0 where b = 0,
 
     so that V̇ = −√(a² + qσ) wherever b ≠ 0: V decreases for every control-Lyapunov function V, however far from
-    the value function. With the true value function it is the HJB policy.
+    the value function. With the true value function it is the HJB policy. Close to the goal a and σ are small
+    differences of rounded numbers: in float32, u chatters within about ‖x‖ = 1e-4.
 
     Sources: Sontag, "A 'universal' construction of Artstein's theorem on nonlinear stabilization", Systems & Control
     Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov

@@ -8,5 +8,5 @@ TRAINING, VALIDATION, TEST, FIGURES = range(4)
 
 def stream(seed: int, *path: int) -> torch.Generator:
     """A generator for one purpose: streams of different (seed, path) are independent, on every machine the same."""
-    state = np.random.SeedSequence([seed, *path]).generate_state(1, np.uint64)[0]
+    state = np.random.SeedSequence(seed, spawn_key=path).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state))

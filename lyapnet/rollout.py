@@ -1,6 +1,6 @@
 """Closed-loop integration of the state and its running cost, differentiable in the parameters of V."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from torchdiffeq import odeint, odeint_adjoint
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import DivergenceError
 from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import ControlPath, PerState, State, StatePath, StepPath, Time, Times, ValuePath
+from lyapnet.types import ControlPath, PerState, State, StatePath, Time, Times, ValuePath
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class Trajectory(NamedTuple):
     terminal_cost: PerState  # (*batch,): φ(x_N)
 
     @property
-    def cost(self) -> PerState:
+    def cost(self) -> Any:  # a tensor, or an array where the fields are arrays
         """J_N = running cost plus terminal cost, (*batch,)."""
         return self.running_cost[-1] + self.terminal_cost
 
     @property
-    def step_cost(self) -> StepPath:
+    def step_cost(self) -> Any:
         """∫ℓ over each step in the integrator's own quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
         return self.running_cost[1:] - self.running_cost[:-1]
 
@@ -117,13 +117,16 @@ class Rollout(nn.Module):
                 raise ValueError(f"Expected {name} as one of {', '.join(known)}, got {value!r}; choose one of them.")
         self.closed_loop = ClosedLoop(system, cost, policy)
         self.horizon, self.method, self.gradient = horizon, method, gradient
-        self.tolerances: Mapping[str, Any] = {"rtol": rtol, "atol": atol}
+        self.solver_arguments: dict[str, Any] = {"method": method, "rtol": rtol, "atol": atol}
+        if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
+            self.solver_arguments["options"] = {"max_num_steps": 10_000}
 
     def forward(self, x0: State) -> Trajectory:
         """The closed loop from x₀ (*batch, n).
 
         Raises:
-            DivergenceError: a state or cost is not finite; names the step and the initial state.
+            DivergenceError: a state or cost is not finite; names the step and the initial state. Or an adaptive method,
+                which takes its steps for the whole batch, gave up.
         """
         loop, t = self.closed_loop, self.horizon.times(x0)
         y0 = torch.cat([x0, torch.zeros_like(x0[..., :1])], -1)
@@ -138,13 +141,15 @@ class Rollout(nn.Module):
     def _integrate(self, y0: Tensor, t: Times) -> Tensor:
         """The augmented state at the nodes, by the route of `gradient`."""
         solve: Callable[..., Any] = odeint
-        arguments = dict(self.tolerances)
+        arguments = dict(self.solver_arguments)
         if self.gradient == "adjoint" and torch.is_grad_enabled():
             solve = odeint_adjoint
             arguments |= self._adjoint_arguments()
         try:
-            return solve(self.closed_loop, y0, t, method=self.method, **arguments)
-        except AssertionError as error:  # how torchdiffeq says that an adaptive step shrank to nothing
+            return solve(self.closed_loop, y0, t, **arguments)
+        except (
+            AssertionError
+        ) as error:  # how torchdiffeq says that an adaptive step shrank to nothing, or too many came
             message = f"Expected {self.method} to reach t = {t[-1]:.4g} s, got {error}; {_REMEDY}."
             raise DivergenceError(message) from error
 

@@ -68,7 +68,8 @@ class Box(nn.Module):
         """`count` states drawn uniformly and independently; on a CPU generator whatever the box's device,
         so that a seed names the same states everywhere."""
         unit = torch.rand(count, self.dimension, generator=generator, dtype=torch.float64)
-        return self.lower + self.widths * unit.to(self.lower)
+        x = self.lower + self.widths * unit.to(self.lower)
+        return torch.minimum(x, self.upper)  # rounding may pass the upper bound, never the lower one
 
     def contains(self, x: State) -> Bool[Tensor, "*batch"]:
         """Whether each state lies in the closed box."""

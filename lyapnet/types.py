@@ -18,6 +18,8 @@ Time = Float[Tensor, "*#batch"]
 State = Float[Tensor, "*batch n"]
 Control = Float[Tensor, "*batch m"]
 PerState = Float[Tensor, "*batch"]  # one number for each state: V, a running cost, an energy
+Coordinates = Float[Tensor, "*batch d"]  # q or q̇ of a mechanical system, n = 2d
+MassMatrix = Float[Tensor, "*batch d d"]
 InputMatrix = Float[Tensor, "*batch n m"]
 ControlMatrix = Float[Tensor, "*batch m m"]
 Matrix = Float[Tensor, "rows columns"]

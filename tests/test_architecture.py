@@ -129,4 +129,4 @@ def loaded(*statements):
 def test_importing_lyapnet_loads_neither_lightning_nor_matplotlib():
     heavy = {"lightning", "matplotlib", "tensorboard"}
     assert not heavy & loaded("import lyapnet", "import lyapnet.cli")
-    assert heavy <= loaded("import lyapnet.experiment")
+    assert heavy & loaded("import lyapnet.figures") == {"matplotlib"}

@@ -37,19 +37,26 @@ import torch
 from torch import nn
 from lyapnet import ControlAffineSystem
 
-class Drone(ControlAffineSystem):
+class Balloon(ControlAffineSystem):
     state_names, state_units = ("height", "speed"), ("m", "m/s")
     control_names, control_units = ("thrust",), ("N",)
-
-    def __init__(self, mass=1.0):
-        super().__init__()
-        self.mass = mass
+    mass = 1.0
 
     def f(self, x):
         return torch.stack([x[..., 1], -x[..., 1] ** 3], -1)
 
     def g(self, x):
         return torch.stack([torch.zeros_like(x[..., :1]), torch.ones_like(x[..., :1]) / self.mass], -2)
+
+class Drone(Balloon):
+    def __init__(self, mass=1.0):
+        super().__init__()
+        self.mass = mass
+
+class Squadron(Balloon):
+    def __init__(self, **parameters):
+        super().__init__()
+        self.mass = parameters["mass"]
 
 class Bowl(nn.Module):
     def __init__(self, scaling, hidden=(4,)):
@@ -139,7 +146,7 @@ MISTYPED = {
     "program.normalise=maybe": ("program.normalise", "maybe"),
     "network.hidden=64": ("network.hidden",),
     "network.hidden=[a]": ("network.hidden", "'a'"),
-    "training.betas=0.9": ("training.betas",),
+    "training.beta1=high": ("training.beta1", "'high'"),
     "initial_states.lower=5": ("initial_states.lower",),
     "initial_states.lower=[a, b]": ("initial_states.lower", "'a'"),
     "trainer=5": ("trainer",),
@@ -176,8 +183,7 @@ OUT_OF_RANGE = {
     "training.iterations=0": ("training.iterations", "got 0"),
     "training.batch_size=0": ("training.batch_size", "got 0"),
     "training.learning_rate=0": ("training.learning_rate", "> 0"),
-    "training.betas=[0.9, 1.5]": ("training.betas", "1.5"),
-    "training.betas=[0.9]": ("training.betas", "0.9"),
+    "training.beta2=1": ("training.beta2", "1"),
     "evaluation.test_states=0": ("evaluation.test_states", "got 0"),
     "system.parameters.mass=-1": ("system.parameters", "mass > 0", "-1"),
     "cost.Q=[[1, 2], [3, 4]]": ("cost", "Q", "symmetric", "[3.0, 4.0]"),
@@ -337,9 +343,9 @@ def test_config_survives_plain_data_and_yaml(path, tmp_path):
 
 def test_defaults_are_not_shared_between_configs(plain):
     config_from_plain(plain).trainer["accelerator"] = "gpu"
-    config_from_plain(plain).training.betas.append(0.5)
+    config_from_plain(plain).system.parameters["mass"] = 2
     assert config_from_plain(plain).trainer == {}
-    assert config_from_plain(plain).training.betas == [0.9, 0.99]
+    assert config_from_plain(plain).system.parameters == {}
 
 
 # The shipped configs against the task sheet
@@ -409,11 +415,14 @@ def own_classes(tmp_path, monkeypatch):
     sys.modules.pop("hangar", None)
 
 
-def test_classes_of_the_users_own_are_built(own_classes, plain):
-    plain["system"] = {"name": f"{own_classes}:Drone", "parameters": {"mass": 4}}
+@pytest.mark.parametrize(("name", "mass"), [("Balloon", 1), ("Drone", 4), ("Squadron", 4)])
+def test_classes_of_the_users_own_are_built(name, mass, own_classes, plain):
+    """Also without a constructor, and with one that takes anything."""
+    parameters = {"mass": mass} if name != "Balloon" else {}
+    plain["system"] = {"name": f"{own_classes}:{name}", "parameters": parameters}
     plain["network"] = {"name": f"{own_classes}:Bowl", "hidden": [6]}
     task, V, _, rollout = objects(config_from_plain(plain))
     x = torch.randn(3, 2)
-    assert task.system.mass == 4
+    assert task.system.mass == mass
     assert V.width == 6
-    assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / 4)  # −½ R⁻¹gᵀV_x with V = ‖x‖²
+    assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / mass)  # −½ R⁻¹gᵀV_x with V = ‖x‖²

@@ -39,10 +39,15 @@ def _silu_derivative(a: Tensor) -> Tensor:
     return s * (1 + a * (1 - s))
 
 
+def _softplus(a: Tensor) -> Tensor:
+    # torch's own threshold of 20 is a jump of 2e-9 in float64
+    return nn.functional.softplus(a, threshold=40.0)
+
+
 # V_x enters the policy, so an activation with kinks would make the closed loop jump: smooth ones only.
 ACTIVATIONS: dict[str, Activation] = {
     "tanh": Activation(torch.tanh, _tanh_derivative, convex=False),
-    "softplus": Activation(nn.functional.softplus, torch.sigmoid, convex=True),
+    "softplus": Activation(_softplus, torch.sigmoid, convex=True),
     "silu": Activation(nn.functional.silu, _silu_derivative, convex=False),
     "sin": Activation(torch.sin, torch.cos, convex=False),
 }
@@ -92,3 +97,22 @@ class InputScaling(nn.Module):
             return pulled
         theta, sine, cosine = x[..., self.angles], gradient[..., n : n + k], gradient[..., n + k :]
         return pulled.index_add(-1, self.angles, sine * theta.cos() - cosine * theta.sin())
+
+
+def activation_named(name: str, *, convex: bool = False) -> Activation:
+    """The activation of that name.
+
+    Raises:
+        ValueError: there is none; or it is not convex and nondecreasing where it has to be.
+    """
+    known = [key for key, activation in ACTIVATIONS.items() if activation.convex or not convex]
+    if name not in known:
+        kind = "a convex activation" if convex else "an activation"
+        raise ValueError(f"Expected {kind}, got {name!r}; choose one of: {', '.join(known)}.")
+    return ACTIVATIONS[name]
+
+
+def require_widths(hidden: Sequence[int]) -> None:
+    """Refuse hidden layers that are not there."""
+    if not hidden or min(hidden) < 1:
+        raise ValueError(f"Expected hidden layers of width ≥ 1, got {list(hidden)}; for example [64, 64].")

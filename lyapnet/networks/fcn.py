@@ -7,7 +7,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from lyapnet.networks.base import ACTIVATIONS, InputScaling, Scaling
+from lyapnet.networks.base import InputScaling, Scaling, activation_named, require_widths
 from lyapnet.types import PerState, State, Time
 
 
@@ -29,9 +29,10 @@ class FCN(nn.Module):
         embedded_angles: Sequence[int] = (),
     ):
         super().__init__()
+        require_widths(hidden)
         self.inputs = InputScaling(scaling, embedded_angles)
         self.value_scale = scaling.value
-        self.activation = ACTIVATIONS[activation]
+        self.activation = activation_named(activation)
         widths = [1 + self.inputs.features, *hidden]
         self.hidden = cast(Sequence[nn.Linear], nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths)))
         self.output = nn.Linear(widths[-1], 1)

@@ -10,7 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from lyapnet.networks.base import ACTIVATIONS, Activation, InputScaling, Scaling
+from lyapnet.networks.base import InputScaling, Scaling, activation_named, require_widths
 from lyapnet.types import PerState, State, Time
 
 
@@ -51,9 +51,10 @@ class ICNN(nn.Module):
         epsilon: float = 1e-3,
     ):
         super().__init__()
+        require_widths(hidden)
         self.inputs = InputScaling(scaling)
         self.value_scale, self.epsilon = scaling.value, epsilon
-        self.activation = convex_activation(activation)
+        self.activation = activation_named(activation, convex=True)
         features = 1 + self.inputs.features
         through = [nn.Linear(features, width) for width in (*hidden, 1)]
         convex = [NonNegativeLinear(a, b) for a, b in pairwise((*hidden, 1))]
@@ -100,9 +101,10 @@ class PartiallyConvexNetwork(nn.Module):
 
     def __init__(self, scaling: Scaling, hidden: Sequence[int] = (64, 64), activation: str = "softplus"):
         super().__init__()
+        require_widths(hidden)
         self.inputs = InputScaling(scaling)
         self.value_scale = scaling.value
-        self.activation = convex_activation(activation)
+        self.activation = activation_named(activation, convex=True)
         self.time = nn.Linear(1, hidden[0])
         through = [nn.Linear(self.inputs.features, width, bias=False) for width in hidden]
         shift = [nn.Linear(hidden[0], width) for width in hidden]
@@ -136,14 +138,3 @@ class PartiallyConvexNetwork(nn.Module):
             g_a = (g_a @ convex.weight) * self.activation.derivative(a)
             g_xi = g_xi + g_a @ through.weight
         return self.inputs.pull_back(x, g_xi)
-
-
-def convex_activation(name: str) -> Activation:
-    """The activation of that name, or a ValueError if it would break convexity."""
-    activation = ACTIVATIONS[name]
-    if not activation.convex:
-        convex = [key for key, value in ACTIVATIONS.items() if value.convex]
-        raise ValueError(
-            f"Expected a convex activation, got {name!r}; a convex network needs one of: {', '.join(convex)}."
-        )
-    return activation

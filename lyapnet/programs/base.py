@@ -85,8 +85,8 @@ def _require_finite(name: str, term: PerState, trajectory: Trajectory) -> None:
     broken = torch.nonzero(~torch.isfinite(term.flatten())).flatten()
     if len(broken):
         first = int(broken[0])
-        x0 = trajectory.x[0].flatten(0, -2)[first].tolist()
+        x0 = trajectory.x[0].reshape(-1, trajectory.x.shape[-1])[first].tolist()
         raise DivergenceError(
-            f"Expected a finite loss, got {float(term.flatten()[first])} in term {name} from x0 = {x0}; lower "
+            f"Expected a finite loss, got {float(term.detach().flatten()[first])} in term {name} from x0 = {x0}; lower "
             "training.learning_rate or the term's weight."
         )

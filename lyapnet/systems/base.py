@@ -1,5 +1,6 @@
 """What a system is: dynamics affine in the control, and facts about its coordinates."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -7,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State
+from lyapnet.types import Control, ControlMatrix, Coordinates, InputMatrix, MassMatrix, PerState, State
 
 
 class ControlAffineSystem(nn.Module, ABC):
@@ -64,32 +65,32 @@ class MechanicalSystem(ControlAffineSystem):
 
     def __init__(self, actuation: Sequence[Sequence[float]], damping: Sequence[float]):
         super().__init__()
-        if min(damping) < 0:
+        if not all(isinstance(d, int | float) and 0 <= d < math.inf for d in damping):
             raise ValueError(f"Expected damping ≥ 0, got {list(damping)}; friction takes energy away.")
         self.register_buffer("B", torch.tensor(actuation, dtype=torch.get_default_dtype()))
         self.register_buffer("D", torch.tensor(damping, dtype=torch.get_default_dtype()))
 
     @abstractmethod
-    def mass_matrix(self, q: State) -> ControlMatrix:
+    def mass_matrix(self, q: Coordinates) -> MassMatrix:
         """M(q), (*batch, d, d), symmetric positive definite."""
 
     @abstractmethod
-    def forces(self, q: State, qdot: State) -> State:
+    def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         """h(q, q̇), (*batch, d): all forces but control and friction, in N or N·m."""
 
     @abstractmethod
     def energy(self, x: State) -> PerState:
         """Kinetic plus potential energy in J; constant along u = 0 without friction."""
 
-    def kinetic_energy(self, q: State, qdot: State) -> PerState:
+    def kinetic_energy(self, q: Coordinates, qdot: Coordinates) -> PerState:
         """½ q̇ᵀM(q)q̇ in J."""
         return ((self.mass_matrix(q) @ qdot[..., None])[..., 0] * qdot).sum(-1) / 2
 
-    def _split(self, x: State) -> tuple[State, State]:
+    def _split(self, x: State) -> tuple[Coordinates, Coordinates]:
         d = self.n // 2
         return x[..., :d], x[..., d:]
 
-    def _accelerate(self, q: State, qdot: State, force: State) -> State:
+    def _accelerate(self, q: Coordinates, qdot: Coordinates, force: Coordinates) -> State:
         """(q̇, q̈) under a generalised force, friction included."""
         qddot = torch.linalg.solve(self.mass_matrix(q), force - self.D * qdot)
         return torch.cat([qdot, qddot], -1)
@@ -100,7 +101,7 @@ class MechanicalSystem(ControlAffineSystem):
 
     def g(self, x: State) -> InputMatrix:
         q, _ = self._split(x)
-        MinvB = torch.linalg.solve(self.mass_matrix(q), self.B)
+        MinvB = self._solve_actuation(q)
         return torch.cat([torch.zeros_like(MinvB), MinvB], -2)
 
     def dynamics(self, x: State, u: Control) -> State:
@@ -111,11 +112,16 @@ class MechanicalSystem(ControlAffineSystem):
     def inverse_mass(self, x: State) -> ControlMatrix:
         """BᵀM(q)⁻¹B: the control weight R of the reference tasks."""
         q, _ = self._split(x)
-        return self.B.mT @ torch.linalg.solve(self.mass_matrix(q), self.B)
+        return self.B.mT @ self._solve_actuation(q)
+
+    def _solve_actuation(self, q: Coordinates) -> Tensor:
+        """M⁻¹B, (*batch, d, m)."""
+        # expanded: solve would take a (d, d) B beside a batch of d matrices for a batch of vectors
+        return torch.linalg.solve(self.mass_matrix(q), self.B.expand(*q.shape[:-1], *self.B.shape))
 
 
 def require_positive(**parameters: float) -> None:
     """Refuse physical parameters that are not positive, naming the first one."""
     for name, value in parameters.items():
-        if not value > 0:
-            raise ValueError(f"Expected {name} > 0, got {value}; give it in SI units.")
+        if not (isinstance(value, int | float) and 0 < value < math.inf):
+            raise ValueError(f"Expected {name} > 0, got {value!r}; give it in SI units.")

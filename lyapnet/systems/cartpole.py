@@ -3,7 +3,7 @@
 import torch
 
 from lyapnet.systems.base import MechanicalSystem, require_positive
-from lyapnet.types import ControlMatrix, PerState, State
+from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
 
 class Cartpole(MechanicalSystem):
@@ -38,17 +38,17 @@ class Cartpole(MechanicalSystem):
         pole_damping: float = 0.1,
         gravity: float = 9.81,
     ):
-        require_positive(cart_mass=cart_mass, pole_mass=pole_mass, length=length)
+        require_positive(cart_mass=cart_mass, pole_mass=pole_mass, length=length, gravity=gravity)
         super().__init__(actuation=[[1.0], [0.0]], damping=[cart_damping, pole_damping])
         self.cart_mass, self.pole_mass, self.length, self.gravity = cart_mass, pole_mass, length, gravity
 
-    def mass_matrix(self, q: State) -> ControlMatrix:
+    def mass_matrix(self, q: Coordinates) -> MassMatrix:
         coupling = self.pole_mass * self.length * torch.cos(q[..., 1])
         cart = torch.full_like(coupling, self.cart_mass + self.pole_mass)
         pole = torch.full_like(coupling, self.pole_mass * self.length**2)
         return torch.stack([cart, coupling, coupling, pole], -1).unflatten(-1, (2, 2))
 
-    def forces(self, q: State, qdot: State) -> State:
+    def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         ml_sin = self.pole_mass * self.length * torch.sin(q[..., 1])
         return torch.stack([ml_sin * qdot[..., 1] ** 2, self.gravity * ml_sin], -1)
 

@@ -26,7 +26,7 @@ class Linear(ControlAffineSystem):
 
     def __init__(self, A: Sequence[Sequence[float]] | Tensor, B: Sequence[Sequence[float]] | Tensor):
         super().__init__()
-        a, b = (torch.as_tensor(matrix, dtype=torch.get_default_dtype()) for matrix in (A, B))
+        a, b = _matrix("A", A), _matrix("B", B)
         if a.ndim != 2 or a.shape[0] != a.shape[1] or b.ndim != 2 or b.shape[0] != a.shape[0]:
             raise ValueError(
                 f"Expected A of shape (n, n) and B of shape (n, m), got {tuple(a.shape)} and {tuple(b.shape)}; "
@@ -70,3 +70,13 @@ class DoubleIntegrator(Linear):
     def inverse_mass(self, x: State) -> ControlMatrix:
         """1/m: the control weight R of the reference task."""
         return torch.full((*x.shape[:-1], 1, 1), 1.0 / self.mass).to(x)
+
+
+def _matrix(name: str, rows: Sequence[Sequence[float]] | Tensor) -> Tensor:
+    try:
+        matrix = torch.as_tensor(rows, dtype=torch.get_default_dtype())
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"Expected {name} as a list of rows of one length, got {rows!r}; correct it.") from error
+    if not torch.isfinite(matrix).all():
+        raise ValueError(f"Expected finite entries in {name}, got {matrix.tolist()}; correct them.")
+    return matrix

@@ -3,7 +3,7 @@
 import torch
 
 from lyapnet.systems.base import MechanicalSystem, require_positive
-from lyapnet.types import ControlMatrix, PerState, State
+from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
 
 class Reacher(MechanicalSystem):
@@ -40,13 +40,13 @@ class Reacher(MechanicalSystem):
         super().__init__(actuation=[[1.0, 0.0], [0.0, 1.0]], damping=[damping, damping])
         self.a1, self.a2, self.a3 = a1, a2, a3
 
-    def mass_matrix(self, q: State) -> ControlMatrix:
+    def mass_matrix(self, q: Coordinates) -> MassMatrix:
         a2_cos = self.a2 * torch.cos(q[..., 1])
         coupling = self.a3 + a2_cos
         elements = [self.a1 + 2 * a2_cos, coupling, coupling, torch.full_like(coupling, self.a3)]
         return torch.stack(elements, -1).unflatten(-1, (2, 2))
 
-    def forces(self, q: State, qdot: State) -> State:
+    def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         first, second = qdot.unbind(-1)
         coriolis = torch.stack([second * (2 * first + second), -(first**2)], -1)
         return self.a2 * torch.sin(q[..., 1:]) * coriolis

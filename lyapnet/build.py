@@ -1,5 +1,6 @@
 """From a config to the objects it names."""
 
+import difflib
 import importlib
 import inspect
 import sys
@@ -59,14 +60,27 @@ def build_task(config: Config, system: ControlAffineSystem | None = None) -> Tas
 def build_system(config: SystemConfig) -> ControlAffineSystem:
     """The system of a config, registered or the user's own."""
     cls = resolve(config.name, SYSTEMS, "system.name", ControlAffineSystem)
-    known = inspect.signature(cls).parameters
-    unknown = [key for key in config.parameters if key not in known]
-    missing = [key for key, p in known.items() if p.default is p.empty and key not in config.parameters]
-    if unknown or missing:
-        got = f"unknown system.parameters.{unknown[0]}" if unknown else f"no system.parameters.{missing[0]}"
-        raise UsageError(f"Expected the parameters of {config.name}: {', '.join(known)}; got {got}.")
+    _check_parameters(cls, config)
     with _section(f"system.parameters of {config.name}"):
         return cls(**config.parameters)
+
+
+def _check_parameters(cls: type, config: SystemConfig) -> None:
+    """Hold the names under system.parameters against the constructor's arguments."""
+    arguments = inspect.signature(cls).parameters.values()
+    named = [a for a in arguments if a.kind in (a.POSITIONAL_OR_KEYWORD, a.KEYWORD_ONLY)]
+    names = [a.name for a in named]
+    open_ended = any(a.kind is a.VAR_KEYWORD for a in arguments)
+    for name in config.parameters:
+        if name not in names and not open_ended:
+            near = difflib.get_close_matches(name, names, n=1)
+            hint = f"did you mean system.parameters.{near[0]}?" if near else "remove it."
+            known = ", ".join(names) or "none"
+            raise UsageError(f"Expected parameters of {config.name} ({known}), got system.parameters.{name}; {hint}")
+    missing = [a.name for a in named if a.default is a.empty and a.name not in config.parameters]
+    if missing:
+        keys = ", ".join(f"system.parameters.{name}" for name in missing)
+        raise UsageError(f"Expected values for {keys}, got none; {config.name} has no default for them.")
 
 
 def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost:

@@ -210,7 +210,7 @@ class Checkpoints(ModelCheckpoint):
         # The folder may have moved since, and its checkpoints with it; Lightning would forget the best score.
         best, last = (str(Path(str(self.dirpath)) / f"{name}.ckpt") for name in (BEST, LAST))
         paths = {"dirpath": self.dirpath, "best_model_path": best, "kth_best_model_path": best, "last_model_path": last}
-        scores = {best: score for score in state_dict["best_k_models"].values()}
+        scores = {best: state_dict["best_model_score"]} if state_dict["best_k_models"] else {}
         super().load_state_dict({**state_dict, **paths, "best_k_models": scores})
 
     def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:

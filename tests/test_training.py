@@ -120,7 +120,7 @@ def without_figures():
     pkgutil.resolve_name("lyapnet.callbacks:FigureLogger")._draw = lambda *_: None
 
 
-def dies_at(place, name, call):
+def dies_at(place, name, call=1):
     """SIGKILL itself when a function is called for the n-th time."""
     owner, calls = pkgutil.resolve_name(place), itertools.count(1)
     original = getattr(owner, name)
@@ -133,17 +133,17 @@ def dies_at(place, name, call):
     setattr(owner, name, deadly)
 
 
-def dies_while_writing(suffix):
-    """SIGKILL itself in the middle of writing a text file."""
-    original = Path.write_text
+def dies_writing(name, call=1):
+    """SIGKILL itself when half of what would have become a file of this name is written, for the n-th time."""
+    original, calls = os.replace, itertools.count(1)
 
-    def deadly(path, text, **options):
-        if path.name.endswith(suffix):
-            original(path, text[: len(text) // 2], **options)
+    def deadly(source, target, **options):
+        if name in str(target) and next(calls) == call:
+            os.truncate(source, Path(source).stat().st_size // 2)
             os.kill(os.getpid(), signal.SIGKILL)
-        return original(path, text, **options)
+        return original(source, target, **options)
 
-    Path.write_text = deadly
+    os.replace = deadly
 
 
 # What a run leaves behind
@@ -311,40 +311,39 @@ def test_best_checkpoint_is_the_best_validation(reference):
 
 # Killed
 
-BEFORE_ANY_CHECKPOINT = [
-    ("lyapnet.experiment", "_prepare_folder", 1),
-    ("lyapnet.callbacks:ScalarLogger", "_log_validation", 1),
-    ("lyapnet.modules:ProgramModule", "on_before_optimizer_step", 3),
-    ("os", "fsync", 1),  # the first best.ckpt is written, not yet in place
-]
-LATER = [
-    ("os", "fsync", 2),  # best.ckpt is in place, last.ckpt not
-    ("lyapnet.modules:ProgramModule", "training_step", 8),
-    ("lyapnet.events:RecordWriter", "write", 30),  # taking back what was logged after the checkpoint
-    ("lyapnet.callbacks:ScalarLogger", "on_train_batch_end", 3),  # a step is made, not yet logged
-    ("lyapnet.modules:ProgramModule", "validate_on", 2),
-    ("os", "fsync", 3),
-    ("os", "replace", 1),
-    ("lyapnet.callbacks:FigureLogger", "_draw", 1),
-]
-AT_THE_END = [
-    ("lyapnet.experiment", "evaluate", 1),
-    ("lyapnet.experiment:TensorBoardLogger", "log_hyperparams", 1),
-    ("lyapnet.experiment:TensorBoardLogger", "finalize", 2),
+MODULE, SCALARS = "lyapnet.modules:ProgramModule", "lyapnet.callbacks:ScalarLogger"
+LOGGER = "lyapnet.experiment:TensorBoardLogger"
+MOMENTS = [  # in this order in one run
+    (dies_at, "lyapnet.experiment", "_prepare_folder"),
+    (dies_writing, "config.yaml"),
+    (dies_at, SCALARS, "_log_validation"),
+    (dies_at, MODULE, "on_before_optimizer_step", 3),
+    (dies_writing, "best.ckpt"),
+    (dies_writing, "last.ckpt"),  # best.ckpt is in place
+    (dies_at, MODULE, "training_step", 8),  # step 8, after the checkpoint of step 5
+    (dies_at, "lyapnet.events:RecordWriter", "write", 30),
+    (dies_writing, "events.out"),
+    (dies_at, SCALARS, "on_train_batch_end", 3),  # step 8 is made, not logged
+    (dies_at, MODULE, "validate_on", 2),
+    (dies_writing, "last.ckpt", 2),
+    (dies_at, "lyapnet.callbacks:FigureLogger", "_draw"),
+    (dies_at, "lyapnet.experiment", "evaluate"),
+    (dies_at, LOGGER, "log_hyperparams"),
+    (dies_at, LOGGER, "finalize", 2),
+    (dies_writing, "evaluation.json"),
 ]
 
 
 def survives(desk, moments, arguments=()):
     """Start, then resume again and again, killed at each of the moments."""
-    for place, name, call in moments:
-        status, _, errors = desk.train(*arguments, prepare=functools.partial(dies_at, place, name, call))
-        assert status == -signal.SIGKILL, (place, name, call, errors)
+    for moment in moments:
+        status, _, errors = desk.train(*arguments, prepare=functools.partial(*moment))
+        assert status == -signal.SIGKILL, (moment, errors)
         arguments = ("--resume", "last")
 
 
 def test_killed_at_chosen_moments_a_run_ends_the_same(desk, reference):
-    survives(desk, [*BEFORE_ANY_CHECKPOINT, *LATER, *AT_THE_END])
-    assert desk.train("--resume", "last", prepare=functools.partial(dies_while_writing, "evaluation.json"))[0] < 0
+    survives(desk, MOMENTS)
     assert desk.train("--resume", "last")[0] == 0
     assert_same_end(desk, reference)
 
@@ -363,8 +362,21 @@ def test_killed_at_random_moments_a_run_ends_the_same(desk, reference):
     assert_same_end(desk, reference)
 
 
+def forgets_to_take_back():
+    pkgutil.resolve_name("lyapnet.experiment").drop_events_after = lambda *_: None
+
+
+def test_steps_that_are_logged_twice_are_found(desk, reference):
+    """A twin: without taking back what was logged after the checkpoint, every curve has steps 6 and 7 twice."""
+    survives(desk, [(dies_at, MODULE, "training_step", 8)])
+    assert desk.train("--resume", "last", prepare=forgets_to_take_back)[0] == 0
+    unequal = set(unequal_ends(desk, reference))
+    assert {"loss/train", "gradient_norm", "rollout_steps_per_second"} <= unequal
+    assert not any(name.startswith(("last", "best", "evaluation")) for name in unequal)
+
+
 def test_another_seed_ends_differently(desk, reference):
-    """The twin of every comparison above."""
+    """A twin: what the comparison can see."""
     assert desk.train("seed=1", prepare=without_figures)[0] == 0
     unequal = set(unequal_ends(desk, reference))
     assert {"evaluation.json", "trajectory_cost/val", "loss/train", "gradient_norm"} <= unequal
@@ -419,7 +431,7 @@ def test_finetuning_killed_before_its_first_checkpoint_ends_the_same(reference, 
         (tmp_path / name).mkdir()
         desk = Desk(tmp_path / name)
         if killed:
-            survives(desk, [("lyapnet.modules:ProgramModule", "training_step", 2)], source)
+            survives(desk, [(dies_at, MODULE, "training_step", 2)], source)
         arguments = ("--resume", "last", *source[2:]) if killed else source
         assert desk.train(*arguments, prepare=without_figures)[0] == 0
         ends.append(desk)

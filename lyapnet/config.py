@@ -131,6 +131,9 @@ class TrainingConfig:
     beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
     weight_decay: float = option(0.0, "Of the optimiser.", at_least=0)
     precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
+    threads: int = option(
+        1, "CPU threads; in networks this small, more of them mostly wait for each other.", at_least=1
+    )
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
 
 

@@ -131,6 +131,7 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
     """
     config, run, module = plan.config, plan.run, plan.module
     _quiet()
+    torch.set_num_threads(config.training.threads)
     data = InitialStateDataModule(
         module.task.initial_states, config.training.batch_size, config.evaluation.validation_states, config.seed
     )

@@ -1,5 +1,6 @@
 """Checkpoint files: whole or refused, never executed, written all or nothing."""
 
+import errno
 import importlib
 import io
 import os
@@ -16,7 +17,6 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet import checkpoint as checkpoint_module
 from lyapnet.build import build_task, build_value_function
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.config import load_config, to_plain
@@ -230,14 +230,8 @@ def test_no_other_name_in_a_checkpoint_is_imported(key, trap, tmp_path, content)
 # All or nothing
 
 
-class FullDisk:
-    """Stands for os, whose fsync finds no space."""
-
-    def __getattr__(self, name):
-        return getattr(os, name)
-
-    def fsync(self, descriptor):
-        raise OSError(28, os.strerror(28))
+def finds_no_space(descriptor):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def assert_untouched(path, before):
@@ -248,7 +242,7 @@ def assert_untouched(path, before):
 
 def test_failed_write_keeps_the_previous_checkpoint(path, content, monkeypatch):
     before = path.read_bytes()
-    monkeypatch.setattr(checkpoint_module, "os", FullDisk())
+    monkeypatch.setattr(os, "fsync", finds_no_space)
     with pytest.raises(CheckpointError) as raised:
         write_checkpoint({**content, "global_step": 8}, path)
     is_one_line_that_names(path, raised.value)

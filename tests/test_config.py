@@ -212,7 +212,7 @@ IMPOSSIBLE = {
     "network.name=fcn & network.epsilon=0.1": ("network.epsilon", "fcn"),
     "network.embed_angles=true": ("network.embed_angles", "anchored"),
     "network.activation=tanh": ("network", "activation", "convex", "softplus"),
-    "system.name=linear": ("system.parameters", "linear", "A", "B"),
+    "system.name=linear": ("system.parameters.A", "linear"),
     "system.name=cartpole & system.parameters.mass=1": ("system.parameters.mass", "cart_mass"),
     "system.name=reacher": ("initial_states", "4", "shoulder angle"),
     "system={name: linear, parameters: {A: [[0, 1], [0, 0]], B: [[0], [1]]}} & cost.R=inverse_mass": (

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -291,7 +292,7 @@ def test_no_samples_are_refused(controller):
 def own_system(path, tmp_path):
     """The checkpoint of a run on a system of the user's own."""
     content = read_checkpoint(path)
-    content[KEY]["config"]["system"] = {"name": "mine:Cart", "parameters": {"weight": 2.0}}
+    content[KEY]["config"]["system"] = {"name": "mine:Cart", "parameters": {"mass": 2.0}}
     write_checkpoint(content, tmp_path / "own.ckpt")
     return tmp_path / "own.ckpt"
 
@@ -301,6 +302,19 @@ def test_system_of_the_users_own_is_passed_to_load(own_system):
         lyapnet.load(own_system)
     mine = DoubleIntegrator(mass=2.0)
     assert lyapnet.load(own_system, system=mine).system is mine
+
+
+def test_evaluate_command_takes_a_system_of_the_users_own(own_system, monkeypatch, capsys):
+    monkeypatch.chdir(own_system.parent)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (own_system.parent / "mine.py").write_text("from lyapnet.systems import DoubleIntegrator as Cart\n")
+    arguments = ["evaluate", str(own_system), "--samples", "5", "--json"]
+    assert main(arguments) == 2
+    assert "mine:Cart" in capsys.readouterr().err
+    assert main([*arguments, "--system", "mine:Cart"]) == 0
+    sys.modules.pop("mine")
+    expected = evaluate(lyapnet.load(own_system, system=DoubleIntegrator(mass=2.0)), 5)
+    assert json.loads(capsys.readouterr().out) == expected
 
 
 def test_passed_system_replaces_the_one_of_the_checkpoint(controller, path):

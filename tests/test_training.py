@@ -33,7 +33,10 @@ from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.controller import Controller, load_value_function
+from lyapnet.errors import UsageError
+from lyapnet.networks import FCN
 from lyapnet.randomness import VALIDATION, stream
+from lyapnet.systems import DoubleIntegrator
 
 ROOT = Path(__file__).parents[1]
 SMALL = {
@@ -52,6 +55,7 @@ STEPS = SMALL["training"]["iterations"]
 VALIDATIONS = [0, 5, 10, 15, 20, 25, 30, 32]
 DRAWINGS = [0, 20, 32]
 FIGURES = {"certified_region", "trajectories", "value_slices"}
+PATIENCE = 120  # seconds
 
 server = multiprocessing.get_context("forkserver")
 server.set_forkserver_preload(["pytest", "lyapnet.experiment", "lyapnet.cli", "tensorboard.util.tensor_util"])
@@ -89,13 +93,16 @@ class Desk:
         return self.end(self.start(*arguments, prepare=prepare))
 
     def end(self, process):
-        process.join(120)
+        process.join(PATIENCE)
+        process.kill()  # one that hangs has no exit status, which fails its test
         return process.exitcode, self.output.read_text(), self.errors.read_text()
 
     def wait_for(self, text, process):
         """Until the process has written this."""
+        deadline = time.monotonic() + PATIENCE
         while text not in (self.output.read_text() if self.output.exists() else ""):
             assert process.is_alive(), self.errors.read_text()
+            assert time.monotonic() < deadline
             time.sleep(0.005)
 
     def copy(self, folder):
@@ -351,7 +358,7 @@ def test_killed_at_chosen_moments_a_run_ends_the_same(desk, reference):
 def test_killed_at_random_moments_a_run_ends_the_same(desk, reference):
     chance = random.Random(0)
     process = desk.start()
-    for step in (5, 10, 15, 20, 30):
+    for step in (5, 10, 15, 20, 25):
         desk.wait_for(f"step {step}/", process)
         time.sleep(chance.uniform(0, 0.15))
         os.kill(process.pid, signal.SIGKILL)
@@ -536,6 +543,46 @@ def test_truncated_last_checkpoint_is_refused_and_the_best_one_loads(finished, a
     assert message.count("\n") == 1
     assert "last.ckpt" in message
     lyapnet.load(finished.run / "checkpoints" / "best.ckpt")
+
+
+# With classes of the user's own
+
+OWN = """
+import torch
+from lyapnet import ControlAffineSystem
+from lyapnet.networks import FCN
+
+class Cart(ControlAffineSystem):
+    state_names, state_units = ("position", "velocity"), ("m", "m/s")
+    control_names, control_units = ("force",), ("N",)
+
+    def f(self, x):
+        return torch.stack([x[..., 1], -x[..., 1]], -1)
+
+    def g(self, x):
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
+
+class Network(FCN):
+    pass
+"""
+
+
+def test_classes_of_the_users_own_train_resume_and_load(tmp_path):
+    desk = Desk(
+        tmp_path,
+        system={"name": "own:Cart"},
+        cost={"Q": [1, 1], "R": [1], "Q_T": [1, 1]},
+        network={"name": "own:Network", "hidden": [4]},
+    )
+    (tmp_path / "own.py").write_text(OWN)
+    assert desk.train("training.iterations=2")[0] == 0
+    assert desk.train("--resume", "last", "training.iterations=3", prepare=without_figures)[0] == 0
+    with pytest.raises(UsageError, match="own:Cart"):
+        lyapnet.load(desk.last)
+    with pytest.raises(UsageError, match="own:Network"):
+        lyapnet.load(desk.last, system=DoubleIntegrator())
+    controller = lyapnet.load(desk.last, system=DoubleIntegrator(), network=FCN)
+    assert controller.rollout([[1.0, 0.0]]).cost.shape == (1,)
 
 
 # Fine-tuned

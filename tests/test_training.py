@@ -327,7 +327,8 @@ MOMENTS = [  # in this order in one run
     (dies_at, MODULE, "on_before_optimizer_step", 3),
     (dies_writing, "best.ckpt"),
     (dies_writing, "last.ckpt"),  # best.ckpt is in place
-    (dies_at, MODULE, "training_step", 8),  # step 8, after the checkpoint of step 5
+    (dies_at, "lyapnet.callbacks:Checkpoints", "on_train_epoch_start", 6),  # right after the checkpoint of step 5
+    (dies_at, MODULE, "training_step", 3),  # step 8
     (dies_at, "lyapnet.events:RecordWriter", "write", 30),
     (dies_writing, "events.out"),
     (dies_at, SCALARS, "on_train_batch_end", 3),  # step 8 is made, not logged
@@ -479,6 +480,15 @@ def test_resuming_another_config_is_refused(override, key, reference, ask):
     assert message.count("\n") == 1
     for text in ("Expected", key, "--finetune"):
         assert text in message
+
+
+def test_resuming_another_config_is_refused_before_the_first_checkpoint_too(desk):
+    survives(desk, [(dies_at, MODULE, "training_step", 2)])
+    status, _, message = desk.train("--resume", "last", "program.margin=0.2", prepare=without_figures)
+    assert status == 2
+    assert message.count("\n") == 1
+    assert "program.margin" in message
+    assert not desk.last.exists()
 
 
 def test_resuming_a_finished_run_says_so(reference, ask):

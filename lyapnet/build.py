@@ -1,5 +1,6 @@
 """From a config to the objects it names."""
 
+import copy
 import difflib
 import importlib
 import inspect
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 from lyapnet.config import Config, CostConfig, SystemConfig
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
-from lyapnet.networks import NETWORKS, GoalAnchor, Scaling, TerminalAnchor
+from lyapnet.networks import NETWORKS, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
 from lyapnet.programs import PROGRAMS, Program
 from lyapnet.rollout import Horizon, Rollout
@@ -45,7 +46,8 @@ def build_task(config: Config, system: ControlAffineSystem | None = None) -> Tas
     """
     dtype = DTYPES[config.training.precision]
     with _float64_defaults():
-        system = system or build_system(config.system)
+        # in float64 for the checks below, and a copy: the caller's system keeps its precision
+        system = build_system(config.system) if system is None else copy.deepcopy(system).double()
         with _section("initial_states"):
             initial_states = Box(config.initial_states.lower, config.initial_states.upper)
             _require_length("initial_states.lower", initial_states.dimension, system)
@@ -61,7 +63,7 @@ def build_system(config: SystemConfig) -> ControlAffineSystem:
     """The system of a config, registered or the user's own."""
     cls = resolve(config.name, SYSTEMS, "system.name", ControlAffineSystem)
     _check_parameters(cls, config)
-    with _section(f"system.parameters of {config.name}"):
+    with _float64_defaults(), _section(f"system.parameters of {config.name}"):
         return cls(**config.parameters)
 
 
@@ -123,7 +125,6 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
         "embedded_angles": task.system.angles if options.embed_angles else None,
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}
-    anchor = {"epsilon": chosen.pop("epsilon")} if options.name == "anchored" and options.epsilon else {}
     accepted = inspect.signature(cls).parameters
     for key in ("scaling", *chosen):
         if key not in accepted:
@@ -134,8 +135,6 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
         V = cls(scaling=_scaling(config, task), **chosen)
         if options.terminal == "exact":
             V = TerminalAnchor(V, task.cost, task.horizon.duration)
-        if options.name == "anchored":
-            V = GoalAnchor(V, **anchor)
     return V.to(DTYPES[config.training.precision])
 
 

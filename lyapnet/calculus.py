@@ -36,7 +36,12 @@ def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
 def lie_derivatives(V: Value, system: ControlAffineSystem, t: Time, x: State) -> tuple[PerState, Control]:
     """(LfV, LgV) = (V_xᵀf, gᵀV_x), of shapes (*batch,) and (*batch, m)."""
     V_x = state_gradient(V, t, x)
-    return (V_x * system.f(x)).sum(-1), input_lie_derivative(system, x, V_x)
+    return drift_lie_derivative(system, x, V_x), input_lie_derivative(system, x, V_x)
+
+
+def drift_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> PerState:
+    """LfV = V_xᵀf(x)."""
+    return (V_x * system.f(x)).sum(-1)
 
 
 def input_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> Control:

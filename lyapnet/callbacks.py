@@ -1,8 +1,10 @@
 """What is shown, logged and saved, and when."""
 
+import math
 import signal
 import textwrap
 import time
+import warnings
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -10,9 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -20,9 +21,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
-from lyapnet.checkpoint import read_plain_data, write_checkpoint
 from lyapnet.config import to_yaml
-from lyapnet.errors import LyapnetError
+from lyapnet.errors import DivergenceError, Interrupted
 from lyapnet.modules import ProgramModule
 from lyapnet.randomness import FIGURES, stream
 
@@ -77,6 +77,7 @@ class ScalarLogger(Callback):
             trainer,
             {
                 "loss/train": outputs["loss"].detach(),
+                **{f"term/{name}": value for name, value in outputs["terms"].items()},
                 "constraint_loss/train": outputs["constraint_loss"],
                 "trajectory_cost/train": outputs["trajectory_cost"],
                 "gradient_norm": module.gradient_norm,
@@ -100,6 +101,7 @@ class ScalarLogger(Callback):
             "value_error/val": summary["value_error"],
             "value_to_cost/val": summary["value_to_cost"],
             "satisfied_fraction/val": summary["satisfied_fraction"],
+            "bounded_fraction/val": summary["bounded_fraction"],
             "decreasing_fraction/val": summary["decreasing_fraction"],
             "terminal_error/val": summary["terminal_error"],
         }
@@ -125,102 +127,97 @@ class FigureLogger(Callback):
         if step % self.every == 0 or step == trainer.max_epochs:
             self._draw(trainer, _program_module(pl_module))
 
-    @staticmethod
-    def _draw(trainer: Trainer, module: ProgramModule) -> None:
+    def _draw(self, trainer: Trainer, module: ProgramModule) -> None:
         if not trainer.is_global_zero:
             return
+        try:
+            drawn = self._figures(module)
+        except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
+            warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
+            return
+        for name, figure in drawn.items():
+            writer(trainer).add_image(name, _pixels(figure), trainer.global_step, dataformats="HWC")
+
+    @staticmethod
+    def _figures(module: ProgramModule) -> dict[str, Figure]:
         system, _, initial_states, horizon = module.task
         x0 = initial_states.sample(12, stream(module.config.seed, FIGURES))
         with torch.no_grad():
             sample = module.closed_loop(x0)
-        drawn = {
+        return {
             "certified_region": figures.certified_region(module.V, module.closed_loop, system, initial_states),
             "trajectories": figures.trajectories(module.V, sample, system),
             "value_slices": figures.value_slices(module.V, system, initial_states, horizon.duration),
         }
-        for name, figure in drawn.items():
-            writer(trainer).add_image(name, _pixels(figure), trainer.global_step, dataformats="HWC")
 
 
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's door to checkpoint files: all or nothing on writing, nothing executed on reading."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        write_checkpoint(checkpoint, path)
-
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read_plain_data(path, map_location or "cpu")
-
-
-class Interrupted(LyapnetError):
-    """Ctrl-C or SIGTERM arrived; the run was saved."""
-
-    exit_status = 0
-
-
-class Checkpoints(ModelCheckpoint):
+class Checkpoints(Checkpoint):
     """last.ckpt after every validation, best.ckpt where loss/val is least, and last.ckpt on Ctrl-C and SIGTERM.
 
-    The event file is flushed first, so that it is never behind the checkpoint.
+    The event file is flushed first, so that it is never behind the checkpoint. (Lightning's ModelCheckpoint writes its
+    last checkpoint only together with a best one, remembers absolute paths, and its position within an interval.)
+
+    Args:
+        folder: where both files go.
+        every: steps between validations; the last step is validated and saved whether a multiple or not.
     """
 
     def __init__(self, folder: Path, every: int):
-        super().__init__(
-            dirpath=folder,
-            filename=BEST,
-            monitor="loss/val",
-            save_last=True,
-            every_n_epochs=every,
-            save_on_train_epoch_end=True,
-            enable_version_counter=False,
-        )
+        super().__init__()
+        self.folder, self.every = folder, every
+        self.best_loss = math.inf
         self._signal: int | None = None
         self._previous: dict[int, Any] = {}
 
-    @property
-    def state_key(self) -> str:
-        # Lightning's key holds the interval, which the last step changes: a run that goes on would not find its state
-        return type(self).__name__
+    def state_dict(self) -> dict[str, Any]:
+        return {"best_loss": self.best_loss}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.best_loss = state_dict["best_loss"]
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_train_start(trainer, pl_module)
         for number in (signal.SIGINT, signal.SIGTERM):
             self._previous[number] = signal.signal(number, self._remember)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_train_epoch_start(trainer, pl_module)
-        if trainer.current_epoch + 1 == trainer.max_epochs:  # the last step is validated and saved, multiple or not
-            trainer.check_val_every_n_epoch = self._every_n_epochs = 1
+        if trainer.global_step + 1 == trainer.max_epochs:
+            trainer.check_val_every_n_epoch = 1
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        super().on_train_epoch_end(trainer, pl_module)
-        if self._signal is not None:
-            path = Path(str(self.dirpath)) / f"{LAST}.ckpt"
-            self._save_checkpoint(trainer, str(path))
-            name = signal.Signals(self._signal).name
-            raise Interrupted(f"{name} after step {trainer.global_step}: saved {path}. Continue with --resume last.")
+        step = trainer.global_step
+        if step % self.every == 0 or step == trainer.max_epochs:
+            loss = float(trainer.callback_metrics["loss/val"])
+            if loss < self.best_loss:
+                self.best_loss = loss
+                self._save(trainer, BEST)
+            self._save(trainer, LAST)
+        # every process stops if one of them was told to
+        if trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
+            path = self._save(trainer, LAST)
+            name = signal.Signals(self._signal).name if self._signal else "Stop"
+            raise Interrupted(f"{name} after step {step}: saved {path}. Continue with --resume last.")
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._restore_handlers()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        super().teardown(trainer, pl_module, stage)
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
-        self._previous.clear()
+        self._restore_handlers()
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        # The folder may have moved since, and its checkpoints with it; Lightning would forget the best score.
-        best, last = (str(Path(str(self.dirpath)) / f"{name}.ckpt") for name in (BEST, LAST))
-        paths = {"dirpath": self.dirpath, "best_model_path": best, "kth_best_model_path": best, "last_model_path": last}
-        scores = {best: state_dict["best_model_score"]} if state_dict["best_k_models"] else {}
-        super().load_state_dict({**state_dict, **paths, "best_k_models": scores})
-
-    def _save_checkpoint(self, trainer: Trainer, filepath: str) -> None:
+    def _save(self, trainer: Trainer, name: str) -> Path:
+        path = self.folder / f"{name}.ckpt"
         writer(trainer).flush()
-        super()._save_checkpoint(trainer, filepath)
+        trainer.save_checkpoint(path)
+        return path
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if self._signal is not None:  # the second time, the user means now
-            raise KeyboardInterrupt
+            raise Interrupted("Stopped at once; the last checkpoint is from before this step.", exit_status=130)
         self._signal = number
+
+    def _restore_handlers(self) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()
 
 
 class TrainingProgress(ProgressBar):
@@ -275,8 +272,14 @@ class TrainingProgress(ProgressBar):
             soft_wrap=True,
         )
 
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._stop()
+
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        if self._progress is not None:
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._progress is not None:  # gives the cursor back to the terminal
             self._progress.stop()
             self._progress = None
 

@@ -50,20 +50,28 @@ def evaluate(
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     system: Annotated[str | None, typer.Option(help="module:Class of a system of your own.")] = None,
+    network: Annotated[str | None, typer.Option(help="module:Class of a network of your own.")] = None,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀."""
-    from lyapnet.build import build_system
+    import torch
+    from torch import nn
+
+    from lyapnet.build import build_system, resolve
     from lyapnet.checkpoint import read_checkpoint
     from lyapnet.config import SystemConfig
     from lyapnet.controller import config_of, load
     from lyapnet.evaluation import evaluate as measure
+    from lyapnet.networks import NETWORKS
 
     own = None
     if system is not None:
         parameters = config_of(read_checkpoint(checkpoint), checkpoint).system.parameters
         own = build_system(SystemConfig(name=system, parameters=parameters))
-    result = measure(load(checkpoint, system=own), samples, seed)
+    own_network = None if network is None else resolve(network, NETWORKS, "--network", nn.Module)
+    controller = load(checkpoint, system=own, network=own_network)
+    torch.set_num_threads(controller.config.training.threads)
+    result = measure(controller, samples, seed)
     if as_json:
         print(json.dumps(result))
     else:
@@ -155,6 +163,7 @@ ROWS = {
     "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
     "constraint_loss": "constraint loss, mean",
     "terminal_error": "terminal error, mean ‖x(T)‖",
+    "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
     "decreasing_fraction": "V decreases at every step, share of states",
     "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
     "satisfied_fraction_1e-3": "… within 0.1 %",

@@ -14,7 +14,7 @@ from typing import Any
 
 import yaml
 from omegaconf import MISSING, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from lyapnet.errors import UsageError
 from lyapnet.networks import ACTIVATIONS, NETWORKS
@@ -99,8 +99,8 @@ class NetworkConfig:
     hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
     activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
-    epsilon: float | None = option(None, "ε of the lower bound V ≥ ε‖x‖² (icnn, anchored).", above=0)
-    terminal: str = option("free", "exact builds V(T, ·) = φ in (for anchored: φ + ε‖x‖²).", choices=("free", "exact"))
+    epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
+    terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
     state_scale: list[float] | None = option(
         None, "Expected |x|; null: the extent of X₀, 1 where it has none.", above=0
     )
@@ -172,15 +172,22 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
         UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
     """
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        content = OmegaConf.to_container(
+            OmegaConf.load(path), resolve=False
+        )  # reads 1e-2 as a number; YAML 1.1 does not
     except OSError as error:
-        raise UsageError(f"Expected a config file, got {str(path)!r} ({error.strerror}); see conf/.") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(
+            f"Expected a config file, got {str(path)!r} ({error.strerror or error}); see conf/."
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
-    if not isinstance(content, Mapping):
-        raise UsageError(f"Expected sections in {str(path)!r}, got {type(content).__name__}; see conf/ for an example.")
-    return config_from_plain(content, overrides)
+    sections = [f.name for f in dataclasses.fields(Config)]
+    if not isinstance(content, Mapping) or not any(name in content for name in sections):
+        raise UsageError(
+            f"Expected a config in {str(path)!r}, got none of its keys ({', '.join(sections)}); see conf/."
+        )
+    return config_from_plain({str(key): value for key, value in content.items()}, overrides)
 
 
 def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
@@ -218,7 +225,7 @@ def to_plain(config: Config) -> dict[str, Any]:
 
 def to_yaml(config: Config) -> str:
     """The resolved config as YAML."""
-    return yaml.safe_dump(to_plain(config), sort_keys=False, allow_unicode=True)
+    return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
 
 
 def differing_keys(one: Config, other: Config) -> list[str]:
@@ -253,29 +260,29 @@ def _refuse_unknown_keys(content: Any, schema: type, prefix: str) -> None:
             _refuse_unknown_keys(value, section, f"{prefix}{key}.")
 
 
+def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
+    """Full name and type of every field."""
+    found: dict[str, Any] = {}
+    for f in dataclasses.fields(schema):
+        if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
+            found |= _annotations(f.type, f"{prefix}{f.name}.")
+        else:
+            found[f"{prefix}{f.name}"] = f.type
+    return found
+
+
 def _same_name_elsewhere(key: str) -> list[str]:
-    """The full name of a field of that name in some section: for a key written one level too high."""
-    return [
-        f"{section.name}.{key}"
-        for section in dataclasses.fields(Config)
-        if isinstance(section.type, type) and dataclasses.is_dataclass(section.type)
-        if key in {f.name for f in dataclasses.fields(section.type)}
-    ]
+    """The full names of fields of that name: for a key written in the wrong section."""
+    return [name for name in _annotations(Config) if name.split(".")[-1] == key]
 
 
 def _explain(error: OmegaConfBaseException) -> str:
     key = error.full_key or "a key"
-    kind = getattr(error.ref_type, "__name__", str(error.ref_type)).replace("typing.", "")
-    for section in dataclasses.fields(Config):
-        if isinstance(section.type, type) and dataclasses.is_dataclass(section.type):
-            for f in dataclasses.fields(section.type):
-                if key.split("[")[0] == f"{section.name}.{f.name}":
-                    kind = getattr(f.type, "__name__", str(f.type)) if not hasattr(f.type, "__args__") else str(f.type)
-        elif key == section.name:
-            kind = getattr(section.type, "__name__", str(section.type))
-    got = str(error).splitlines()[0]
-    if "mandatory" in got.lower() or "missing" in got.lower():
+    if isinstance(error, MissingMandatoryValue):
         return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
+    annotation = _annotations(Config).get(key.split("[")[0])
+    kind = annotation.__name__ if type(annotation) is type else annotation
+    got = str(error).splitlines()[0]
     return f"Expected {key} as {kind}, got: {got}; correct its value."
 
 

@@ -1,5 +1,6 @@
 """What training leaves behind: V, the control law, and the closed loop of a checkpoint."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, overload
@@ -148,7 +149,7 @@ def load(
         if given is None and name not in registry:
             raise UsageError(
                 f"Expected {argument}=… for {str(path)!r}, got none; it was trained with {name}, and loading a file "
-                f"never imports what the file names: import it yourself and pass the {argument}."
+                f"never imports what the file names: pass {argument}=… to load, or --{argument} to lyapnet evaluate."
             )
     task = build_task(config, system)
     V = build_value_function(config, task, network)
@@ -168,6 +169,8 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
     try:
         if not isinstance(plain, dict):
             raise UsageError(f"Expected a config, got {type(plain).__name__}")
+        if "${" in json.dumps(plain, ensure_ascii=False):  # resolving one may read the environment, or call a function
+            raise UsageError("Expected plain values, got an interpolation ${…}")
         return config_from_plain(plain)
     except UsageError as error:
         raise CheckpointError(

@@ -24,6 +24,7 @@ class QuadraticCost(nn.Module):
     Q_T: Matrix
     R_constant: Matrix | None
 
+    # Not persistent, here and in sets and systems: facts of the task come from its config, never from a checkpoint.
     def __init__(
         self,
         Q: Sequence[Sequence[float]] | Tensor,
@@ -31,15 +32,15 @@ class QuadraticCost(nn.Module):
         Q_T: Sequence[Sequence[float]] | Tensor,
     ):
         super().__init__()
-        self.register_buffer("Q", _symmetric("Q", Q, definite=False))
-        self.register_buffer("Q_T", _symmetric("Q_T", Q_T, definite=False))
+        self.register_buffer("Q", _symmetric("Q", Q, definite=False), persistent=False)
+        self.register_buffer("Q_T", _symmetric("Q_T", Q_T, definite=False), persistent=False)
         if self.Q.shape != self.Q_T.shape:
             raise ValueError(
                 f"Expected Q and Q_T of the same shape, got {tuple(self.Q.shape)} and {tuple(self.Q_T.shape)}; "
                 "give one row for each state."
             )
         self._R_of_state = R if callable(R) else None
-        self.register_buffer("R_constant", None if callable(R) else _symmetric("R", R, definite=True))
+        self.register_buffer("R_constant", None if callable(R) else _symmetric("R", R, definite=True), persistent=False)
 
     def R(self, x: State) -> ControlMatrix:
         """The control weight at each state, (*batch, m, m)."""

@@ -19,3 +19,11 @@ class CheckpointError(LyapnetError):
 
 class DivergenceError(LyapnetError):
     """A rollout, a loss term or a gradient left the finite numbers."""
+
+
+class Interrupted(LyapnetError):
+    """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
+
+    def __init__(self, message: str, exit_status: int = 0):
+        super().__init__(message)
+        self.exit_status = exit_status

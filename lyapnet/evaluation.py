@@ -23,7 +23,6 @@ PAPER_STATES = 100  # K, the number of states on which the paper counts satisfie
 class StateTable:
     """One row for each initial state."""
 
-    x0: State
     cost: PerState  # J_N(x₀)
     value: PerState  # V(0, x₀)
     optimal_cost: PerState | None  # J*(x₀), where an oracle knows it
@@ -59,6 +58,7 @@ class StateTable:
             "value_error": None if value_error is None else float(value_error),
             "constraint_loss": float(self.constraint_loss.mean()),
             "terminal_error": float(self.terminal_error.mean()),
+            "bounded_fraction": _share(self.cost <= self.value),
             "decreasing_fraction": _share(self.decreasing),
             "satisfied_fraction": _share(self.satisfied(1e-2)),
             "satisfied_fraction_1e-3": _share(self.satisfied(1e-3)),
@@ -71,12 +71,10 @@ def measure(
 ) -> StateTable:
     """The table of a batch (b,) of trajectories under the policy of V."""
     values = V(trajectory.t[:, None], trajectory.x)
-    x0 = trajectory.x[0]
     return StateTable(
-        x0=x0,
         cost=trajectory.cost,
         value=values[0],
-        optimal_cost=None if oracle is None else oracle(x0),
+        optimal_cost=None if oracle is None else oracle(trajectory.x[0]),
         constraint_loss=program.constraint_loss(values, trajectory),
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),

@@ -15,36 +15,38 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 from torch import nn
 
 import lyapnet
+from lyapnet.atomic import write_atomically
 from lyapnet.build import build_task, resolve
 from lyapnet.callbacks import (
     LAST,
-    AtomicCheckpointIO,
     Checkpoints,
     FigureLogger,
     ScalarLogger,
     Stopwatch,
     TrainingProgress,
 )
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoint
 from lyapnet.config import Config, differing_keys, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
 from lyapnet.data import InitialStateDataModule
 from lyapnet.errors import DivergenceError, LyapnetError, UsageError
 from lyapnet.evaluation import evaluate
-from lyapnet.events import drop_events_after, event_files
-from lyapnet.files import write_atomically
+from lyapnet.event_files import drop_events_after, event_files
 from lyapnet.modules import MODULES, ProgramModule
 from lyapnet.networks import NETWORKS
 
+CONFIG = "config.yaml"
 PROVENANCE = "run.json"
 EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
 TRAINER_OPTIONS = (
-    "accelerator", "strategy", "devices", "num_nodes", "gradient_clip_val", "gradient_clip_algorithm",
+    "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",
     "deterministic", "benchmark", "detect_anomaly", "profiler",
 )  # fmt: skip
 CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every")
@@ -115,9 +117,15 @@ def plan_run(path: Path | None, overrides: list[str], resume: str | None = None,
     run = _last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if resume == LAST and not checkpoint.exists():  # stopped before its first checkpoint: it stands where it began
+        written = run.folder / CONFIG
+        if written.exists():
+            _require_same_experiment(config, load_config(written), written)
         origin = run.finetuned_from
         return Plan(path, config, _start_from(module, origin), run, finetune_from=origin)
-    _require_same_experiment(config, config_of(read_checkpoint(checkpoint), checkpoint), checkpoint)
+    stored = config_of(read_checkpoint(checkpoint), checkpoint)
+    if not (run.folder / PROVENANCE).is_file():
+        raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
+    _require_same_experiment(config, stored, checkpoint)
     return Plan(path, config, module, run, resume_from=checkpoint)
 
 
@@ -130,7 +138,6 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
         LyapnetError: a checkpoint or event file cannot be read or written.
     """
     config, run, module = plan.config, plan.run, plan.module
-    _quiet()
     torch.set_num_threads(config.training.threads)
     data = InitialStateDataModule(
         module.task.initial_states, config.training.batch_size, config.evaluation.validation_states, config.seed
@@ -171,6 +178,16 @@ def _finish(trainer: L.Trainer, plan: Plan) -> dict[str, Any]:
     return result
 
 
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's door to checkpoint files: all or nothing on writing, nothing executed on reading."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        write_checkpoint(checkpoint, path)
+
+    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
+        return read_plain_data(path, map_location or "cpu")
+
+
 def _trainer(config: Config, run: Run, console: Console) -> L.Trainer:
     training = config.training
     return L.Trainer(
@@ -191,7 +208,7 @@ def _trainer(config: Config, run: Run, console: Console) -> L.Trainer:
             Checkpoints(run.checkpoints, training.validate_every),
         ],
         plugins=[AtomicCheckpointIO()],
-        **{"accelerator": "cpu", "devices": 1, **config.trainer},
+        **_trainer_options(config),
     )
 
 
@@ -199,7 +216,7 @@ def _prepare_folder(plan: Plan) -> None:
     """Write what the run is; take back what it logged after the point from which it goes on."""
     folder = plan.run.folder
     (folder / EVALUATION).unlink(missing_ok=True)
-    write_atomically(folder / "config.yaml", to_yaml(plan.config).encode())
+    write_atomically(folder / CONFIG, to_yaml(plan.config).encode())
     if plan.resume_from:
         drop_events_after(folder, int(read_checkpoint(plan.resume_from)["global_step"]))
         return
@@ -282,6 +299,17 @@ def _check_trainer_options(config: Config) -> None:
                 "lyapnet sets that one itself" if owned else f"did you mean trainer.{near[0]}?" if near else "remove it"
             )
             raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint}")
+    _quiet()
+    try:  # Lightning refuses values only when it is built: now, before there is a folder
+        L.Trainer(logger=False, enable_checkpointing=False, **_trainer_options(config))
+    except (MisconfigurationException, ValueError, TypeError, RuntimeError) as error:
+        raise UsageError(
+            f"Expected trainer options that Lightning accepts, got: {' '.join(str(error).split())}"
+        ) from error
+
+
+def _trainer_options(config: Config) -> dict[str, Any]:
+    return {"accelerator": "cpu", "devices": 1, **config.trainer}
 
 
 def _quiet() -> None:

@@ -16,23 +16,20 @@ from lyapnet.config import Config, TrainingConfig, to_plain
 from lyapnet.errors import DivergenceError
 from lyapnet.evaluation import StateTable, measure
 from lyapnet.oracles import optimal_cost
-from lyapnet.programs import LyapunovProgram, Program, ValueProgram
+from lyapnet.rollout import ADAPTIVE_METHODS
 from lyapnet.types import PerState, State
 
 
 class ProgramModule(L.LightningModule):
     """Minimises a program over the weights of V, through the closed loop of V's own policy."""
 
-    program_class: type[Program]
-
     def __init__(self, config: Config, task: Task):
         super().__init__()
         self.config, self.task = config, task
+        self.initial_states = task.initial_states  # registered, so that X₀ follows the module from device to device
         self.V = build_value_function(config, task)
         self.closed_loop = build_rollout(config, task, self.V)
         self.program = build_program(config)
-        if not isinstance(self.program, self.program_class):
-            raise TypeError(f"Expected a {self.program_class.__name__}, got {type(self.program).__name__}.")
         self.oracle: Callable[[State], PerState] | None = optimal_cost(
             task.system, task.cost, task.horizon, config.rollout.method
         )
@@ -45,6 +42,7 @@ class ProgramModule(L.LightningModule):
             output = self.program(self.V, self.closed_loop(x0))
         return {
             "loss": output.loss,
+            "terms": {name: term.detach() for name, term in output.terms.items()},
             "constraint_loss": output.constraint_loss.detach(),
             "trajectory_cost": output.trajectory_cost.detach(),
         }
@@ -54,6 +52,8 @@ class ProgramModule(L.LightningModule):
         try:
             super().backward(loss, *args, **kwargs)
         except AssertionError as error:
+            if self.config.rollout.method not in ADAPTIVE_METHODS:
+                raise
             raise DivergenceError(
                 f"Iteration {self.global_step}: Expected the adjoint to reach t = 0, got {error}; lower "
                 "training.learning_rate, or take rollout.gradient=backprop."
@@ -107,13 +107,9 @@ class ProgramModule(L.LightningModule):
 class ValueModule(ProgramModule):
     """The value program: V becomes the cost-to-go of its greedy policy."""
 
-    program_class = ValueProgram
-
 
 class LyapunovModule(ProgramModule):
     """The Lyapunov program: V falls along the closed loop at least as fast as the cost accrues."""
-
-    program_class = LyapunovProgram
 
 
 MODULES: dict[str, type[ProgramModule]] = {"value": ValueModule, "lyapunov": LyapunovModule}

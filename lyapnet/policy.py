@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from lyapnet.calculus import gradients, input_lie_derivative, state_gradient
+from lyapnet.calculus import drift_lie_derivative, gradients, input_lie_derivative, state_gradient
 from lyapnet.cost import QuadraticCost
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
@@ -43,7 +43,7 @@ class SontagPolicy(nn.Module):
         V_t, V_x = gradients(self.V, t, x)
         LgV = input_lie_derivative(self.system, x, V_x)
         direction = self.cost.solve_R(x, LgV)
-        a = V_t + (V_x * self.system.f(x)).sum(-1)
+        a = V_t + drift_lie_derivative(self.system, x, V_x)
         q = self.cost.state(x)
         sigma = (LgV * direction).sum(-1)
         # √ has no derivative at 0, which the goal reaches: keep its argument positive

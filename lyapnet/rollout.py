@@ -150,6 +150,8 @@ class Rollout(nn.Module):
         except (
             AssertionError
         ) as error:  # how torchdiffeq says that an adaptive step shrank to nothing, or too many came
+            if self.method not in ADAPTIVE_METHODS:
+                raise
             message = f"Expected {self.method} to reach t = {t[-1]:.4g} s, got {error}; {_REMEDY}."
             raise DivergenceError(message) from error
 
@@ -158,7 +160,7 @@ class Rollout(nn.Module):
         if self.method in ADAPTIVE_METHODS:
             # The parameters' gradient is an integral that feeds back into nothing: leaving it out of the error
             # estimate saves steps (Kidger, Chen, Lyons, "Hey, that's not an ODE", ICML 2021).
-            arguments["adjoint_options"] = {"norm": "seminorm"}
+            arguments["adjoint_options"] = {"norm": "seminorm", **self.solver_arguments["options"]}
         return arguments
 
 

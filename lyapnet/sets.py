@@ -41,8 +41,8 @@ class Box(nn.Module):
         if reversed_at:
             i = reversed_at[0]
             raise ValueError(f"Expected lower ≤ upper, got {low[i]} > {high[i]} at index {i}; swap the two bounds.")
-        self.register_buffer("lower", low)
-        self.register_buffer("upper", high)
+        self.register_buffer("lower", low, persistent=False)
+        self.register_buffer("upper", high, persistent=False)
 
     @property
     def dimension(self) -> int:

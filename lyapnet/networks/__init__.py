@@ -5,7 +5,7 @@ The options are the fields of the config's network section that the constructor 
 
 from torch import nn
 
-from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
+from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAnchor
 from lyapnet.networks.base import ACTIVATIONS, Scaling
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
@@ -13,7 +13,7 @@ from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 NETWORKS: dict[str, type[nn.Module]] = {
     "fcn": FCN,
     "icnn": ICNN,
-    "anchored": PartiallyConvexNetwork,  # inside a GoalAnchor
+    "anchored": AnchoredNetwork,
 }
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "FCN",
     "ICNN",
     "NETWORKS",
+    "AnchoredNetwork",
     "GoalAnchor",
     "PartiallyConvexNetwork",
     "Scaling",

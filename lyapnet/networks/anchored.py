@@ -1,5 +1,6 @@
 """Guarantees by construction: V tied to the terminal cost at t = T, and to zero at the goal."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -7,14 +8,16 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import state_gradient
 from lyapnet.cost import QuadraticCost
+from lyapnet.networks.base import Scaling
+from lyapnet.networks.icnn import PartiallyConvexNetwork
 from lyapnet.types import PerState, State, Time, Value
 
 
 class TerminalAnchor(nn.Module):
     """V(t, x) = φ(x) + (1 − t/T) N(t, x), so that V(T, x) = φ(x) for any network N.
 
-    Where N is convex in x, so is V. With N ≥ 0, as inside a GoalAnchor, V ≥ φ at every t: an upper bound of the
-    cost-to-go still fits, the cost-to-go itself need not.
+    Where N is convex in x, so is V; where N(t, 0) = 0, so is V(t, 0). With N ≥ 0, as an AnchoredNetwork is, V ≥ φ at
+    every t: an upper bound of the cost-to-go still fits, the cost-to-go itself need not.
     """
 
     def __init__(self, network: nn.Module, cost: QuadraticCost, duration: float):
@@ -54,6 +57,24 @@ class GoalAnchor(nn.Module):
         """V_x = N_x(t, x) − N_x(t, 0) + 2εx."""
         slope, slope_at_goal = _at_state_and_goal(partial(state_gradient, self.network), t, x)
         return slope - slope_at_goal + 2 * self.epsilon * x
+
+
+class AnchoredNetwork(GoalAnchor):
+    """A partially convex network inside a GoalAnchor: a Lyapunov candidate for any weights.
+
+    Args:
+        scaling, hidden, activation: of the PartiallyConvexNetwork.
+        epsilon: ε > 0, in cost per squared state unit.
+    """
+
+    def __init__(
+        self,
+        scaling: Scaling,
+        hidden: Sequence[int] = (64, 64),
+        activation: str = "softplus",
+        epsilon: float = 1e-3,
+    ):
+        super().__init__(PartiallyConvexNetwork(scaling, hidden, activation), epsilon)
 
 
 def _at_state_and_goal(function: Value, t: Time, x: State) -> tuple[Tensor, Tensor]:

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -33,6 +33,8 @@ class Program(ABC):
     J̄ (detached; C as the mean over time), and J enters as log J̄, whose gradient is ∇J̄/J̄.
     """
 
+    degree: ClassVar[int]  # C and B are of this degree in units of cost
+
     constraint: float = 1.0
     terminal: float = 0.0
     trajectory_cost: float = 0.0
@@ -53,16 +55,19 @@ class Program(ABC):
         """
         values = V(trajectory.t.reshape(-1, *[1] * (trajectory.x.ndim - 2)), trajectory.x)
         J = trajectory.cost.mean()
-        unit = J.detach() if self.normalise else torch.ones_like(J)
         per_state = {
-            "constraint": self._constraint_in_units(values, trajectory, unit),
-            "terminal": self._terminal_in_units(values, trajectory, unit),
+            "constraint": self.constraint_term(values, trajectory),
+            "terminal": self.terminal_term(values, trajectory),
             "trajectory_cost": trajectory.cost,
         }
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
+            unit = J.detach() ** self.degree
+            # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
+            terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1) / unit
+            terms["terminal"] = terms["terminal"] / unit
             terms["trajectory_cost"] = torch.log(J)
         weights = {"constraint": self.constraint, "terminal": self.terminal, "trajectory_cost": self.trajectory_cost}
         loss = torch.stack([weight * terms[name] for name, weight in weights.items() if weight]).sum()
@@ -73,12 +78,12 @@ class Program(ABC):
         """The paper's sum over the steps of each trajectory."""
 
     @abstractmethod
-    def _constraint_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
-        """C, in units of the mean cost."""
+    def terminal_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        """B for each trajectory."""
 
-    @abstractmethod
-    def _terminal_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
-        """B, in units of the mean cost."""
+    def constraint_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        """C for each trajectory: the paper's sum, unless the program asks for more."""
+        return self.constraint_loss(values, trajectory)
 
 
 def _require_finite(name: str, term: PerState, trajectory: Trajectory) -> None:

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-from torch import Tensor
-
 from lyapnet.programs.base import Program
 from lyapnet.programs.terms import hinge, terminal_hinge
 from lyapnet.rollout import Trajectory
@@ -14,10 +12,12 @@ from lyapnet.types import PerState, ValuePath
 class LyapunovProgram(Program):
     """C = Σ_n max(V_{n+1} − V_n + (1 + margin) Δt ℓ_n, 0) and B = max(φ(x_N) − V(T, x_N), 0).
 
-    Where both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 asks for a little more than is claimed, so that the
-    condition also holds between the sampled states; the constraint loss that is logged has none.
+    Where both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 asks for a little more than is claimed, which leaves
+    room for states between the sampled ones; the constraint loss that is logged has none.
     Source: P_L of arXiv 2305.15244.
     """
+
+    degree = 1
 
     margin: float = 0.0
 
@@ -29,8 +29,8 @@ class LyapunovProgram(Program):
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return hinge(values, trajectory.step_cost)
 
-    def _constraint_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
-        return hinge(values, trajectory.step_cost, self.margin) / unit
+    def constraint_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        return hinge(values, trajectory.step_cost, self.margin)
 
-    def _terminal_in_units(self, values: ValuePath, trajectory: Trajectory, unit: Tensor) -> PerState:
-        return terminal_hinge(values, trajectory.terminal_cost) / unit
+    def terminal_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        return terminal_hinge(values, trajectory.terminal_cost)

@@ -67,8 +67,8 @@ class MechanicalSystem(ControlAffineSystem):
         super().__init__()
         if not all(isinstance(d, int | float) and 0 <= d < math.inf for d in damping):
             raise ValueError(f"Expected damping ≥ 0, got {list(damping)}; friction takes energy away.")
-        self.register_buffer("B", torch.tensor(actuation, dtype=torch.get_default_dtype()))
-        self.register_buffer("D", torch.tensor(damping, dtype=torch.get_default_dtype()))
+        self.register_buffer("B", torch.tensor(actuation, dtype=torch.get_default_dtype()), persistent=False)
+        self.register_buffer("D", torch.tensor(damping, dtype=torch.get_default_dtype()), persistent=False)
 
     @abstractmethod
     def mass_matrix(self, q: Coordinates) -> MassMatrix:

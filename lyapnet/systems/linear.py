@@ -32,8 +32,8 @@ class Linear(ControlAffineSystem):
                 f"Expected A of shape (n, n) and B of shape (n, m), got {tuple(a.shape)} and {tuple(b.shape)}; "
                 "write both as lists of rows."
             )
-        self.register_buffer("A", a)
-        self.register_buffer("B", b)
+        self.register_buffer("A", a, persistent=False)
+        self.register_buffer("B", b, persistent=False)
         self.state_names = tuple(f"x{i + 1}" for i in range(a.shape[0]))
         self.state_units = ("",) * a.shape[0]
         self.control_names = tuple(f"u{i + 1}" for i in range(b.shape[1]))

@@ -8,7 +8,7 @@ from tensorboard.backend.event_processing.event_file_loader import RawEventFileL
 from tensorboard.compat.proto.event_pb2 import Event  # pyright: ignore[reportAttributeAccessIssue]
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-from lyapnet.files import write_atomically
+from lyapnet.atomic import write_atomically
 
 
 def drop_events_after(folder: Path, step: int) -> None:

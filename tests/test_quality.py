@@ -1,0 +1,43 @@
+"""Shipped trainings at full length, held to what the README promises. Minutes each: pytest -m slow."""
+
+import json
+
+import pytest
+
+from lyapnet.cli import main
+
+pytestmark = pytest.mark.slow
+
+
+def trained(name, folder, capsys, *overrides):
+    """`lyapnet evaluate --json` of the best checkpoint of a shipped config."""
+    assert main(["train", "--config", f"conf/{name}.yaml", f"logs={folder}", *overrides]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", f"{folder}/{name}/version_0/checkpoints/best.ckpt", "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_lyapunov_program_on_the_double_integrator(tmp_path, capsys):
+    result = trained("double_integrator", tmp_path, capsys)
+    assert 1 <= result["cost_ratio"] <= 1.05
+    assert result["satisfied_fraction"] >= 0.95
+    assert result["decreasing_fraction"] == 1
+    assert result["bounded_fraction"] >= 0.95
+
+
+def test_value_program_on_the_double_integrator(tmp_path, capsys):
+    result = trained("double_integrator_value", tmp_path, capsys)
+    assert 1 <= result["cost_ratio"] <= 1.02
+    assert result["value_error"] <= 0.03
+
+
+@pytest.mark.parametrize(("name", "cost"), [("cartpole_balancing", 20), ("cartpole_swingup", 250), ("reacher", 15)])
+def test_cost_falls_well_below_its_start(name, cost, tmp_path, capsys):
+    assert trained(name, tmp_path, capsys)["cost_mean"] < cost
+
+
+def test_a_hundredth_of_the_training_is_not_enough(tmp_path, capsys):
+    """The twin: the bars above are not met by an untrained V."""
+    result = trained("double_integrator", tmp_path, capsys, "training.iterations=1")
+    assert result["cost_ratio"] > 1.05
+    assert result["satisfied_fraction"] < 0.95

@@ -11,7 +11,7 @@ from lyapnet.build import build_program
 from lyapnet.controller import Controller
 from lyapnet.oracles import optimal_cost
 from lyapnet.programs import Program
-from lyapnet.programs.terms import hinge
+from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.randomness import TEST, stream
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, State, Value
@@ -40,7 +40,7 @@ class StateTable:
 
     def satisfied(self, tolerance: float) -> Tensor:
         """Whether the summed hinge is at most `tolerance` · V(0, x₀)."""
-        return self.hinge <= tolerance * self.value
+        return satisfied(self.hinge, self.value, tolerance)
 
     def summary(self) -> dict[str, float | None]:
         """The means and shares over the rows, under the names of `lyapnet evaluate --json`."""

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from torch import Tensor
 
-from lyapnet.programs.terms import hinge
+from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
@@ -58,7 +58,7 @@ def certified_region(
         trajectory = rollout(region.states)
         values = V(trajectory.t[:, None], trajectory.x)
     violation = hinge(values, trajectory.step_cost)
-    holds = violation <= tolerance * values[0]
+    holds = satisfied(violation, values[0], tolerance)
     share = float(holds.double().mean())
     figure = Figure(figsize=(5.6, 4.4), layout="constrained")
     axes = figure.subplots()

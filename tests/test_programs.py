@@ -15,7 +15,7 @@ from lyapnet.cost import QuadraticCost
 from lyapnet.errors import DivergenceError
 from lyapnet.policy import HJBPolicy
 from lyapnet.programs import PROGRAMS, LyapunovProgram, ValueProgram
-from lyapnet.programs.terms import hinge, residual, terminal_hinge, terminal_residual, violation
+from lyapnet.programs.terms import hinge, residual, satisfied, terminal_hinge, terminal_residual, violation
 from lyapnet.rollout import Horizon, Rollout, Trajectory
 from lyapnet.systems import DoubleIntegrator
 
@@ -252,3 +252,10 @@ def test_a_term_that_is_not_finite_names_itself_and_the_initial_state(program, b
     values.requires_grad_()
     with pytest.raises(DivergenceError, match=rf"term constraint from x0 = \[{float(len(batch)):.1f}\]"):
         program()(given_values(values), trajectory_of(torch.ones(3, *batch), torch.ones(batch)))
+
+
+def test_the_goal_satisfies_the_condition_in_spite_of_rounding():
+    value = torch.tensor([0.0, 5.0, 5.0])
+    summed = torch.tensor([1e-33, 0.05, 0.0501])
+    assert satisfied(summed, value, 1e-2).tolist() == [True, True, False]
+    assert not satisfied(torch.tensor([1e-9, 0.0]), torch.tensor([0.0, 5.0]), 1e-2)[0]

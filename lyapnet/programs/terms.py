@@ -4,6 +4,8 @@
 """
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from lyapnet.types import PerState, StepPath, ValuePath
 
@@ -34,3 +36,13 @@ def terminal_residual(values: ValuePath, terminal_cost: PerState) -> PerState:
 def terminal_hinge(values: ValuePath, terminal_cost: PerState) -> PerState:
     """max(φ(x_N) − V(T, x_N), 0): V ends no lower than the terminal cost, so that V(0, x₀) bounds the whole cost."""
     return torch.relu(terminal_cost - values[-1])
+
+
+def satisfied(summed_hinge: PerState, value: PerState, tolerance: float) -> Bool[Tensor, "*batch"]:
+    """Whether Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ tolerance · V(0, x₀), up to rounding.
+
+    Rounding (100 eps of the largest V, for a sum over hundreds of steps) decides at the goal alone, where both sides
+    are zero.
+    """
+    rounding = 100 * torch.finfo(value.dtype).eps * value.abs().max()
+    return summed_hinge <= tolerance * value + rounding

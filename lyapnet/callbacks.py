@@ -17,7 +17,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
@@ -221,7 +222,7 @@ class Checkpoints(Checkpoint):
 
 
 class TrainingProgress(ProgressBar):
-    """One line for the run: step, loss, cost, speed, time left; without a terminal, a plain line per validation."""
+    """A line for each validation, and below them in a terminal: step, loss, cost, speed, time left."""
 
     def __init__(self, console: Console):
         super().__init__()
@@ -234,20 +235,14 @@ class TrainingProgress(ProgressBar):
         if not trainer.is_global_zero:
             return
         self._progress = Progress(
-            TextColumn("[bold]{task.description}"),
-            BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[figures]}"),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            BarColumn(bar_width=None),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            TimeRemainingColumn(elapsed_when_finished=True),
             console=self._console,
             disable=not self._console.is_terminal,
         )
-        name = _program_module(pl_module).config.experiment
-        self._task = self._progress.add_task(
-            name, total=trainer.max_epochs, completed=trainer.global_step, figures="first step"
-        )
+        self._task = self._progress.add_task("…", total=trainer.max_epochs, completed=trainer.global_step)
         self._progress.start()
 
     def on_train_batch_end(
@@ -258,11 +253,11 @@ class TrainingProgress(ProgressBar):
         module = _program_module(pl_module)
         loss, cost = float(outputs["loss"]), float(outputs["trajectory_cost"])
         line = f"loss {loss:.4g}  cost {cost:.4g}  {module.steps_per_second:,.0f} rollout steps/s"
-        self._progress.update(self._task, completed=trainer.global_step, figures=line)
+        self._progress.update(self._task, completed=trainer.global_step, description=line)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         module = _program_module(pl_module)
-        if self._progress is None or self._console.is_terminal or module.validation is None:
+        if self._progress is None or module.validation is None:
             return
         summary = module.validation.summary()
         ratio = "" if summary["cost_ratio"] is None else f"  cost/optimum {summary['cost_ratio']:.4f}"

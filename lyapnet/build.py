@@ -51,6 +51,7 @@ def build_task(config: Config, system: ControlAffineSystem | None = None) -> Tas
         with _section("initial_states"):
             initial_states = Box(config.initial_states.lower, config.initial_states.upper)
             _require_length("initial_states.lower", initial_states.dimension, system)
+        check_system(system, initial_states.sample(3, torch.Generator().manual_seed(0)))
         with _section("cost"):
             cost = build_cost(config.cost, system)
             cost.check(initial_states.sample(256, torch.Generator().manual_seed(0)))
@@ -83,6 +84,34 @@ def _check_parameters(cls: type, config: SystemConfig) -> None:
     if missing:
         keys = ", ".join(f"system.parameters.{name}" for name in missing)
         raise UsageError(f"Expected values for {keys}, got none; {config.name} has no default for them.")
+
+
+def check_system(system: ControlAffineSystem, x: Tensor) -> None:
+    """Hold a system's f and g against their contract on a batch (b, n) of states.
+
+    Raises:
+        UsageError: f or g fails, returns another type, dtype or shape, or loses its gradient; or names lack a unit.
+    """
+    name, n, m = type(system).__name__, system.n, system.m
+    if len(system.state_units) != n or len(system.control_units) != m:
+        raise UsageError(f"Expected one unit for each state and control name of {name}, got another number of units.")
+    x = x.requires_grad_()
+    for symbol, function, shape in (("f", system.f, (len(x), n)), ("g", system.g, (len(x), n, m))):
+        try:
+            value = function(x)
+        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            line = " ".join(str(error).split())
+            raise UsageError(
+                f"Expected {name}.{symbol}(x) for x of shape {tuple(x.shape)}, got {type(error).__name__}: {line}"
+            ) from error
+        got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
+        if got != (shape, x.dtype):
+            raise UsageError(f"Expected {name}.{symbol}(x) as a tensor of {shape} and {x.dtype}, got {got}.")
+        moved = not torch.equal(value, function(x.detach() + 1e-3))
+        if moved and not value.requires_grad:
+            raise UsageError(
+                f"Expected {name}.{symbol}(x) differentiable by autograd, got a detached tensor; use torch on x."
+            )
 
 
 def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost:
@@ -126,7 +155,11 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}
     accepted = inspect.signature(cls).parameters
-    for key in ("scaling", *chosen):
+    if "scaling" not in accepted:
+        raise UsageError(
+            f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."
+        )
+    for key in chosen:
         if key not in accepted:
             name = {"embedded_angles": "embed_angles"}.get(key, key)
             raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")

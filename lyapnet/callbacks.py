@@ -176,9 +176,11 @@ class Checkpoints(Checkpoint):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.best_loss = state_dict["best_loss"]
 
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._install_handlers()  # before the first validation and figures, which take seconds
+
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._remember)
+        self._install_handlers()  # again: Lightning sets one for SIGTERM in between
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step + 1 == trainer.max_epochs:
@@ -196,7 +198,7 @@ class Checkpoints(Checkpoint):
         if trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
             path = self._save(trainer, LAST)
             name = signal.Signals(self._signal).name if self._signal else "Stop"
-            raise Interrupted(f"{name} after step {step}: saved {path}. Continue with --resume last.")
+            raise Interrupted(f"{name} after step {step}: saved {path}.")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         self._restore_handlers()
@@ -214,6 +216,11 @@ class Checkpoints(Checkpoint):
         if self._signal is not None:  # the second time, the user means now
             raise Interrupted("Stopped at once; the last checkpoint is from before this step.", exit_status=130)
         self._signal = number
+
+    def _install_handlers(self) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous = signal.signal(number, self._remember)
+            self._previous.setdefault(number, previous)
 
     def _restore_handlers(self) -> None:
         for number, handler in self._previous.items():

@@ -43,6 +43,10 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         CheckpointError: truncated, foreign, or holding anything else; nothing in it was executed.
     """
     path = Path(path)
+    if path.is_dir():
+        raise UsageError(
+            f"Expected a checkpoint file, got the folder {str(path)!r}; in a run's it is checkpoints/best.ckpt."
+        )
     if not path.is_file():
         raise UsageError(
             f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."

@@ -7,17 +7,27 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from lyapnet.errors import LyapnetError
 
 app = typer.Typer(
-    help="Learn time-varying value functions and Lyapunov functions, and measure what they are worth.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run.", metavar="CKPT")]
+
+
+@app.callback(invoke_without_command=True)
+def lyapnet(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Learn time-varying value functions and Lyapunov functions, and measure what they are worth."""
+    if version:
+        from lyapnet import __version__
+
+        print(__version__)
 
 
 @app.command()
@@ -85,7 +95,8 @@ def systems(debug: Debug = False) -> None:
 
     from lyapnet.systems import SYSTEMS
 
-    table = Table("system", "states", "controls", "parameters (default)", title="system.name in a config")
+    parameters_column = Column("parameters (default)", overflow="fold")
+    table = Table("system", "states", "controls", parameters_column, title="system.name in a config")
     for name, cls in SYSTEMS.items():
         parameters = inspect.signature(cls).parameters.values()
         shown = [p.name if p.default is p.empty else f"{p.name}={p.default}" for p in parameters]
@@ -124,7 +135,7 @@ def _explain(error: Exception) -> tuple[str, int]:
         status = error.exit_status
         return (f"error: {error}" if status else str(error)), status
     if isinstance(error, typer.TyperException):
-        return f"error: {error.format_message()} See lyapnet --help.", error.exit_code
+        return f"error: {error.format_message().rstrip('.')}. See lyapnet --help.", error.exit_code
     if isinstance(error, OSError):
         return (
             f"error: {error.strerror or error}: {error.filename or 'a file of the run'}; check space and permissions.",
@@ -147,7 +158,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any]) -> None:
         ("run", plan.run.folder),
         ("watch", f"tensorboard --logdir {plan.config.logs}"),
         ("measure", f"lyapnet evaluate {best}"),
-        ("fine-tune", f"python train.py --config {plan.path} --finetune {best}"),
+        ("fine-tune", f"{plan.command} --finetune {best}"),
         ("use", f'lyapnet.load("{best}")'),
     ):
         console.print(f"{what:<10}{command}", soft_wrap=True)
@@ -172,7 +183,7 @@ ROWS = {
 
 
 def _table(title: str, result: dict[str, Any]) -> Table:
-    table = Table("measure", "", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
+    table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in ROWS.items():
         value = result[key]
         if value is None:

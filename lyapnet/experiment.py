@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import platform
+import shlex
 import subprocess
 import tempfile
 import warnings
@@ -36,7 +37,7 @@ from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoin
 from lyapnet.config import Config, differing_keys, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
 from lyapnet.data import InitialStateDataModule
-from lyapnet.errors import DivergenceError, LyapnetError, UsageError
+from lyapnet.errors import DivergenceError, Interrupted, LyapnetError, UsageError
 from lyapnet.evaluation import evaluate
 from lyapnet.event_files import drop_events_after, event_files
 from lyapnet.modules import MODULES, ProgramModule
@@ -89,7 +90,7 @@ class Run:
 class Plan:
     """What to do: which module to train, in which run's folder, and from which checkpoint if any."""
 
-    path: Path  # of the config file
+    command: str  # that starts this run again
     config: Config
     module: ProgramModule
     run: Run
@@ -110,10 +111,11 @@ def plan_run(path: Path | None, overrides: list[str], resume: str | None = None,
     if path is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
     config = load_config(path, overrides)
+    command = shlex.join(["python", "train.py", "--config", str(path), *overrides])
     _check_trainer_options(config)
     module = MODULES[config.program.name](config, build_task(config))
     if not resume:
-        return Plan(path, config, _start_from(module, finetune), _new_run(config, finetune), finetune_from=finetune)
+        return Plan(command, config, _start_from(module, finetune), _new_run(config, finetune), finetune_from=finetune)
     run = _last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if resume == LAST and not checkpoint.exists():  # stopped before its first checkpoint: it stands where it began
@@ -121,12 +123,12 @@ def plan_run(path: Path | None, overrides: list[str], resume: str | None = None,
         if written.exists():
             _require_same_experiment(config, load_config(written), written)
         origin = run.finetuned_from
-        return Plan(path, config, _start_from(module, origin), run, finetune_from=origin)
+        return Plan(command, config, _start_from(module, origin), run, finetune_from=origin)
     stored = config_of(read_checkpoint(checkpoint), checkpoint)
     if not (run.folder / PROVENANCE).is_file():
         raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
     _require_same_experiment(config, stored, checkpoint)
-    return Plan(path, config, module, run, resume_from=checkpoint)
+    return Plan(command, config, module, run, resume_from=checkpoint)
 
 
 def fit(plan: Plan, console: Console) -> dict[str, Any]:
@@ -149,6 +151,9 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
     try:
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
         trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
+    except Interrupted as stop:
+        hint = f" Continue with: {plan.command} --resume last" if stop.exit_status == 0 else ""
+        raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
     except DivergenceError as error:
         kept = f" Kept: {run.last}." if run.last.exists() else ""
         raise DivergenceError(f"{error}{kept}") from error

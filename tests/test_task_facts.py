@@ -8,13 +8,13 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.build import build_task
+from lyapnet.build import build_task, check_system
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
-from lyapnet.errors import CheckpointError, DivergenceError
+from lyapnet.errors import CheckpointError, DivergenceError, UsageError
 from lyapnet.modules import MODULES
-from lyapnet.systems import Cartpole
+from lyapnet.systems import Cartpole, DoubleIntegrator
 
 CONF = Path(__file__).parents[1] / "conf"
 SHORT = ["training.iterations=1", "horizon.steps=4", "evaluation.validation_states=2", "evaluation.test_states=2"]
@@ -65,6 +65,53 @@ def test_passed_system_takes_the_precision_of_the_run_and_stays_as_it_was(tmp_pa
     passed = lyapnet.load(path, system=mine).rollout(x0).cost
     assert abs(passed - lyapnet.load(path).rollout(x0).cost) < 1e-6
     assert mine.B.dtype == torch.float32
+
+
+class Sound(DoubleIntegrator):
+    """The twin of the systems below: what they break is right here."""
+
+
+class ThreeRows(Sound):
+    def f(self, x):
+        return torch.cat([x, x[..., :1]], -1)
+
+
+class SinglePrecision(Sound):
+    def g(self, x):
+        return super().g(x).float()
+
+
+class Detached(Sound):
+    def f(self, x):
+        return super().f(x).detach()
+
+
+class NumPy(Sound):
+    def f(self, x):
+        return x.detach().numpy()
+
+
+class OneUnit(Sound):
+    def __init__(self):
+        super().__init__()
+        self.state_units = ("m",)
+
+
+@pytest.mark.parametrize(
+    ("system", "named"),
+    [
+        (ThreeRows, r"ThreeRows\.f\(x\).*\(2, 2\).*\(2, 3\)"),
+        (SinglePrecision, r"SinglePrecision\.g\(x\).*float64.*float32"),
+        (Detached, r"Detached\.f\(x\) differentiable"),
+        (NumPy, r"NumPy\.f\(x\).*ndarray"),
+        (OneUnit, "one unit for each"),
+    ],
+)
+def test_system_that_breaks_its_contract_is_refused_by_name(system, named):
+    x = torch.ones(2, 2)
+    check_system(Sound(), x)
+    with pytest.raises(UsageError, match=named):
+        check_system(system(), x)
 
 
 @pytest.mark.parametrize("key", ["experiment", "logs"])

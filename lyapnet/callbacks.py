@@ -88,8 +88,7 @@ class ScalarLogger(Callback):
         )
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not trainer.sanity_checking:
-            self._log_validation(trainer, _program_module(pl_module))
+        self._log_validation(trainer, _program_module(pl_module))
 
     @staticmethod
     def _log_validation(trainer: Trainer, module: ProgramModule) -> None:

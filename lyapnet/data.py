@@ -1,4 +1,4 @@
-"""Initial states: a fresh batch of X₀ for every training step, fixed draws for validation and test."""
+"""Initial states: a fresh batch of X₀ for every training step, a fixed draw for validation."""
 
 from typing import Any
 

@@ -26,6 +26,7 @@ import lyapnet
 from lyapnet.atomic import write_atomically
 from lyapnet.build import build_task, resolve
 from lyapnet.callbacks import (
+    BEST,
     LAST,
     Checkpoints,
     FigureLogger,
@@ -72,7 +73,7 @@ class Run:
     @property
     def best(self) -> Path:
         """The checkpoint of the least validation loss."""
-        return self.checkpoints / "best.ckpt"
+        return self.checkpoints / f"{BEST}.ckpt"
 
     @property
     def finetuned_from(self) -> Path | None:
@@ -320,10 +321,5 @@ def _trainer_options(config: Config) -> dict[str, Any]:
 def _quiet() -> None:
     """Lightning's notes that are wrong here: one epoch is one step, and drawing states needs no workers."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    for message in (
-        ".*LeafSpec.*",
-        ".*does not have many workers.*",
-        ".*exists and is not empty.*",
-        ".*dirpath has changed.*",
-    ):
+    for message in (".*LeafSpec.*", ".*does not have many workers.*"):
         warnings.filterwarnings("ignore", message)

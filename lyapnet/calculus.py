@@ -8,18 +8,25 @@ import torch
 from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
+from lyapnet.linear_algebra import apply
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, Policy, State, Time, Value
 
 
-def state_gradient(V: Value, t: Time, x: State) -> State:
-    """V_x(t, x), (*batch, n).
+def value_and_state_gradient(V: Value, t: Time, x: State) -> tuple[PerState, State]:
+    """(V(t, x), V_x(t, x)), of shapes (*batch,) and (*batch, n).
 
-    A network that knows its gradient as plain forward operations offers it as `V.state_gradient(t, x)`; any other V is
-    differentiated by autograd.
+    A network that knows its gradient as plain forward operations offers both, which share most of their work, as
+    `V.value_and_state_gradient(t, x)`; any other V is differentiated by autograd.
     """
-    formula = getattr(V, "state_gradient", None)
-    return formula(t, x) if formula is not None else gradients(V, t, x)[1]
+    formula = getattr(V, "value_and_state_gradient", None)
+    return formula(t, x) if formula is not None else (V(t, x), gradients(V, t, x)[1])
+
+
+def state_gradient(V: Value, t: Time, x: State) -> State:
+    """V_x(t, x), (*batch, n); by the formula of a network that has one, else by autograd."""
+    formula = getattr(V, "value_and_state_gradient", None)
+    return formula(t, x)[1] if formula is not None else gradients(V, t, x)[1]
 
 
 def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
@@ -46,7 +53,7 @@ def drift_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> P
 
 def input_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> Control:
     """LgV = g(x)ᵀV_x."""
-    return (V_x[..., None, :] @ system.g(x))[..., 0, :]
+    return apply(system.g(x).mT, V_x)
 
 
 def time_derivative(V: Value, system: ControlAffineSystem, policy: Policy, t: Time, x: State) -> PerState:

@@ -5,9 +5,11 @@ import signal
 import textwrap
 import time
 import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,12 +24,21 @@ from rich.table import Column
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
+from lyapnet.compilation import cache_folder
 from lyapnet.config import to_yaml
-from lyapnet.errors import DivergenceError, Interrupted
-from lyapnet.modules import ProgramModule
+from lyapnet.errors import CompilationError, DivergenceError, Interrupted
+from lyapnet.modules import ProgramModule, TrainedModule, labelled
 from lyapnet.randomness import FIGURES, stream
 
 LAST, BEST = "last", "best"
+
+# the line of a validation: name, key of the summary, format
+VALIDATED = (
+    ("cost", "cost_mean", ".4g"),
+    ("cost/optimum", "cost_ratio", ".4f"),
+    ("constraint loss", "constraint_loss", ".3g"),
+    ("satisfied", "satisfied_fraction", ".0%"),
+)
 
 # the paper's panels: constraint loss beside trajectory cost
 LAYOUT = {
@@ -40,8 +51,35 @@ LAYOUT = {
 }
 
 
+class Compilation(Callback):
+    """Compiles the closed loop and its gradient before the first step, and says so.
+
+    Args:
+        console: where it is said.
+        batch_size: initial states in a training batch.
+    """
+
+    def __init__(self, console: Console, batch_size: int):
+        self.console, self.batch_size = console, batch_size
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        module = _trained_module(pl_module)
+        self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
+        started = time.perf_counter()
+        try:
+            module.compile_for(self.batch_size)
+        except CompilationError as error:
+            self._say(trainer, f"{error}; running without compilation.")
+        else:
+            self._say(trainer, f"compiled in {time.perf_counter() - started:.0f} s, kept in {cache_folder()}")
+
+    def _say(self, trainer: Trainer, line: str) -> None:
+        if trainer.is_global_zero:
+            self.console.print(line, soft_wrap=True)
+
+
 class Stopwatch(Callback):
-    """Tells the module how many rollout steps per second the last training step made, gradient included."""
+    """Tells each member how many rollout steps per second the last training step made, gradient included."""
 
     def __init__(self) -> None:
         self._started = 0.0
@@ -52,9 +90,11 @@ class Stopwatch(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        module = _program_module(pl_module)
-        steps = len(batch) * module.task.horizon.steps * trainer.world_size
-        module.steps_per_second = steps / (time.perf_counter() - self._started)
+        module = _trained_module(pl_module)
+        seconds = time.perf_counter() - self._started
+        for member in module.members:
+            steps = batch.shape[-2] * member.task.horizon.steps * trainer.world_size
+            member.steps_per_second = steps / seconds
 
 
 class ScalarLogger(Callback):
@@ -62,9 +102,10 @@ class ScalarLogger(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            module = _program_module(pl_module)
-            writer(trainer).add_custom_scalars(LAYOUT)
-            writer(trainer).add_text("config", textwrap.indent(to_yaml(module.config), "    "))
+            module = _trained_module(pl_module)
+            for member, curves in _with_writers(trainer, module):
+                curves.add_custom_scalars(LAYOUT)
+                curves.add_text("config", textwrap.indent(to_yaml(member.config), "    "))
             with torch.no_grad():
                 states = next(iter(trainer.datamodule.val_dataloader())).to(module.device)  # pyright: ignore
                 module.validate_on(states)
@@ -73,43 +114,42 @@ class ScalarLogger(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        module = _program_module(pl_module)
-        _log(
-            trainer,
-            {
-                "loss/train": outputs["loss"].detach(),
-                **{f"term/{name}": value for name, value in outputs["terms"].items()},
-                "constraint_loss/train": outputs["constraint_loss"],
-                "trajectory_cost/train": outputs["trajectory_cost"],
-                "gradient_norm": module.gradient_norm,
+        for member, curves in _with_writers(trainer, _trained_module(pl_module)):
+            output = _shown(member.output)
+            scalars = {
+                "loss/train": output.loss,
+                **{f"term/{name}": value for name, value in output.terms.items()},
+                "constraint_loss/train": output.constraint_loss,
+                "trajectory_cost/train": output.trajectory_cost,
+                "gradient_norm": member.gradient_norm,
                 "learning_rate": trainer.optimizers[0].param_groups[0]["lr"],
-                "rollout_steps_per_second": module.steps_per_second,
-            },
-        )
+                "rollout_steps_per_second": member.steps_per_second,
+            }
+            _log(trainer, curves, scalars)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._log_validation(trainer, _program_module(pl_module))
+        self._log_validation(trainer, _trained_module(pl_module))
 
     @staticmethod
-    def _log_validation(trainer: Trainer, module: ProgramModule) -> None:
-        assert module.validation is not None
-        summary = module.validation.summary()
-        names = {
-            "constraint_loss/val": summary["constraint_loss"],
-            "trajectory_cost/val": summary["cost_mean"],
-            "optimality_gap/val": None if summary["cost_ratio"] is None else summary["cost_ratio"] - 1,
-            "value_error/val": summary["value_error"],
-            "value_to_cost/val": summary["value_to_cost"],
-            "satisfied_fraction/val": summary["satisfied_fraction"],
-            "bounded_fraction/val": summary["bounded_fraction"],
-            "decreasing_fraction/val": summary["decreasing_fraction"],
-            "terminal_error/val": summary["terminal_error"],
-        }
-        _log(trainer, {name: value for name, value in names.items() if value is not None})
+    def _log_validation(trainer: Trainer, module: TrainedModule) -> None:
+        for member, curves in _with_writers(trainer, module):
+            summary = _shown(member.validation).summary()
+            names = {
+                "constraint_loss/val": summary["constraint_loss"],
+                "trajectory_cost/val": summary["cost_mean"],
+                "optimality_gap/val": None if summary["cost_ratio"] is None else summary["cost_ratio"] - 1,
+                "value_error/val": summary["value_error"],
+                "value_to_cost/val": summary["value_to_cost"],
+                "satisfied_fraction/val": summary["satisfied_fraction"],
+                "bounded_fraction/val": summary["bounded_fraction"],
+                "decreasing_fraction/val": summary["decreasing_fraction"],
+                "terminal_error/val": summary["terminal_error"],
+            }
+            _log(trainer, curves, {name: value for name, value in names.items() if value is not None})
 
 
 class FigureLogger(Callback):
-    """Draws the certified region, some trajectories and slices of V during training.
+    """Draws the certified region, some trajectories and slices of V during training: the first member's.
 
     Args:
         every: steps between drawings; the last validation always draws.
@@ -120,23 +160,24 @@ class FigureLogger(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            self._draw(trainer, _program_module(pl_module))
+            self._draw(trainer, _trained_module(pl_module))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
         if step % self.every == 0 or step == trainer.max_epochs:
-            self._draw(trainer, _program_module(pl_module))
+            self._draw(trainer, _trained_module(pl_module))
 
-    def _draw(self, trainer: Trainer, module: ProgramModule) -> None:
+    def _draw(self, trainer: Trainer, module: TrainedModule) -> None:
         if not trainer.is_global_zero:
             return
+        member, pictures = next(_with_writers(trainer, module))
         try:
-            drawn = self._figures(module)
+            drawn = self._figures(member)
         except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
             warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
             return
         for name, figure in drawn.items():
-            writer(trainer).add_image(name, _pixels(figure), trainer.global_step, dataformats="HWC")
+            pictures.add_image(name, _pixels(figure), trainer.global_step, dataformats="HWC")
 
     @staticmethod
     def _figures(module: ProgramModule) -> dict[str, Figure]:
@@ -145,8 +186,8 @@ class FigureLogger(Callback):
         with torch.no_grad():
             sample = module.closed_loop(x0)
         return {
-            "certified_region": figures.certified_region(module.V, module.closed_loop, system, initial_states),
-            "trajectories": figures.trajectories(module.V, sample, system),
+            "certified_region": figures.certified_region(module.closed_loop, system, initial_states),
+            "trajectories": figures.trajectories(sample, system),
             "value_slices": figures.value_slices(module.V, system, initial_states, horizon.duration),
         }
 
@@ -154,26 +195,27 @@ class FigureLogger(Callback):
 class Checkpoints(Checkpoint):
     """last.ckpt after every validation, best.ckpt where loss/val is least, and last.ckpt on Ctrl-C and SIGTERM.
 
-    The event file is flushed first, so that it is never behind the checkpoint. (Lightning's ModelCheckpoint writes its
-    last checkpoint only together with a best one, remembers absolute paths, and its position within an interval.)
+    The event files are flushed first, so that they are never behind the checkpoint. (Lightning's ModelCheckpoint writes
+    its last checkpoint only together with a best one, remembers absolute paths, and its position within an interval.)
 
     Args:
-        folder: where both files go.
+        last: the checkpoint of the whole run.
+        best: label ↦ each member's best checkpoint.
         every: steps between validations; the last step is validated and saved whether a multiple or not.
     """
 
-    def __init__(self, folder: Path, every: int):
+    def __init__(self, last: Path, best: Mapping[str, Path], every: int):
         super().__init__()
-        self.folder, self.every = folder, every
-        self.best_loss = math.inf
+        self.last, self.best, self.every = last, best, every
+        self.best_loss = dict.fromkeys(best, math.inf)
         self._signal: int | None = None
         self._previous: dict[int, Any] = {}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"best_loss": self.best_loss}
+        return {labelled("best_loss", label): loss for label, loss in self.best_loss.items()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.best_loss = state_dict["best_loss"]
+        self.best_loss = {label: state_dict[labelled("best_loss", label)] for label in self.best_loss}
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._install_handlers()  # before the first validation and figures, which take seconds
@@ -188,16 +230,13 @@ class Checkpoints(Checkpoint):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
         if step % self.every == 0 or step == trainer.max_epochs:
-            loss = float(trainer.callback_metrics["loss/val"])
-            if loss < self.best_loss:
-                self.best_loss = loss
-                self._save(trainer, BEST)
-            self._save(trainer, LAST)
+            self._save_best(trainer, _trained_module(pl_module))
+            self._save_last(trainer)
         # every process stops if one of them was told to
         if trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
-            path = self._save(trainer, LAST)
+            self._save_last(trainer)
             name = signal.Signals(self._signal).name if self._signal else "Stop"
-            raise Interrupted(f"{name} after step {step}: saved {path}.")
+            raise Interrupted(f"{name} after step {step}: saved {self.last}.")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         self._restore_handlers()
@@ -205,11 +244,17 @@ class Checkpoints(Checkpoint):
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         self._restore_handlers()
 
-    def _save(self, trainer: Trainer, name: str) -> Path:
-        path = self.folder / f"{name}.ckpt"
-        writer(trainer).flush()
-        trainer.save_checkpoint(path)
-        return path
+    def _save_best(self, trainer: Trainer, module: TrainedModule) -> None:
+        _flush(trainer)
+        for member, label in zip(module.members, module.labels, strict=True):
+            loss = float(trainer.callback_metrics[labelled("loss/val", label)])
+            if loss < self.best_loss[label]:
+                self.best_loss[label] = loss
+                module.save_member(member, self.best[label])
+
+    def _save_last(self, trainer: Trainer) -> None:
+        _flush(trainer)
+        trainer.save_checkpoint(self.last)
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if self._signal is not None:  # the second time, the user means now
@@ -256,22 +301,19 @@ class TrainingProgress(ProgressBar):
     ) -> None:
         if self._progress is None or self._task is None:
             return
-        module = _program_module(pl_module)
-        loss, cost = float(outputs["loss"]), float(outputs["trajectory_cost"])
-        line = f"loss {loss:.4g}  cost {cost:.4g}  {module.steps_per_second:,.0f} rollout steps/s"
+        members = _trained_module(pl_module).members
+        loss = fmean(float(_shown(member.output).loss) for member in members)
+        cost = fmean(float(_shown(member.output).trajectory_cost) for member in members)
+        speed = sum(member.steps_per_second for member in members)
+        line = f"loss {loss:.4g}  cost {cost:.4g}  {speed:,.0f} rollout steps/s"
         self._progress.update(self._task, completed=trainer.global_step, description=line)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        module = _program_module(pl_module)
-        if self._progress is None or module.validation is None:
+        if self._progress is None:
             return
-        summary = module.validation.summary()
-        ratio = "" if summary["cost_ratio"] is None else f"  cost/optimum {summary['cost_ratio']:.4f}"
-        self._console.print(
-            f"step {trainer.global_step}/{trainer.max_epochs}  cost {summary['cost_mean']:.4g}{ratio}  "
-            f"constraint loss {summary['constraint_loss']:.3g}  satisfied {summary['satisfied_fraction']:.0%}",
-            soft_wrap=True,
-        )
+        summaries = [_shown(member.validation).summary() for member in _trained_module(pl_module).members]
+        measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := over_seeds(summaries, key, form))]
+        self._console.print(f"step {trainer.global_step}/{trainer.max_epochs}  {'  '.join(measures)}", soft_wrap=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         self._stop()
@@ -285,20 +327,47 @@ class TrainingProgress(ProgressBar):
             self._progress = None
 
 
-def writer(trainer: Trainer) -> SummaryWriter:
-    """TensorBoard's writer of the run."""
-    assert isinstance(trainer.logger, TensorBoardLogger)
-    return trainer.logger.experiment
+def over_seeds(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
+    """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
+    values = [summary[key] for summary in summaries]
+    if None in values:
+        return ""
+    mean, low, high = (format(value, form) for value in (fmean(values), min(values), max(values)))
+    return mean if len(values) == 1 else f"{mean} ({low} – {high})"
 
 
-def _log(trainer: Trainer, scalars: dict[str, Any]) -> None:
+def _with_writers(trainer: Trainer, module: TrainedModule) -> Iterator[tuple[ProgramModule, SummaryWriter]]:
+    """Each member and TensorBoard's writer of its curves."""
+    return zip(module.members, _writers(trainer), strict=True)
+
+
+def _writers(trainer: Trainer) -> list[SummaryWriter]:
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
+    return [logger.experiment for logger in loggers]
+
+
+def _flush(trainer: Trainer) -> None:
+    for curves in _writers(trainer):
+        curves.flush()
+
+
+def _log(trainer: Trainer, curves: SummaryWriter, scalars: dict[str, Any]) -> None:
     if trainer.is_global_zero:
         for name, value in scalars.items():
-            writer(trainer).add_scalar(name, float(value), trainer.global_step)
+            curves.add_scalar(name, float(value), trainer.global_step)
 
 
-def _program_module(module: LightningModule) -> ProgramModule:
-    assert isinstance(module, ProgramModule)
+T = TypeVar("T")
+
+
+def _shown(record: T | None) -> T:
+    """What a member keeps of its last step or validation, once there was one."""
+    assert record is not None
+    return record
+
+
+def _trained_module(module: LightningModule) -> TrainedModule:
+    assert isinstance(module, TrainedModule)
     return module
 
 

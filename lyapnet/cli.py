@@ -1,7 +1,9 @@
-"""The command line: lyapnet train | evaluate | systems."""
+"""The command line: lyapnet train | evaluate | bench | systems."""
 
 import json
 import sys
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from lyapnet.errors import LyapnetError
+from lyapnet.errors import LyapnetError, UsageError
 
 app = typer.Typer(
     add_completion=False,
@@ -89,6 +91,74 @@ def evaluate(
 
 
 @app.command()
+def bench(
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")
+    ] = None,
+    task: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."
+        ),
+    ] = None,
+    batch: Annotated[list[str] | None, typer.Option(help="Numbers of initial states; 12,64,512 if none.")] = None,
+    routes: Annotated[list[str] | None, typer.Option(help="Some of the above; all that can run here if none.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
+    figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
+    debug: Debug = False,
+) -> None:
+    """Time the routes to the gradient of a training loss; measure their memory and error.
+
+    Routes, of which the starred ones appear twice, eager and compiled:
+
+    rollout *            the closed loop without a gradient: the floor
+    adjoint              odeint_adjoint, V_x by the network's formula
+    adjoint-autograd     odeint_adjoint, V_x by autograd
+    backprop             backpropagation through the steps
+    discrete *           the exact discrete adjoint
+    jax, jax-checkpoint  the same loss jitted in JAX, where it is installed
+    jax-rollout          and its closed loop alone
+
+    All routes of one task and batch are warmed up, then timed in turns.
+    Memory is the peak beyond the model; errors are relative, against
+    backprop in float64. Compiling takes up to a minute for each task and
+    batch, once for a machine; rollout.compile=off leaves it out.
+
+    lyapnet bench --task double_integrator,reacher --batch 12,64 --json
+    lyapnet bench --batch 1,8,64,512,4096 --routes rollout,discrete --figures out
+    lyapnet bench --task chain:2,chain:8,chain:32 --batch 64 --figures out
+    lyapnet bench network.name=fcn program.name=value training.precision=float32
+    """
+    from lyapnet import bench as benchmark
+    from lyapnet.compilation import has_compiler
+
+    benchmark.use_threads(threads)
+    cases = [benchmark.load_case(name, overrides or []) for name in _items(task) or ["double_integrator"]]
+    chosen = [(case, benchmark.routes_for(case, _items(routes))) for case in cases]
+    batches = [_batch(text) for text in _items(batch) or ["12", "64", "512"]]
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
+    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
+    say = partial(notes.print, soft_wrap=True)
+    if not has_compiler():
+        say("No C++ compiler ($CXX, g++ or clang++): compiled rows are left out.")
+    rows = []
+    for case, names in chosen:
+        for size in batches:
+            with notes.status(f"{case.name}, batch {size}: {', '.join(names)}"):
+                rows += benchmark.measure(case, size, names, repeats, say)
+        if not as_json:
+            console.print(_bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
+    if as_json:
+        print(json.dumps([asdict(row) for row in rows]))
+    if figures is not None:
+        for path in _write_figures(figures, cases[0], rows):
+            say(f"wrote {path}")
+
+
+@app.command()
 def systems(debug: Debug = False) -> None:
     """List the registered systems with their states, controls and parameters."""
     import inspect
@@ -111,6 +181,62 @@ def systems(debug: Debug = False) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print("A system of your own: system.name=module:Class; see the README.")
+
+
+def _items(values: list[str] | None) -> list[str]:
+    """The entries of a repeated option, each of which may hold several after commas."""
+    return list(dict.fromkeys(item.strip() for value in values or [] for item in value.split(",")))
+
+
+def _batch(text: str) -> int:
+    if not (text.isdecimal() and int(text) > 0):
+        raise UsageError(f"Expected --batch as numbers ≥ 1, got {text!r}; for example --batch 12,64.")
+    return int(text)
+
+
+def _bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
+    from lyapnet.bench import BASELINE
+
+    parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.task.horizon
+    columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
+    table = Table("route", "com-\npiled", *columns)
+    table.title = (
+        f"{case.name}: one loss and its gradient\n{horizon.steps} steps, {parameters} parameters, "
+        f"{rows[0].dtype}, {threads} thread{'s' * (threads > 1)}, median of {repeats}"
+    )
+    table.caption = f"×: times faster than {BASELINE}; steps: of the environment; MB: peak"
+    baseline = {row.batch: row.seconds for row in rows if row.route == BASELINE}
+    for row, following in zip(rows, [*rows[1:], None], strict=True):
+        table.add_row(
+            row.route, "yes" if row.compiled else "no", str(row.batch), f"{row.seconds:.3g}",
+            f"{baseline[row.batch] / row.seconds:.2g}" if row.batch in baseline else "–",
+            f"{row.steps_per_second / 1e3:,.1f}",
+            "–" if row.peak_bytes is None else f"{row.peak_bytes / 1e6:.1f}",
+            "–" if row.relative_error is None else f"{row.relative_error:.0e}",
+            end_section=following is not None and following.batch != row.batch,
+        )  # fmt: skip
+    return table
+
+
+def _write_figures(folder: Path, first: Any, rows: list[Any]) -> list[Path]:
+    """The figures that these rows fill, and the gradient errors of the first task."""
+    from lyapnet import figures
+    from lyapnet.bench import gradient_accuracy, is_chain
+
+    horizon = first.task.horizon
+    title = (
+        f"{first.name}: ∂J/∂θ of the mean trajectory cost over {horizon.duration:g} s, "
+        f"in {horizon.steps}/16 to {horizon.steps}/2 steps; dopri5 by its tolerance"
+    )
+    drawn = {"gradient_error": figures.gradient_error(gradient_accuracy(first), title)}
+    chains = [row for row in rows if is_chain(row.task)]
+    if others := [row for row in rows if row not in chains]:
+        drawn["gradient_time"] = figures.gradient_time(others)
+    if chains:
+        drawn["steps_per_second_against_n"] = figures.steps_per_second_against_n(chains)
+    for name, figure in drawn.items():
+        figure.savefig(folder / f"{name}.png", dpi=150)
+    return [folder / f"{name}.png" for name in drawn]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -152,8 +278,9 @@ def _reached_end(plan: Any) -> bool:
 
 
 def _print_result(console: Console, plan: Any, result: dict[str, Any]) -> None:
-    console.print(_table(f"{plan.config.experiment}, best checkpoint", result))
-    best = plan.run.best
+    title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
+    console.print(_table(title, result) if len(members) == 1 else _table_over_seeds(f"{title} of each seed", result))
+    best = members[0].best
     for what, command in (
         ("run", plan.run.folder),
         ("watch", f"tensorboard --logdir {plan.config.logs}"),
@@ -181,17 +308,37 @@ ROWS = {
     "satisfied_fraction_1e-6": "… within 1e-6",
 }
 
+NO_ORACLE = "–: no oracle knows the optimum of this task"
+
 
 def _table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in ROWS.items():
-        value = result[key]
-        if value is None:
+        if result[key] is None:
             table.add_row(label, "–")
-            table.caption = "–: no oracle knows the optimum of this task"
+            table.caption = NO_ORACLE
         else:
-            table.add_row(label, f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}")
+            table.add_row(label, _measured(key, result[key]))
     return table
+
+
+def _table_over_seeds(title: str, result: dict[str, Any]) -> Table:
+    seeds = result["seeds"]
+    table = Table("measure", *(Column(name, no_wrap=True) for name in ("mean ± spread", "least (seed)", "most (seed)")))
+    table.title = f"{title}\n{len(seeds)} seeds, {seeds[0]['samples']} unseen states of X₀ each"
+    for key, label in ROWS.items():
+        if key not in result["mean"]:
+            table.add_row(label, "–", "–", "–")
+            table.caption = NO_ORACLE
+            continue
+        ends = [choose(seeds, key=lambda one, key=key: one[key]) for choose in (min, max)]
+        mean, spread = (_measured(key, result[name][key]) for name in ("mean", "spread"))
+        table.add_row(label, f"{mean} ± {spread}", *(f"{_measured(key, end[key])} ({end['seed']})" for end in ends))
+    return table
+
+
+def _measured(key: str, value: float) -> str:
+    return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"
 
 
 def _with_units(names: Any, units: Any) -> str:

@@ -23,6 +23,8 @@ from lyapnet.programs import PROGRAMS
 from lyapnet.rollout import GRADIENTS, METHODS
 from lyapnet.systems import SYSTEMS
 
+SWITCH = ("auto", "on", "off")
+
 
 def option(
     default: Any,
@@ -114,6 +116,9 @@ class RolloutConfig:
     policy: str = option("hjb", "The control law that V defines.", choices=tuple(POLICIES))
     method: str = option("euler", "The integrator.", choices=METHODS)
     gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
+    compile: str = option(
+        "auto", "Run gradient discrete as machine code; auto where that earns its compilation.", choices=SWITCH
+    )
     rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
     atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
 
@@ -153,6 +158,7 @@ class Config:
     experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.")
     logs: str = option("logs", "The folder of all runs.")
     seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0)
+    seeds: int = option(1, "Runs trained together as one batch, with the seeds seed, seed + 1, …", at_least=1)
     program: ProgramConfig = field(default_factory=ProgramConfig)
     system: SystemConfig = field(default_factory=SystemConfig)
     cost: CostConfig = field(default_factory=CostConfig)
@@ -163,6 +169,16 @@ class Config:
     training: TrainingConfig = field(default_factory=TrainingConfig)
     trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+def configs_of_seeds(config: Config) -> list[Config]:
+    """The config of each seed's run alone."""
+    return [dataclasses.replace(config, seed=config.seed + k, seeds=1) for k in range(config.seeds)]
+
+
+def label_of(config: Config) -> str:
+    """The name of a seed's run within an ensemble."""
+    return f"seed_{config.seed}"
 
 
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
@@ -214,6 +230,8 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     except yaml.YAMLError as error:
         raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
     assert isinstance(config, Config)
+    # YAML reads on and off as booleans
+    config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     _check_values(config)
     return config
 

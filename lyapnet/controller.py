@@ -182,8 +182,13 @@ def load_value_function(V: nn.Module, content: dict, path: str | Path) -> None:
     """Put a checkpoint's weights into V.
 
     Raises:
-        CheckpointError: naming the tensors that differ.
+        CheckpointError: naming the tensors that differ; or it holds the weights of several seeds.
     """
+    if content[KEY].get("config", {}).get("seeds", 1) > 1:
+        raise CheckpointError(
+            f"Expected the checkpoint of one seed, got {str(path)!r}, which holds several; use "
+            "checkpoints/best.ckpt in a seed's folder beside it."
+        )
     prefix = "V."
     weights = {key.removeprefix(prefix): w for key, w in content["state_dict"].items() if key.startswith(prefix)}
     own = V.state_dict()

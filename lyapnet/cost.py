@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from lyapnet.linear_algebra import apply, solve
 from lyapnet.types import Control, ControlMatrix, Matrix, PerState, State
 
 
@@ -67,10 +68,7 @@ class QuadraticCost(nn.Module):
 
     def solve_R(self, x: State, v: Control) -> Control:
         """R(x)⁻¹v."""
-        R = self.R(x)
-        if R.shape[-1] == 1:  # a division, an eighth of a batched solve's time
-            return v / R[..., 0]
-        return torch.linalg.solve(R, v)
+        return solve(self.R(x), v[..., None])[..., 0]
 
     def check(self, x: State) -> None:
         """Refuse an R(x) that is not symmetric positive definite at some state of a batch (b, n).
@@ -91,9 +89,7 @@ class QuadraticCost(nn.Module):
 
 
 def _quadratic(weight: Tensor, v: Tensor) -> Tensor:
-    if weight.ndim == 2:
-        return ((v @ weight) * v).sum(-1)
-    return ((weight @ v[..., None])[..., 0] * v).sum(-1)
+    return (apply(weight, v) * v).sum(-1)
 
 
 def _symmetric(name: str, rows: Sequence[Sequence[float]] | Tensor, *, definite: bool) -> Tensor:

@@ -3,6 +3,8 @@
 from typing import Any
 
 import lightning as L
+import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from lyapnet.errors import CheckpointError
@@ -36,9 +38,12 @@ class InitialStateDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         return DataLoader(_CurrentBatch(self), batch_size=None)
 
+    def validation_batch(self) -> State:
+        """The states of every validation."""
+        return self.initial_states.sample(self.validation_states, stream(self.seed, VALIDATION))
+
     def val_dataloader(self) -> DataLoader:
-        fixed = self.initial_states.sample(self.validation_states, stream(self.seed, VALIDATION))
-        return DataLoader([fixed], batch_size=None)  # pyright: ignore[reportArgumentType]
+        return DataLoader([self.validation_batch()], batch_size=None)  # pyright: ignore[reportArgumentType]
 
     def position(self) -> int:
         """The step whose batch comes next."""
@@ -56,6 +61,26 @@ class InitialStateDataModule(L.LightningDataModule):
             )
 
 
+class EnsembleDataModule(InitialStateDataModule):
+    """Batches (E, b, n): for each of the seeds seed, seed + 1, … what its run alone would draw.
+
+    Args:
+        seeds: E.
+    """
+
+    def __init__(self, initial_states: Box, batch_size: int, validation_states: int, seed: int, seeds: int):
+        super().__init__(initial_states, batch_size, validation_states, seed)
+        self.members = [
+            InitialStateDataModule(initial_states, batch_size, validation_states, seed + k) for k in range(seeds)
+        ]
+
+    def batch(self, step: int, process: int = 0) -> Tensor:
+        return torch.stack([member.batch(step, process) for member in self.members])
+
+    def validation_batch(self) -> Tensor:
+        return torch.stack([member.validation_batch() for member in self.members])
+
+
 class _CurrentBatch(Dataset):
     """A dataset of one element: the batch of the current step. An epoch is one step, since no state is seen twice."""
 
@@ -65,6 +90,6 @@ class _CurrentBatch(Dataset):
     def __len__(self) -> int:
         return 1
 
-    def __getitem__(self, index: int) -> State:
+    def __getitem__(self, index: int) -> Tensor:
         process = self.states.trainer.global_rank if self.states.trainer else 0
         return self.states.batch(self.states.position(), process)

@@ -21,6 +21,10 @@ class DivergenceError(LyapnetError):
     """A rollout, a loss term or a gradient left the finite numbers."""
 
 
+class CompilationError(LyapnetError):
+    """A closed loop cannot be compiled; it runs without."""
+
+
 class Interrupted(LyapnetError):
     """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
 

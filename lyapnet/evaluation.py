@@ -14,7 +14,7 @@ from lyapnet.programs import Program
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.randomness import TEST, stream
 from lyapnet.rollout import Trajectory
-from lyapnet.types import PerState, State, Value
+from lyapnet.types import PerState, State
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 
@@ -66,11 +66,9 @@ class StateTable:
         }
 
 
-def measure(
-    V: Value, trajectory: Trajectory, program: Program, oracle: Callable[[State], PerState] | None
-) -> StateTable:
-    """The table of a batch (b,) of trajectories under the policy of V."""
-    values = V(trajectory.t[:, None], trajectory.x)
+def measure(trajectory: Trajectory, program: Program, oracle: Callable[[State], PerState] | None) -> StateTable:
+    """The table of a batch (b,) of trajectories under the control law of a V."""
+    values = trajectory.require_value()
     return StateTable(
         cost=trajectory.cost,
         value=values[0],
@@ -105,7 +103,7 @@ def state_table(controller: Controller, x0: State) -> StateTable:
     program = build_program(controller.config)
     oracle = optimal_cost(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
     with torch.no_grad():
-        return measure(controller.V, controller.rollout(x0), program, oracle)
+        return measure(controller.rollout(x0), program, oracle)
 
 
 def _share(holds: Tensor) -> float:

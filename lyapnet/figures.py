@@ -10,8 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import NullLocator
 from torch import Tensor
 
+from lyapnet.bench import Accuracy, Row
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.sets import Box
@@ -20,6 +22,13 @@ from lyapnet.types import State, Value
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
+SKY, PURPLE = "#56B4E9", "#CC79A7"
+
+ROUTE_STYLES = {  # of lyapnet.bench
+    "rollout": (GREY, "o"), "adjoint": (ORANGE, "s"), "adjoint-autograd": (VERMILION, "D"), "backprop": (GREEN, "^"),
+    "discrete": (BLUE, "o"), "jax": (PURPLE, "v"), "jax-checkpoint": (PURPLE, "x"), "jax-rollout": (SKY, "v"),
+}  # fmt: skip
+METHOD_LINES = {"euler": "-", "midpoint": ":", "rk4": "--", "dopri5": "-."}
 
 
 class Slice(NamedTuple):
@@ -46,7 +55,7 @@ def widest_slice(initial_states: Box, points: int) -> Slice:
 
 
 def certified_region(
-    V: Value, rollout: Rollout, system: ControlAffineSystem, initial_states: Box, tolerance: float = 1e-2
+    rollout: Rollout, system: ControlAffineSystem, initial_states: Box, tolerance: float = 1e-2
 ) -> Figure:
     """Which initial states of a slice of X₀ satisfy the Lyapunov condition along their whole closed loop.
 
@@ -56,7 +65,7 @@ def certified_region(
     region = widest_slice(initial_states, 41 if _free_components(initial_states) > 1 else 101)
     with torch.no_grad():
         trajectory = rollout(region.states)
-        values = V(trajectory.t[:, None], trajectory.x)
+    values = trajectory.require_value()
     violation = hinge(values, trajectory.step_cost)
     holds = satisfied(violation, values[0], tolerance)
     share = float(holds.double().mean())
@@ -139,10 +148,8 @@ def _draw_line_region(
     figure.legend(loc="outside lower center", ncols=3, fontsize=7, frameon=False)
 
 
-def trajectories(V: Value, trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
+def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
     """States, controls, and V with the cost still to come, over time, of a batch (b,) of closed loops."""
-    with torch.no_grad():
-        values = V(trajectory.t[:, None], trajectory.x)
     to_go = trajectory.cost - trajectory.running_cost
     t = _numpy(trajectory.t)
     curves = [(state_label(system, i), _numpy(trajectory.x[..., i]), BLUE) for i in range(system.n)]
@@ -159,7 +166,7 @@ def trajectories(V: Value, trajectory: Trajectory, system: ControlAffineSystem) 
     last = panels[len(curves)]
     for name, paths, style in (
         ("cost to go", to_go, {"color": ORANGE}),
-        ("V(t, x)", values, {"color": BLUE, "ls": "--"}),
+        ("V(t, x)", trajectory.require_value(), {"color": BLUE, "ls": "--"}),
     ):
         lines = last.plot(t, _numpy(paths), linewidth=0.9, **style)
         lines[0].set_label(name)
@@ -201,6 +208,86 @@ def value_slices(V: Value, system: ControlAffineSystem, initial_states: Box, dur
         panel.set_xlabel(state_label(system, region.axes[0]))
     panels[0].set_ylabel(state_label(system, region.axes[1]))
     return figure
+
+
+def gradient_time(rows: Sequence[Row]) -> Figure:
+    """Seconds for a loss and its gradient, and environment steps per second, against the batch; a column for a task."""
+    tasks = list(dict.fromkeys(row.task for row in rows))
+    figure = Figure(figsize=(max(3.4 * len(tasks), 5.6), 6.4), layout="constrained")
+    grid = figure.subplots(2, len(tasks), sharex="col", sharey="row", squeeze=False)
+    for column, task in zip(grid.T, tasks, strict=True):
+        of_task = [row for row in rows if row.task == task]
+        for panel, field in zip(column, ("seconds", "steps_per_second"), strict=True):
+            _draw_routes(panel, of_task, "batch", field)
+        column[0].set_title(f"{task}, {of_task[0].dtype}", fontsize=9)
+        column[1].set_xlabel("batch (initial states)")
+    grid[0, 0].set_ylabel("seconds per loss and gradient (s)")
+    grid[1, 0].set_ylabel("environment steps per second (1/s)")
+    _legend_below(figure, grid[0, 0])
+    return figure
+
+
+def steps_per_second_against_n(rows: Sequence[Row]) -> Figure:
+    """Environment steps per second against the number of states; a panel for a batch."""
+    batches = sorted({row.batch for row in rows})
+    figure = Figure(figsize=(max(3.4 * len(batches), 5.6), 3.9), layout="constrained")
+    panels = figure.subplots(1, len(batches), sharey=True, squeeze=False)[0]
+    for panel, batch in zip(panels, batches, strict=True):
+        _draw_routes(panel, [row for row in rows if row.batch == batch], "states", "steps_per_second")
+        panel.set_title(f"batch {batch}, {rows[0].dtype}", fontsize=9)
+        panel.set_xlabel("states n")
+    panels[0].set_ylabel("environment steps per second (1/s)")
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def gradient_error(points: Sequence[Accuracy], title: str) -> Figure:
+    """Each route's gradient error against what it took: from the loss that is trained, and from continuous time."""
+    figure = Figure(figsize=(9, 4.6), layout="constrained")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    fields = {
+        "discretisation_error": "against backprop through the same steps (itself 0):\nis it the gradient of this loss?",
+        "continuous_error": "against the gradient as Δt → 0:\nwhat the steps themselves cost",
+    }
+    for panel, (field, heading) in zip(panels, fields.items(), strict=True):
+        for route, method in dict.fromkeys((point.route, point.method) for point in points):
+            chosen = [point for point in points if (point.route, point.method) == (route, method)]
+            shown = [(point.evaluations, getattr(point, field)) for point in chosen if getattr(point, field)]
+            color, marker = ROUTE_STYLES[route]
+            panel.loglog(
+                [x for x, _ in shown], [y for _, y in shown], METHOD_LINES[method], color=color, marker=marker,
+                markersize=4, linewidth=1.1, label=f"{route}, {method}",
+            )  # fmt: skip
+        panel.set_title(heading, fontsize=9)
+        panel.set_xlabel("evaluations of f + gu per trajectory, forward and backward", fontsize=8)
+        panel.grid(color=GREY, alpha=0.25, linewidth=0.5)
+        panel.tick_params(labelsize=8)
+    panels[0].set_ylabel("relative error of the gradient of J", fontsize=8)
+    figure.suptitle(title, fontsize=9)
+    _legend_below(figure, panels[1])
+    return figure
+
+
+def _draw_routes(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:
+    """A line for each route; whole where it is compiled, dashed where it is not."""
+    for route, compiled in dict.fromkeys((row.route, row.compiled) for row in rows):
+        chosen = sorted((getattr(r, x), getattr(r, y)) for r in rows if (r.route, r.compiled) == (route, compiled))
+        color, marker = ROUTE_STYLES[route]
+        label = f"{route}, compiled" if compiled else route
+        style = "-" if compiled else "--"
+        axes.loglog(
+            *zip(*chosen, strict=True), style, color=color, marker=marker, markersize=4, linewidth=1.1, label=label
+        )
+    ticks = sorted({getattr(row, x) for row in rows})
+    axes.set_xticks(ticks if len(ticks) < 8 else ticks[::2], minor=False)
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.grid(color=GREY, alpha=0.25, linewidth=0.5)
+
+
+def _legend_below(figure: Figure, axes: Axes) -> None:
+    handles, names = axes.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=4, fontsize=7, frameon=False)
 
 
 def state_label(system: ControlAffineSystem, index: int) -> str:

@@ -1,27 +1,59 @@
 """Control laws that a value function defines."""
 
+from typing import NamedTuple
+
 import torch
 from torch import nn
 
-from lyapnet.calculus import drift_lie_derivative, gradients, input_lie_derivative, state_gradient
+from lyapnet.calculus import (
+    drift_lie_derivative,
+    gradients,
+    input_lie_derivative,
+    state_gradient,
+    value_and_state_gradient,
+)
 from lyapnet.cost import QuadraticCost
 from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import Control, State, Time
+from lyapnet.types import Control, PerState, State, Time
 
 
-class HJBPolicy(nn.Module):
-    """u*(t, x) = argmin_u H(x, u, V_x) = −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+class PolicyOutput(NamedTuple):
+    """A control, and the value function that it comes from, at the same (t, x)."""
+
+    u: Control
+    value: PerState
+    state_gradient: State  # V_x
+
+
+class ValuePolicy(nn.Module):
+    """u = policy(t, x), a control law that V defines."""
 
     def __init__(self, system: ControlAffineSystem, cost: QuadraticCost, V: nn.Module):
         super().__init__()
         self.system, self.cost, self.V = system, cost, V
 
+    def with_value(self, t: Time, x: State) -> PolicyOutput:
+        """u, V and V_x; a law that needs V_x anyway shares it."""
+        return PolicyOutput(self(t, x), *value_and_state_gradient(self.V, t, x))
+
+
+class HJBPolicy(ValuePolicy):
+    """u*(t, x) = argmin_u H(x, u, V_x) = −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+
     def forward(self, t: Time, x: State) -> Control:
-        LgV = input_lie_derivative(self.system, x, state_gradient(self.V, t, x))
-        return -0.5 * self.cost.solve_R(x, LgV)
+        return self._minimise(x, state_gradient(self.V, t, x))
+
+    def with_value(self, t: Time, x: State) -> PolicyOutput:
+        if type(self).forward is not HJBPolicy.forward:  # a law derived from this one
+            return super().with_value(t, x)
+        value, V_x = value_and_state_gradient(self.V, t, x)
+        return PolicyOutput(self._minimise(x, V_x), value, V_x)
+
+    def _minimise(self, x: State, V_x: State) -> Control:
+        return -0.5 * self.cost.solve_R(x, input_lie_derivative(self.system, x, V_x))
 
 
-class SontagPolicy(nn.Module):
+class SontagPolicy(ValuePolicy):
     """Sontag's universal formula, weighted by the cost: with a = V_t + LfV, b = LgV and σ = bᵀR⁻¹b,
 
         u = −(a + √(a² + qσ))/σ · R⁻¹b,   and 0 where b = 0,
@@ -34,10 +66,6 @@ class SontagPolicy(nn.Module):
     Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
     function and receding horizon perspective", Asian Journal of Control 1999 (this form).
     """
-
-    def __init__(self, system: ControlAffineSystem, cost: QuadraticCost, V: nn.Module):
-        super().__init__()
-        self.system, self.cost, self.V = system, cost, V
 
     def forward(self, t: Time, x: State) -> Control:
         V_t, V_x = gradients(self.V, t, x)
@@ -56,4 +84,4 @@ class SontagPolicy(nn.Module):
         return -gain[..., None] * direction
 
 
-POLICIES: dict[str, type[HJBPolicy] | type[SontagPolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy}
+POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy}

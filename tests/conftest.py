@@ -13,6 +13,7 @@ from torch import nn
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
 install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
+from lyapnet import discrete_adjoint  # noqa: E402
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
 from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
@@ -32,6 +33,33 @@ ARGUMENTS = {
 def _float64_and_seeded():
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def traced() -> bool | None:
+    """Whether rollouts with the discrete costate run in a trace, or as they are written; None is their own choice.
+
+    A trace takes seconds: tests of the mathematics override this with False, and run it in Python.
+    """
+    return None
+
+
+@pytest.fixture(autouse=True)
+def _form_of_rollouts(traced, monkeypatch):
+    def forced(step):
+        def run(*arguments, **options):
+            if not traced:
+                raise NotImplementedError
+            try:
+                return step(*arguments, **options)
+            except Exception as error:  # which a rollout would take for a reason to run without a trace
+                pytest.fail(f"Expected a trace, got {error!r}.")
+
+        return run
+
+    if traced is not None:
+        for name in ("trace", "batched", "cut"):
+            monkeypatch.setattr(discrete_adjoint, name, forced(getattr(discrete_adjoint, name)))
 
 
 @pytest.fixture

@@ -9,7 +9,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1] / "lyapnet"
-FLOW = ("errors", "types", "sets", "systems", "cost", "calculus", "networks", "policy", "rollout", "programs")
+FLOW = (
+    "errors", "types", "linear_algebra", "sets", "systems", "cost", "calculus", "networks", "policy", "closed_loop",
+    "tracing", "compilation", "runge_kutta", "discrete_adjoint", "rollout", "programs",
+)  # fmt: skip
 CORE = (*FLOW, "oracles")
 EDGE = ("lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib")
 

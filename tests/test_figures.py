@@ -38,7 +38,7 @@ def build(name, V=None):
 
 
 def region(task, V, rollout, **options):
-    return figures.certified_region(V, rollout, task.system, task.initial_states, **options)
+    return figures.certified_region(rollout, task.system, task.initial_states, **options)
 
 
 def drawn(figure):
@@ -83,7 +83,7 @@ def test_figures_are_drawn_with_units(drawing):
     name, task, V, rollout = drawing
     with torch.no_grad():
         sample = rollout(task.initial_states.sample(5))
-    paths = figures.trajectories(V, sample, task.system)
+    paths = figures.trajectories(sample, task.system)
     slices = figures.value_slices(V, task.system, task.initial_states, task.horizon.duration)
     for figure in (region(task, V, rollout), paths, slices):
         assert isinstance(figure, Figure)

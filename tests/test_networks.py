@@ -10,7 +10,7 @@ from torch import nn
 from torch.autograd.functional import hessian
 from torch.testing import assert_close
 
-from lyapnet.calculus import gradients, state_gradient
+from lyapnet.calculus import gradients, state_gradient, value_and_state_gradient
 from lyapnet.cost import QuadraticCost
 from lyapnet.networks import ACTIVATIONS, FCN, ICNN, NETWORKS, PartiallyConvexNetwork, Scaling
 from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
@@ -79,9 +79,10 @@ def draw(t_shape=(50,), x_shape=(50, 3)):
 
 def formula_equals_autograd(V, t, x):
     _, expected = gradients(V, t, x)
-    formula = state_gradient(V, t, x)
+    value, formula = value_and_state_gradient(V, t, x)
     assert formula.shape == x.shape
     assert_close(formula, expected, rtol=0, atol=1e-12 * max(expected.detach().abs().flatten().tolist(), default=0.0))
+    assert_close(value, V(t, x), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(("t_shape", "x_shape"), SHAPES, ids=str)
@@ -89,8 +90,12 @@ def test_gradient_formula_equals_autograd(network, t_shape, x_shape):
     formula_equals_autograd(network, *draw(t_shape, x_shape))
 
 
-def test_a_formula_with_an_error_is_noticed(monkeypatch):
-    monkeypatch.setattr(FCN, "state_gradient", lambda self, t, x: gradients(self, t, x)[1] * (1 + 1e-11))
+@pytest.mark.parametrize(("value_factor", "slope_factor"), [(1, 1 + 1e-11), (1 + 1e-11, 1)])
+def test_a_formula_with_an_error_is_noticed(monkeypatch, value_factor, slope_factor):
+    def wrong(self, t, x):
+        return self(t, x) * value_factor, gradients(self, t, x)[1] * slope_factor
+
+    monkeypatch.setattr(FCN, "value_and_state_gradient", wrong)
     with pytest.raises(AssertionError):
         formula_equals_autograd(FCN(**SMALL), *draw())
 

@@ -54,6 +54,16 @@ def test_hjb_policy_minimises_the_hamiltonian(system, cost, V):
             minimises_the_hamiltonian(wrong, system, cost, V, t, x)
 
 
+@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
+def test_control_comes_with_its_value_function(policy, system, cost, V):
+    t, x = draw(system, 8)
+    law = policy(system, cost, V)
+    expected = law(t, x), V(t, x), gradients(V, t, x)[1]
+    for value, wanted, other in zip(law.with_value(t, x), expected, law.with_value(t + 0.1, x), strict=True):
+        assert_close(value, wanted)
+        assert not torch.allclose(other, wanted)
+
+
 def test_hamiltonian_by_hand():
     cost = QuadraticCost([[1.0, 0.0], [0.0, 2.0]], [[3.0]], torch.eye(2))
     x, u, costate = torch.tensor([1.0, 2.0]), torch.tensor([-1.0]), torch.tensor([5.0, 7.0])

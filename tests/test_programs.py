@@ -42,17 +42,12 @@ def test_margin_asks_for_that_share_of_the_step_cost_more():
     assert hinge(VALUES, STEP_COST, 0.5).tolist() == [0.0 + 2.5 + 2.0, 1.5 + 0.0 + 0.0]
 
 
-def trajectory_of(step_cost=STEP_COST, terminal_cost=TERMINAL_COST):
-    """A trajectory with these costs; its states and controls play no part in the terms."""
+def trajectory_of(value=VALUES, step_cost=STEP_COST, terminal_cost=TERMINAL_COST):
+    """A trajectory with these V and costs; its states and controls play no part in the terms."""
     steps, *batch = step_cost.shape
     running_cost = torch.cat([torch.zeros(1, *batch), step_cost.cumsum(0)])
     x, u = torch.arange((steps + 1.0) * math.prod(batch)).reshape(steps + 1, *batch, 1), torch.zeros(steps, *batch, 1)
-    return Trajectory(torch.arange(steps + 1.0), x, u, running_cost, terminal_cost)
-
-
-def given_values(values):
-    """V that takes these values on the trajectory."""
-    return lambda t, x: values + 0 * t
+    return Trajectory(torch.arange(steps + 1.0), x, u, running_cost, terminal_cost, value)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +59,7 @@ def test_programs_by_hand(program, constraint, terminal):
     """Without normalisation each term is the mean over the batch; the constraint loss never has weight or margin."""
     J = (10.5 + 3.25) / 2
     weighted = type(program)(**vars(program) | dict(zip(TERMS, (2.0, 3.0, 5.0), strict=True)) | {"normalise": False})
-    output = weighted(given_values(VALUES), trajectory_of())
+    output = weighted(trajectory_of())
     assert [float(output.terms[name]) for name in TERMS] == [constraint, terminal, J]
     assert output.loss == 2 * constraint + 3 * terminal + 5 * J
     assert output.constraint_loss == (2.0 if isinstance(program, ValueProgram) else 1.0)
@@ -73,7 +68,7 @@ def test_programs_by_hand(program, constraint, terminal):
 
 @programs
 def test_the_papers_program_is_the_mean_sum_alone(program):
-    output = program(constraint=1.0, normalise=False)(given_values(VALUES), trajectory_of())
+    output = program(constraint=1.0, normalise=False)(trajectory_of())
     assert output.loss == output.constraint_loss == output.terms["constraint"]
 
 
@@ -82,7 +77,7 @@ def test_the_papers_program_is_the_mean_sum_alone(program):
 def test_a_weight_of_zero_leaves_a_term_out(program, name):
     """Out of the loss, though not out of the record."""
     weights = dict.fromkeys(TERMS, 2.0) | {name: 0.0}
-    output = program(**weights)(given_values(VALUES), trajectory_of())
+    output = program(**weights)(trajectory_of())
     assert_close(output.loss, sum(2.0 * output.terms[other] for other in TERMS if other != name))
     assert output.terms[name] != 0
 
@@ -90,29 +85,29 @@ def test_a_weight_of_zero_leaves_a_term_out(program, name):
 # Normalisation
 
 
-def slopes(program, V, rollout, x0):
-    return torch.cat([g.flatten() for g in torch.autograd.grad(program(V, rollout(x0)).loss, list(V.parameters()))])
+def slopes(program, rollout, x0):
+    loss = program(rollout(x0)).loss
+    return torch.cat([g.flatten() for g in torch.autograd.grad(loss, list(rollout.parameters()))])
 
 
 @pytest.fixture
 def loop(quadratic):
     """The double integrator under the HJB policy of V = xᵀPx, with a P that is not optimal."""
     system, cost = DoubleIntegrator(), QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2))
-    V = quadratic([[2.0, 0.5], [0.5, 1.0]])
-    rollout = Rollout(system, cost, HJBPolicy(system, cost, V), Horizon(5, 0.1), gradient="backprop")
-    return V, rollout, torch.randn(8, 2)
+    policy = HJBPolicy(system, cost, quadratic([[2.0, 0.5], [0.5, 1.0]]))
+    return Rollout(system, cost, policy, Horizon(5, 0.1), gradient="backprop"), torch.randn(8, 2)
 
 
 @programs
 def test_normalised_gradients_are_relative_to_the_mean_cost(program, loop):
     """log J̄ has the gradient ∇J̄/J̄; C and B are divided by a J̄ that takes no part in the gradient."""
-    V, rollout, x0 = loop
+    rollout, x0 = loop
     J, N = rollout(x0).cost.mean().item(), rollout.horizon.steps
     value = program is ValueProgram
     factors = (N / J**2, 1 / J**2, 1 / J) if value else (1 / J, 1 / J, 1 / J)
     for name, factor in zip(TERMS, factors, strict=True):
         alone = partial(program, **dict.fromkeys(TERMS, 0.0) | {name: 1.0})
-        plain, normalised = (slopes(alone(normalise=on), V, rollout, x0) for on in (False, True))
+        plain, normalised = (slopes(alone(normalise=on), rollout, x0) for on in (False, True))
         assert plain.norm() > 1e-3
         assert_close(normalised, factor * plain)
         assert not torch.allclose(normalised, plain, rtol=1e-3)
@@ -121,8 +116,8 @@ def test_normalised_gradients_are_relative_to_the_mean_cost(program, loop):
 @programs
 def test_normalised_terms_have_no_unit_of_cost(program):
     def terms(unit, normalise):
-        trajectory = trajectory_of(unit * STEP_COST, unit * TERMINAL_COST)
-        output = program(1.0, 1.0, normalise=normalise)(given_values(unit * VALUES), trajectory)
+        trajectory = trajectory_of(unit * VALUES, unit * STEP_COST, unit * TERMINAL_COST)
+        output = program(1.0, 1.0, normalise=normalise)(trajectory)
         return torch.stack([output.terms["constraint"], output.terms["terminal"]])
 
     assert_close(terms(7.0, normalise=True), terms(1.0, normalise=True))
@@ -134,9 +129,8 @@ def test_normalised_residual_is_a_mean_over_time():
 
     def term(steps, normalise):
         t = torch.linspace(0, 1, steps + 1)
-        V, step_cost = (2 - t)[:, None], torch.full((steps, 1), 1.5 / steps)
-        output = ValueProgram(normalise=normalise)(given_values(V), trajectory_of(step_cost, torch.ones(1)))
-        return output.terms["constraint"]
+        trajectory = trajectory_of((2 - t)[:, None], torch.full((steps, 1), 1.5 / steps), torch.ones(1))
+        return ValueProgram(normalise=normalise)(trajectory).terms["constraint"]
 
     assert_close(term(10, normalise=True), term(40, normalise=True))
     assert_close(term(10, normalise=False), 4 * term(40, normalise=False))
@@ -172,7 +166,8 @@ def cost_to_go(quadratic):
 
 
 def losses(program, V, trajectory):
-    output = program(1.0, 1.0, normalise=False)(V, trajectory)
+    values = V(trajectory.t[:, None], trajectory.x)
+    output = program(1.0, 1.0, normalise=False)(trajectory._replace(value=values))
     return output.constraint_loss.item(), output.terms["terminal"].item()
 
 
@@ -217,10 +212,9 @@ def test_cost_is_at_most_V_plus_both_hinges(numbers):
 
 @programs
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
-def test_any_batch(program, batch, quadratic):
-    V = quadratic(torch.eye(1))
-    trajectory = trajectory_of(torch.rand(3, *batch), torch.rand(batch))
-    output = program(1.0, 1.0, 1.0)(V, trajectory)
+def test_any_batch(program, batch):
+    trajectory = trajectory_of(torch.rand(4, *batch), torch.rand(3, *batch), torch.rand(batch))
+    output = program(1.0, 1.0, 1.0)(trajectory)
     assert output.loss.shape == output.constraint_loss.shape == output.trajectory_cost.shape == ()
     assert_close(output.trajectory_cost, trajectory.cost.mean())
 
@@ -251,7 +245,14 @@ def test_a_term_that_is_not_finite_names_itself_and_the_initial_state(program, b
     values[last][1] = math.inf
     values.requires_grad_()
     with pytest.raises(DivergenceError, match=rf"term constraint from x0 = \[{float(len(batch)):.1f}\]"):
-        program()(given_values(values), trajectory_of(torch.ones(3, *batch), torch.ones(batch)))
+        program()(trajectory_of(values, torch.ones(3, *batch), torch.ones(batch)))
+
+
+@programs
+def test_a_control_law_without_V_has_no_program(program, cost_to_go):
+    assert cost_to_go.trajectory.value is None
+    with pytest.raises(ValueError, match="Expected a trajectory under the control law of a V, got another law"):
+        program()(cost_to_go.trajectory)
 
 
 def test_the_goal_satisfies_the_condition_in_spite_of_rounding():

@@ -14,15 +14,22 @@ from torch.testing import assert_close
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import DivergenceError
 from lyapnet.policy import POLICIES, HJBPolicy
-from lyapnet.rollout import GRADIENTS, METHODS, Horizon, Rollout
+from lyapnet.rollout import ADAPTIVE_METHODS, FIXED_STEP_METHODS, GRADIENTS, METHODS, Horizon, Rollout
 from lyapnet.systems import DoubleIntegrator
 
 DURATION = 0.2
+EXACT = [*((method, "backprop") for method in METHODS), *((method, "discrete") for method in FIXED_STEP_METHODS)]
+routes = pytest.mark.parametrize(("method", "gradient"), [*((method, "adjoint") for method in METHODS), *EXACT])
 double_integrator = pytest.mark.parametrize("system", ["double_integrator"], indirect=True)
 
 
 def rollout_of(system, cost, policy, steps=16, **options):
     return Rollout(system, cost, policy, Horizon(steps, DURATION / steps), **options)
+
+
+@pytest.fixture
+def traced():
+    return False
 
 
 @pytest.fixture
@@ -58,6 +65,9 @@ def test_euler_is_the_loop_by_hand(system, cost, policy, batch, gradient):
         assert_close(value, expected)
     assert_close(trajectory.step_cost, 0.05 * cost.running(x[:-1], u))
     assert_close(trajectory.terminal_cost, cost.terminal(x[-1]))
+    values = torch.stack([policy.V(torch.tensor(step * 0.05), state) for step, state in enumerate(x)])
+    assert_close(trajectory.value, values)
+    assert not torch.allclose(trajectory.value, values.roll(1, 0))
     assert not torch.allclose(trajectory.cost, by_hand(system, cost, policy, Horizon(13, 0.05), x0)[2])
 
 
@@ -166,9 +176,9 @@ def relative_error(value, expected):
     return float((value - expected).norm() / expected.norm())
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_backprop_is_the_gradient_of_the_discretisation(system, cost, policy, x0, directions, method):
-    rollout = rollout_of(system, cost, policy, 4, method=method, gradient="backprop", rtol=1e-8, atol=1e-9)
+@pytest.mark.parametrize(("method", "gradient"), EXACT)
+def test_exact_routes_give_the_gradient_of_the_discretisation(system, cost, policy, x0, directions, method, gradient):
+    rollout = rollout_of(system, cost, policy, 4, method=method, gradient=gradient, rtol=1e-8, atol=1e-9)
     differences = by_differences(rollout, x0, directions)
     assert relative_error(by_gradient(rollout, x0, directions), differences) < 1e-7
     assert relative_error(by_gradient(rollout, x0 + 1e-3, directions), differences) > 1e-6
@@ -195,9 +205,10 @@ def test_adjoint_is_the_gradient_of_the_continuous_problem(system, cost, policy,
         assert error(**options) < tolerance
 
 
-def test_backprop_through_euler_is_not_the_adjoint(system, cost, policy, x0, directions):
-    discrete, adjoint = (by_gradient(rollout_of(system, cost, policy, gradient=g), x0, directions) for g in GRADIENTS)
-    assert relative_error(adjoint, discrete) > 1e-4
+def test_exact_gradient_of_euler_is_not_the_adjoint(system, cost, policy, x0, directions):
+    gradients = {g: by_gradient(rollout_of(system, cost, policy, gradient=g), x0, directions) for g in GRADIENTS}
+    for exact in ("backprop", "discrete"):
+        assert relative_error(gradients["adjoint"], gradients[exact]) > 1e-4
 
 
 # V by autograd: its derivatives join the graph, which odeint_adjoint's no_grad could have cut
@@ -207,20 +218,19 @@ def test_backprop_through_euler_is_not_the_adjoint(system, cost, policy, x0, dir
 def law_by_autograd(request, system, cost, quadratic):
     """HJB and Sontag on a V without a formula for V_x."""
     V = quadratic(2 * torch.eye(system.n) + 0.5)
-    assert not hasattr(V, "state_gradient")
+    assert not hasattr(V, "value_and_state_gradient")
     return POLICIES[request.param](system, cost, V)
 
 
 @double_integrator
-@pytest.mark.parametrize(("gradient", "tolerance"), [("adjoint", 1e-5), ("backprop", 1e-7)])
-def test_both_routes_differentiate_through_a_gradient(system, cost, law_by_autograd, x0, gradient, tolerance):
-    rollout = rollout_of(system, cost, law_by_autograd, method="rk4", gradient=gradient)
+@pytest.mark.parametrize(("gradient", "tolerance"), [("adjoint", 1e-5), ("backprop", 1e-7), ("discrete", 1e-7)])
+def test_every_route_differentiates_through_a_gradient(system, cost, law_by_autograd, x0, gradient, tolerance):
+    laws = law_by_autograd, Cut(law_by_autograd)
+    rollout, without = (rollout_of(system, cost, law, method="rk4", gradient=gradient) for law in laws)
     directions = draw_directions(rollout, x0)
     expected = by_differences(rollout, x0, directions)
     assert relative_error(by_gradient(rollout, x0, directions), expected) < tolerance
-
-    rollout.closed_loop.policy = Cut(law_by_autograd)
-    assert relative_error(by_gradient(rollout, x0, directions), expected) > 1e-2
+    assert relative_error(by_gradient(without, x0, directions), expected) > 1e-2
 
 
 class Cut(nn.Module):
@@ -235,8 +245,7 @@ class Cut(nn.Module):
 
 
 @double_integrator
-@pytest.mark.parametrize("gradient", GRADIENTS)
-@pytest.mark.parametrize("method", METHODS)
+@routes
 def test_every_node_carries_its_gradient(method, gradient, policy, system, cost, x0):
     """The gradient of a weighted sum over the nodes is the sum of the nodes' gradients."""
     rollout = rollout_of(system, cost, policy, 4, method=method, gradient=gradient)
@@ -256,8 +265,7 @@ def test_a_policy_without_parameters_still_has_a_gradient_in_x0(gradient, system
 
 
 @double_integrator
-@pytest.mark.parametrize("gradient", GRADIENTS)
-@pytest.mark.parametrize("method", METHODS)
+@routes
 def test_the_trajectory_is_the_same_without_a_graph(system, cost, law_by_autograd, x0, gradient, method):
     rollout = rollout_of(system, cost, law_by_autograd, method=method, gradient=gradient)
     recorded = rollout(x0)
@@ -281,6 +289,14 @@ def test_unknown_methods_and_gradients_are_refused(option, system, cost, policy)
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"Expected {name} as one of .*got '{value}'"):
         Rollout(system, cost, policy, Horizon(1, 0.1), **option)
+
+
+@double_integrator
+@pytest.mark.parametrize("method", ADAPTIVE_METHODS)
+def test_the_discrete_costate_of_steps_that_depend_on_the_state_is_refused(system, cost, policy, method):
+    message = rf"Expected method as one of {', '.join(FIXED_STEP_METHODS)} for gradient discrete, got '{method}'; "
+    with pytest.raises(ValueError, match=message):
+        rollout_of(system, cost, policy, method=method, gradient="discrete")
 
 
 @pytest.mark.parametrize(("steps", "dt"), [(0, 0.1), (-1, 0.1), (1, 0.0), (1, -0.1), (1, math.inf), (1, math.nan)])
@@ -346,7 +362,7 @@ def test_nothing_diverges_before_that_step(unstable):
 
 
 @double_integrator
-@pytest.mark.parametrize("gradient", GRADIENTS)
+@pytest.mark.parametrize("gradient", ["adjoint", "backprop"])
 def test_an_adaptive_method_that_cannot_go_on_says_so(system, cost, gradient):
     """q̈ = 100 q̇² leaves every bound before t = 0.01 s."""
     escape = Law(lambda t, x: 100 * x[..., 1:] ** 2)
@@ -357,12 +373,12 @@ def test_an_adaptive_method_that_cannot_go_on_says_so(system, cost, gradient):
 
 
 @double_integrator
-@pytest.mark.parametrize("method", METHODS)
-def test_weights_that_are_no_numbers_are_a_divergence(system, cost, V, policy, x0, method):
+@routes
+def test_weights_that_are_no_numbers_are_a_divergence(system, cost, V, policy, x0, method, gradient):
     with torch.no_grad():
         V.hidden[0].weight.fill_(math.nan)
     with pytest.raises(DivergenceError):
-        rollout_of(system, cost, policy, method=method)(x0)
+        rollout_of(system, cost, policy, method=method, gradient=gradient)(x0)
 
 
 @pytest.mark.parametrize("gradient", GRADIENTS)

@@ -1,16 +1,16 @@
 """Guarantees by construction: V tied to the terminal cost at t = T, and to zero at the goal."""
 
 from collections.abc import Sequence
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 
-from lyapnet.calculus import state_gradient
+from lyapnet.calculus import value_and_state_gradient
 from lyapnet.cost import QuadraticCost
+from lyapnet.linear_algebra import apply
 from lyapnet.networks.base import Scaling
 from lyapnet.networks.icnn import PartiallyConvexNetwork
-from lyapnet.types import PerState, State, Time, Value
+from lyapnet.types import PerState, State, Time
 
 
 class TerminalAnchor(nn.Module):
@@ -27,10 +27,11 @@ class TerminalAnchor(nn.Module):
     def forward(self, t: Time, x: State) -> PerState:
         return self.cost.terminal(x) + (1 - t / self.duration) * self.network(t, x)
 
-    def state_gradient(self, t: Time, x: State) -> State:
-        """V_x, with φ_x = 2Q_T x."""
-        remaining = (1 - t / self.duration)[..., None]
-        return 2 * (x @ self.cost.Q_T) + remaining * state_gradient(self.network, t, x)
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V and V_x, with φ_x = 2Q_T x."""
+        remaining = 1 - t / self.duration
+        N, N_x = value_and_state_gradient(self.network, t, x)
+        return self.cost.terminal(x) + remaining * N, 2 * apply(self.cost.Q_T, x) + remaining[..., None] * N_x
 
 
 class GoalAnchor(nn.Module):
@@ -49,14 +50,19 @@ class GoalAnchor(nn.Module):
         self.network, self.epsilon = network, epsilon
 
     def forward(self, t: Time, x: State) -> PerState:
-        value, value_at_goal = _at_state_and_goal(self.network, t, x)
-        slope_at_goal = state_gradient(self.network, t, x.new_zeros(*t.shape, x.shape[-1]))
+        at_goal = value_and_state_gradient(self.network, t, x.new_zeros(*t.shape, x.shape[-1]))
+        return self._divergence(self.network(t, x), *at_goal, x)
+
+    def _divergence(self, value: PerState, value_at_goal: Tensor, slope_at_goal: Tensor, x: State) -> PerState:
         return value - value_at_goal - (slope_at_goal * x).sum(-1) + self.epsilon * (x**2).sum(-1)
 
-    def state_gradient(self, t: Time, x: State) -> State:
-        """V_x = N_x(t, x) − N_x(t, 0) + 2εx."""
-        slope, slope_at_goal = _at_state_and_goal(partial(state_gradient, self.network), t, x)
-        return slope - slope_at_goal + 2 * self.epsilon * x
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V and V_x = N_x(t, x) − N_x(t, 0) + 2εx."""
+        joined = _join_goal(t, x)
+        both = value_and_state_gradient(self.network, t, joined)
+        (value, value_at_goal), (slope, slope_at_goal) = (_part_goal(y, t, x) for y in both)
+        value = self._divergence(value, value_at_goal, slope_at_goal, x)
+        return value, slope - slope_at_goal + 2 * self.epsilon * x
 
 
 class AnchoredNetwork(GoalAnchor):
@@ -77,11 +83,21 @@ class AnchoredNetwork(GoalAnchor):
         super().__init__(PartiallyConvexNetwork(scaling, hidden, activation), epsilon)
 
 
-def _at_state_and_goal(function: Value, t: Time, x: State) -> tuple[Tensor, Tensor]:
-    """A function of (t, x) at the states and at the goal in one call: a small network costs per call, not per state."""
-    if x.ndim > 1 and (t.ndim == 0 or t.shape[-1] == 1):  # one time for a row of states: the goal joins the row
-        row = x.ndim - 2
-        both = function(t, torch.cat([x, x.new_zeros(*x.shape[:-2], 1, x.shape[-1])], row))
-        return both.narrow(row, 0, x.shape[row]), both.narrow(row, x.shape[row], 1)
-    both = function(t, torch.stack([x, torch.zeros_like(x)]))
-    return both[0], both[1]
+def _join_goal(t: Time, x: State) -> Tensor:
+    """The states and the goal, for a network to meet in one call: a small one costs per call, not per state."""
+    if _is_row(t, x):
+        return torch.cat([x, x.new_zeros(*x.shape[:-2], 1, x.shape[-1])], -2)
+    return torch.stack([x, torch.zeros_like(x)])
+
+
+def _part_goal(joined: Tensor, t: Time, x: State) -> tuple[Tensor, Tensor]:
+    """What a function of the joined states gives at the states, and at the goal."""
+    if not _is_row(t, x):
+        return joined[0], joined[1]
+    row = x.ndim - 2
+    return joined.narrow(row, 0, x.shape[row]), joined.narrow(row, x.shape[row], 1)
+
+
+def _is_row(t: Time, x: State) -> bool:
+    """Whether a row of states shares one time: the goal then joins the row."""
+    return x.ndim > 1 and (t.ndim == 0 or t.shape[-1] == 1)

@@ -50,9 +50,11 @@ class FCN(nn.Module):
         last = self._pre_activations(t, x)[-1]
         return self.value_scale * self.output(self.activation.function(last))[..., 0]
 
-    def state_gradient(self, t: Time, x: State) -> State:
-        """V_x by the chain rule, layer by layer from the output."""
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V, and V_x by the chain rule, layer by layer from the output."""
+        activations = self._pre_activations(t, x)
+        value = self.value_scale * self.output(self.activation.function(activations[-1]))[..., 0]
         gradient = self.value_scale * self.output.weight[0]
-        for layer, a in zip(reversed(self.hidden), reversed(self._pre_activations(t, x)), strict=True):
+        for layer, a in zip(reversed(self.hidden), reversed(activations), strict=True):
             gradient = (gradient * self.activation.derivative(a)) @ layer.weight
-        return self.inputs.pull_back(x, gradient[..., 1:])
+        return value, self.inputs.pull_back(x, gradient[..., 1:])

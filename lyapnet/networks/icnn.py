@@ -71,19 +71,22 @@ class ICNN(nn.Module):
         return activations
 
     def forward(self, t: Time, x: State) -> PerState:
-        N = self._pre_activations(t, x)[-1][..., 0]
-        return self.value_scale * N + self.epsilon * (x**2).sum(-1)
+        return self._value(self._pre_activations(t, x)[-1], x)
 
-    def state_gradient(self, t: Time, x: State) -> State:
-        """V_x by the chain rule, layer by layer from the output."""
-        activations = self._pre_activations(t, x)[:-1]
+    def _value(self, N: Tensor, x: State) -> PerState:
+        return self.value_scale * N[..., 0] + self.epsilon * (x**2).sum(-1)
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V, and V_x by the chain rule, layer by layer from the output."""
+        *activations, N = self._pre_activations(t, x)
         g_y = self.through[-1].weight[0]
         g_a = torch.ones_like(g_y[:1])
         layers = zip(activations, self.convex, self.through[:-1], strict=True)
         for a, convex, through in reversed(list(layers)):
             g_a = (g_a @ convex.weight) * self.activation.derivative(a)
             g_y = g_y + g_a @ through.weight
-        return self.inputs.pull_back(x, self.value_scale * g_y[..., 1:]) + 2 * self.epsilon * x
+        slope = self.inputs.pull_back(x, self.value_scale * g_y[..., 1:]) + 2 * self.epsilon * x
+        return self._value(N, x), slope
 
 
 class PartiallyConvexNetwork(nn.Module):
@@ -128,13 +131,14 @@ class PartiallyConvexNetwork(nn.Module):
         activations, weights = self._pre_activations(t, x)
         return (weights * self.activation.function(activations[-1])).sum(-1)
 
-    def state_gradient(self, t: Time, x: State) -> State:
-        """N_x by the chain rule, layer by layer from the output."""
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """N, and N_x by the chain rule, layer by layer from the output."""
         activations, weights = self._pre_activations(t, x)
+        value = (weights * self.activation.function(activations[-1])).sum(-1)
         g_a = weights * self.activation.derivative(activations[-1])
         g_xi = g_a @ self.through[-1].weight
         layers = zip(activations[:-1], self.convex, self.through[:-1], strict=True)
         for a, convex, through in reversed(list(layers)):
             g_a = (g_a @ convex.weight) * self.activation.derivative(a)
             g_xi = g_xi + g_a @ through.weight
-        return self.inputs.pull_back(x, g_xi)
+        return value, self.inputs.pull_back(x, g_xi)

@@ -1,6 +1,7 @@
 """What a program is: named, weighted terms of V along the closed loop."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from lyapnet.errors import DivergenceError
 from lyapnet.rollout import Trajectory
-from lyapnet.types import PerState, Value, ValuePath
+from lyapnet.types import PerState, ValuePath
 
 
 class ProgramOutput(NamedTuple):
@@ -47,13 +48,21 @@ class Program(ABC):
         if not self.constraint + self.terminal + self.trajectory_cost > 0:
             raise ValueError("Expected at least one positive weight, got none; nothing would be learned.")
 
-    def __call__(self, V: Value, trajectory: Trajectory) -> ProgramOutput:
-        """The program on one batch of trajectories, which must come from the policy of this V.
+    def __call__(
+        self, trajectory: Trajectory, mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value
+    ) -> ProgramOutput:
+        """The program on one batch of trajectories under the control law of a V.
+
+        Args:
+            trajectory: the batch.
+            mean_over_processes: takes a number of this process to its mean over all that share the batch, so that
+                they normalise alike and the mean of their gradients is the gradient on the joint batch.
 
         Raises:
+            ValueError: no V defines the control law.
             DivergenceError: a term is not finite; names it and the initial state.
         """
-        values = V(trajectory.t.reshape(-1, *[1] * (trajectory.x.ndim - 2)), trajectory.x)
+        values = trajectory.require_value()
         J = trajectory.cost.mean()
         per_state = {
             "constraint": self.constraint_term(values, trajectory),
@@ -64,11 +73,13 @@ class Program(ABC):
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
-            unit = J.detach() ** self.degree
+            mean_cost = mean_over_processes(J.detach())
+            unit = mean_cost**self.degree
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1) / unit
             terms["terminal"] = terms["terminal"] / unit
-            terms["trajectory_cost"] = torch.log(J)
+            # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
+            terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
         weights = {"constraint": self.constraint, "terminal": self.terminal, "trajectory_cost": self.trajectory_cost}
         loss = torch.stack([weight * terms[name] for name, weight in weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)

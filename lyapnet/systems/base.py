@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.types import Control, ControlMatrix, Coordinates, InputMatrix, MassMatrix, PerState, State
 
 
@@ -34,7 +35,7 @@ class ControlAffineSystem(nn.Module, ABC):
 
     def dynamics(self, x: State, u: Control) -> State:
         """ẋ = f(x) + g(x)u."""
-        return self.f(x) + (self.g(x) @ u[..., None])[..., 0]
+        return self.f(x) + apply(self.g(x), u)
 
     @property
     def n(self) -> int:
@@ -84,7 +85,7 @@ class MechanicalSystem(ControlAffineSystem):
 
     def kinetic_energy(self, q: Coordinates, qdot: Coordinates) -> PerState:
         """½ q̇ᵀM(q)q̇ in J."""
-        return ((self.mass_matrix(q) @ qdot[..., None])[..., 0] * qdot).sum(-1) / 2
+        return (apply(self.mass_matrix(q), qdot) * qdot).sum(-1) / 2
 
     def _split(self, x: State) -> tuple[Coordinates, Coordinates]:
         d = self.n // 2
@@ -92,7 +93,7 @@ class MechanicalSystem(ControlAffineSystem):
 
     def _accelerate(self, q: Coordinates, qdot: Coordinates, force: Coordinates) -> State:
         """(q̇, q̈) under a generalised force, friction included."""
-        qddot = torch.linalg.solve(self.mass_matrix(q), force - self.D * qdot)
+        qddot = solve(self.mass_matrix(q), (force - self.D * qdot)[..., None])[..., 0]
         return torch.cat([qdot, qddot], -1)
 
     def f(self, x: State) -> State:
@@ -107,17 +108,17 @@ class MechanicalSystem(ControlAffineSystem):
     def dynamics(self, x: State, u: Control) -> State:
         # One solve instead of the three of f + g u; a test holds the two equal.
         q, qdot = self._split(x)
-        return self._accelerate(q, qdot, self.forces(q, qdot) + u @ self.B.mT)
+        return self._accelerate(q, qdot, self.forces(q, qdot) + apply(self.B, u))
 
     def inverse_mass(self, x: State) -> ControlMatrix:
         """BᵀM(q)⁻¹B: the control weight R of the reference tasks."""
         q, _ = self._split(x)
-        return self.B.mT @ self._solve_actuation(q)
+        return multiply(self.B.mT, self._solve_actuation(q))
 
     def _solve_actuation(self, q: Coordinates) -> Tensor:
         """M⁻¹B, (*batch, d, m)."""
-        # expanded: solve would take a (d, d) B beside a batch of d matrices for a batch of vectors
-        return torch.linalg.solve(self.mass_matrix(q), self.B.expand(*q.shape[:-1], *self.B.shape))
+        # expanded: torch would take a (d, d) B beside a batch of d matrices for a batch of vectors
+        return solve(self.mass_matrix(q), self.B.expand(*q.shape[:-1], *self.B.shape))
 
 
 def require_positive(**parameters: float) -> None:

@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.linear_algebra import apply
 from lyapnet.systems.base import ControlAffineSystem, require_positive
 from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State
 
@@ -40,13 +41,13 @@ class Linear(ControlAffineSystem):
         self.control_units = ("",) * b.shape[1]
 
     def f(self, x: State) -> State:
-        return x @ self.A.mT
+        return apply(self.A, x)
 
     def g(self, x: State) -> InputMatrix:
         return self.B.expand(*x.shape[:-1], *self.B.shape)
 
     def dynamics(self, x: State, u: Control) -> State:
-        return x @ self.A.mT + u @ self.B.mT
+        return apply(self.A, x) + apply(self.B, u)
 
 
 class DoubleIntegrator(Linear):

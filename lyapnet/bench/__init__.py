@@ -1,0 +1,20 @@
+"""What each route to the gradient costs, and what it gets wrong: seconds, memory and error side by side."""
+
+from lyapnet.bench.accuracy import Accuracy, gradient_accuracy
+from lyapnet.bench.cases import Case, is_chain, load_case
+from lyapnet.bench.measurement import Row, measure, use_threads
+from lyapnet.bench.routes import BASELINE, ROUTES, routes_for
+
+__all__ = [
+    "BASELINE",
+    "ROUTES",
+    "Accuracy",
+    "Case",
+    "Row",
+    "gradient_accuracy",
+    "is_chain",
+    "load_case",
+    "measure",
+    "routes_for",
+    "use_threads",
+]

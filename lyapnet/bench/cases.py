@@ -1,0 +1,109 @@
+"""What is differentiated: a task, a V of fresh weights, and the loss of a program."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.build import Task, build_program, build_rollout, build_task, build_value_function
+from lyapnet.config import Config, config_from_plain, load_config
+from lyapnet.errors import UsageError
+from lyapnet.programs import Program
+from lyapnet.randomness import TEST, stream
+from lyapnet.rollout import Horizon, Rollout
+from lyapnet.types import State
+
+CONFIGS, CHAIN = Path("conf"), "chain:"
+
+
+class Case(NamedTuple):
+    """θ ↦ program(rollout(x₀)).loss, for a V of parameters θ."""
+
+    name: str
+    config: Config
+    task: Task
+    V: nn.Module
+    program: Program
+
+    def rollout(self, gradient: str, V: nn.Module | None = None, **options: Any) -> Rollout:
+        """The closed loop with that rollout.gradient, and further options of the config's section."""
+        section = replace(self.config.rollout, gradient=gradient, **options)
+        return build_rollout(replace(self.config, rollout=section), self.task, self.V if V is None else V)
+
+    def gradient(self, rollout: Rollout, x0: State) -> Sequence[Tensor]:
+        """∂loss/∂θ."""
+        return derivatives([self.program(rollout(x0)).loss], trained(self.V))
+
+    def sample(self, batch: int) -> State:
+        """Initial states, the same at each call."""
+        return self.task.initial_states.sample(batch, stream(self.config.seed, TEST))
+
+    def in_steps(self, steps: int) -> "Case":
+        """The same T in another number of steps."""
+        horizon = Horizon(steps, self.task.horizon.duration / steps)
+        return self._replace(task=self.task._replace(horizon=horizon))
+
+
+def load_case(name: str, overrides: Sequence[str] = ()) -> Case:
+    """The case of a YAML file, of conf/NAME.yaml, or of chain:N, a chain of N integrators with one input.
+
+    Raises:
+        UsageError: no such task, or a config that does not hold.
+    """
+    path = Path(name)
+    if is_chain(name):
+        config = config_from_plain(_chain(name.removeprefix(CHAIN)), overrides)
+    elif path.suffix in (".yaml", ".yml"):
+        name, config = path.stem, load_config(path, overrides)
+    else:
+        known = sorted(file.stem for file in CONFIGS.glob("*.yaml"))
+        if name not in known:
+            raise UsageError(
+                f"Expected a task of {CONFIGS}/ ({', '.join(known) or 'none in this folder'}), a YAML file or "
+                f"{CHAIN}N, got {name!r}; choose one of them."
+            )
+        config = load_config(CONFIGS / f"{name}.yaml", overrides)
+    task = build_task(config)
+    return Case(name, config, task, build_value_function(config, task), build_program(config))
+
+
+def is_chain(name: str) -> bool:
+    """Whether a task is a chain of integrators."""
+    return name.startswith(CHAIN)
+
+
+def _chain(length: str) -> dict[str, Any]:
+    """ẋ_i = x_{i+1}, ẋ_N = u on the double integrator's horizon, as a config."""
+    if not (length.isdecimal() and int(length) > 0):
+        raise UsageError(f"Expected {CHAIN}N with N ≥ 1 integrators, got {CHAIN}{length}; for example {CHAIN}8.")
+    n = int(length)
+    shift = [[float(j == i + 1) for j in range(n)] for i in range(n)]
+    return {
+        "experiment": f"chain_{n}",
+        "program": {"name": "value", "terminal": 1.0, "trajectory_cost": 1.0},
+        "system": {"name": "linear", "parameters": {"A": shift, "B": [[float(i == n - 1)] for i in range(n)]}},
+        "cost": {"Q": [1.0] * n, "R": [[1.0]], "Q_T": [1.0] * n},
+        "initial_states": {"lower": [-1.0] * n, "upper": [1.0] * n},
+        "horizon": {"steps": 400, "dt": 0.01},
+        "network": {"name": "fcn", "hidden": [64, 64]},
+    }
+
+
+def trained(V: nn.Module) -> list[Tensor]:
+    """θ."""
+    return [p for p in V.parameters() if p.requires_grad]
+
+
+def derivatives(
+    outputs: Sequence[Tensor], inputs: Sequence[Tensor], bars: Sequence[Tensor] | None = None
+) -> Sequence[Tensor]:
+    """Σ barᵀ ∂output/∂input; zero where an output does not depend on an input."""
+    return torch.autograd.grad(outputs, inputs, bars, allow_unused=True, materialize_grads=True)
+
+
+def flat(gradient: Sequence[Tensor]) -> Tensor:
+    """A gradient as one float64 vector."""
+    return torch.cat([part.flatten() for part in gradient]).double()

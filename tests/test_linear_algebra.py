@@ -1,0 +1,58 @@
+"""Small matrices by formula against torch's library, derivatives included."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.linear_algebra import SMALL, apply, multiply, solve
+
+batches = pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
+
+
+def agree(function, reference, *arguments, tolerance=1e-12):
+    """In value, and in the gradient of a weighted sum."""
+    leaves = [a.clone().requires_grad_() for a in arguments]
+    value, expected = function(*leaves), reference(*leaves)
+    assert_close(value, expected, rtol=tolerance, atol=tolerance)
+    weight = torch.randn_like(expected)
+    slopes = (torch.autograd.grad((weight * y).sum(), leaves) for y in (value, expected))
+    for slope, wanted in zip(*slopes, strict=True):
+        assert_close(slope, wanted, rtol=tolerance, atol=tolerance)
+
+
+@batches
+@pytest.mark.parametrize("columns", [1, 2])
+@pytest.mark.parametrize("d", [1, 2, 3])
+def test_solve(d, columns, batch):
+    A, B = 3 * torch.eye(d) + torch.rand(*batch, d, d), torch.randn(*batch, d, columns)
+    agree(solve, torch.linalg.solve, A, B, tolerance=1e-10)
+    with pytest.raises(AssertionError):
+        agree(lambda A, B: solve(A.mT + 1e-6, B), torch.linalg.solve, A, B, tolerance=1e-10)
+
+
+def test_solve_pivots_where_the_first_entry_is_zero():
+    A = torch.tensor([[0.0, 2.0], [4.0, 1.0]])
+    assert solve(A, torch.eye(2)).tolist() == [[-0.125, 0.25], [0.5, 0.0]]
+
+
+SIZES = [(1, 1, 1), (2, 2, 2), (1, 4, 2), (3, 3, 3), (4, 4, 4), (2, 3, SMALL)]  # on both sides of SMALL
+
+
+@batches
+@pytest.mark.parametrize(("k", "d", "columns"), SIZES)
+def test_multiply(k, d, columns, batch):
+    A, B = torch.randn(*batch, k, d), torch.randn(*batch, d, columns)
+    agree(multiply, torch.matmul, A, B)
+    with pytest.raises(AssertionError):
+        agree(lambda A, B: multiply(A, B) + 1e-6 * A.sum(), torch.matmul, A, B)
+
+
+@batches
+@pytest.mark.parametrize(("k", "d"), [(1, 1), (2, 4), (4, 4), (5, 4)])
+def test_apply(k, d, batch):
+    """One matrix for each vector, or one for all."""
+    v = torch.randn(*batch, d)
+    for A in (torch.randn(*batch, k, d), torch.randn(k, d)):
+        agree(apply, lambda A, v: torch.einsum("...kd,...d->...k", A, v), A, v)
+        with pytest.raises(AssertionError):
+            agree(apply, lambda A, v: torch.einsum("...kd,...d->...k", 1.001 * A, v), A, v)

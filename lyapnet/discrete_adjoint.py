@@ -17,7 +17,6 @@ from torch.fx import GraphModule
 
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.compilation import Scan, compilation_errors, compiled, is_on_disk
-from lyapnet.errors import CompilationError
 from lyapnet.runge_kutta import TABLEAUX, Linearise, Step
 from lyapnet.tracing import batched, cut, trace
 
@@ -101,13 +100,14 @@ class DiscreteAdjoint:
         self._routines[self._key(x0)] = Routines(integrate, linearise, product, work.block)
 
     def is_on_disk(self, x0: Tensor, theta: Sequence[Tensor] | None = None) -> bool:
-        """Whether `compile` would find everything on disk."""
-        try:
-            with compilation_errors():
-                work = self._work(x0, self.trained() if theta is None else theta)
-                return all(is_on_disk(*piece) for piece in work.pieces())
-        except CompilationError:
-            return False
+        """Whether `compile` would find everything on disk.
+
+        Raises:
+            CompilationError: the loop cannot be traced.
+        """
+        with compilation_errors():
+            work = self._work(x0, self.trained() if theta is None else theta)
+            return all(is_on_disk(*piece) for piece in work.pieces())
 
     def routines(self, x0: Tensor, theta: Sequence[Tensor]) -> Routines:
         """The work for batches like x₀: compiled, else traced, else as written."""

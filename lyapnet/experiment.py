@@ -41,7 +41,7 @@ from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoin
 from lyapnet.config import Config, configs_of_seeds, differing_keys, label_of, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
 from lyapnet.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.errors import DivergenceError, Interrupted, LyapnetError, UsageError
+from lyapnet.errors import CompilationError, DivergenceError, Interrupted, LyapnetError, UsageError
 from lyapnet.evaluation import evaluate
 from lyapnet.event_files import drop_events_after, event_files
 from lyapnet.modules import TrainedModule, build_module
@@ -289,7 +289,10 @@ def _earns_compilation(config: Config, module: TrainedModule) -> bool:
     batch, stages = config.training.batch_size, len(TABLEAUX[config.rollout.method].b)
     states = batch * config.seeds
     saved = config.training.iterations * config.horizon.steps * stages * (3e-4 + 4e-6 * states)
-    return config.rollout.compile == "on" or saved > 45 or module.compiled_before(batch)
+    try:
+        return config.rollout.compile == "on" or saved > 45 or module.compiled_before(batch)
+    except CompilationError:  # what cannot be traced is not on disk
+        return False
 
 
 def _provenance(config: Config, finetuned_from: Path | None, compile: bool) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import CompilationError
 from lyapnet.experiment import plan_run
+from lyapnet.networks import FCN, NETWORKS
 
 CONFIG = Path(__file__).parents[1] / "conf" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -108,6 +109,20 @@ def test_a_loop_that_cannot_be_traced_says_so(monkeypatch):
     )
     with pytest.raises(CompilationError, match="Expected a closed loop to compile"):
         rollout.discrete.compile(torch.zeros(3, 2))
+
+
+class Branching(FCN):
+    """A network whose course depends on values."""
+
+    def forward(self, t, x):
+        return super().forward(t, x) if x.sum() < 1e9 else x.sum(-1)
+
+    value_and_state_gradient = None
+
+
+def test_auto_leaves_what_cannot_be_traced_alone(tmp_path, monkeypatch):
+    monkeypatch.setitem(NETWORKS, "fcn", Branching)
+    assert plan_run(CONFIG, [*SMALL, f"logs={tmp_path}", "network.name=fcn"]).compile is False
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,7 @@ class DiscreteAdjoint:
             x0: (b, n), or (E, b, n) with members.
             theta: the members' parameters, in the order of `trained`; None for the loop's own.
         """
+        x0 = x0.contiguous()  # as machine code takes it, which does not check
         theta = self.trained() if theta is None else theta
         if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
             x, running_cost, value, u = _Rollout.apply(self, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
@@ -137,7 +138,8 @@ class DiscreteAdjoint:
         padded = K * math.ceil(nodes / K)
         t, dt = self._grid(stages, padded)
         stages = torch.cat([stages, stages[-1:].expand(padded - nodes, *stages.shape[1:])])
-        columns = [t, dt, stages, *(_padded(column, padded) for column in (x_bar, cost_bar, value_bar))]
+        node_bars = (_padded(column, padded).contiguous() for column in (x_bar, cost_bar, value_bar))
+        columns = [t, dt, stages, *node_bars]
         costate, gradient = torch.zeros_like(x_bar[0]), [torch.zeros_like(p) for p in theta]
         for start in reversed(range(0, padded, K)):
             block = [column[start : start + K] for column in columns]
@@ -151,7 +153,12 @@ class DiscreteAdjoint:
         """The path without a gradient: by compiled routines, in slices if need be; else without a trace."""
         if self._key(x0) in self._routines:
             return self.integrate(self._routines[self._key(x0)], x0, theta)
-        if not x0.numel() or self._compiled is None or self._key(self._compiled[..., 0, :]) != self._key(x0[..., 0, :]):
+        if (
+            not x0.numel()
+            or self._compiled is None
+            or self._key(self._compiled) not in self._routines  # other parameters were trained then
+            or self._key(self._compiled[..., 0, :]) != self._key(x0[..., 0, :])
+        ):
             routines = self._as_written(x0) if x0.ndim == 2 else self.routines(x0, theta)
             return self.integrate(routines, x0, theta)
         size, batch = self._compiled.shape[-2], x0.shape[-2]

@@ -227,7 +227,8 @@ class EnsembleModule(TrainedModule):
         gradient_clip_algorithm: str | None = None,
     ) -> None:
         """Each member's gradient by itself, as in a run of its own."""
-        clip = {"value": nn.utils.clip_grad_value_}.get(str(gradient_clip_algorithm), nn.utils.clip_grad_norm_)
+        by_value = gradient_clip_algorithm == "value"  # Lightning's enumeration is of strings
+        clip = nn.utils.clip_grad_value_ if by_value else nn.utils.clip_grad_norm_
         if gradient_clip_val and gradient_clip_val > 0:
             for member in self.members:
                 clip(member.V.parameters(), gradient_clip_val)

@@ -25,6 +25,8 @@ def trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Grap
     graph_module = make_fx(function, _allow_non_fake_inputs=True)(*arguments)
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
         graph_module = make_fx(functionalize(graph_module), _allow_non_fake_inputs=True)(*arguments)
+    if any(_depends_on_values(node) for node in graph_module.graph.nodes):
+        raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
     for node in list(graph_module.graph.nodes):
         if node.op == "call_function" and node.target is torch.ops.aten.detach.default:
             node.replace_all_uses_with(node.args[0])
@@ -100,6 +102,13 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
 
 def _name(target: Any) -> str:
     return getattr(target, "__name__", "").split(".")[0]
+
+
+def _depends_on_values(node: Node) -> bool:
+    """Whether the values of its arguments decide the shape of its result: nonzero, or indexing by a mask."""
+    if node.target is torch.ops.aten.index.Tensor:  # by integers it does not
+        return any(source.meta["val"].dtype == torch.bool for source in node.all_input_nodes[1:])
+    return torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ())
 
 
 def _mutates(node: Node) -> bool:

@@ -312,7 +312,7 @@ class TrainingProgress(ProgressBar):
         if self._progress is None:
             return
         summaries = [_shown(member.validation).summary() for member in _trained_module(pl_module).members]
-        measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := over_seeds(summaries, key, form))]
+        measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
         self._console.print(f"step {trainer.global_step}/{trainer.max_epochs}  {'  '.join(measures)}", soft_wrap=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
@@ -327,7 +327,7 @@ class TrainingProgress(ProgressBar):
             self._progress = None
 
 
-def over_seeds(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
+def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
     """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
     values = [summary[key] for summary in summaries]
     if None in values:

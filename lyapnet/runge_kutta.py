@@ -46,16 +46,15 @@ class Step(nn.Module):
         self.loop, self.tableau = loop, tableau
 
     def forward(self, t: Tensor, dt: Tensor, x: Tensor) -> tuple[Tensor, ...]:
-        stages, slopes, at_node = [], [], None
+        stages, slopes, outputs = [], [], []
         for row, c in zip(self.tableau.a, self.tableau.c, strict=True):
             X = x + dt * _combine(row, [k[..., :-1] for k in slopes]) if any(row) else x
             output = self.loop.control(t + c * dt, X)
-            at_node = at_node or output
+            outputs.append(output)
             stages.append(X)
             slopes.append(self.loop.slope(X, output.u))
-        assert at_node is not None
         step = dt * _combine(self.tableau.b, slopes)
-        return x + step[..., :-1], torch.stack(stages), step[..., -1], at_node.u, at_node.value
+        return x + step[..., :-1], torch.stack(stages), step[..., -1], outputs[0].u, outputs[0].value
 
 
 class Linearisation(NamedTuple):
@@ -93,8 +92,7 @@ class Linearise(nn.Module):
             u, value, V_x = self.loop.control(self._times(t, dt), x)
             u_x = torch.stack([_vjp([u_j], [x], [torch.ones_like(u_j)])[0] for u_j in u.unbind(-1)], -2)
             # One copy of (x, u) for each component of (f + gu, ℓ): all rows of the Jacobian in one sweep.
-            copies = (x, u)
-            copies = [y.detach().expand(n + 1, *y.shape).clone().requires_grad_() for y in copies]
+            copies = [y.detach().expand(n + 1, *y.shape).clone().requires_grad_() for y in (x, u)]
             slope = self.loop.slope(*copies)
             rows = torch.eye(n + 1).to(slope).reshape(n + 1, *[1] * (slope.ndim - 2), n + 1)
             y_x, y_u = _vjp([slope], copies, [rows.expand_as(slope)])

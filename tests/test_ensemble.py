@@ -13,7 +13,7 @@ from test_training import SMALL, Desk, differences, logged, values, without_figu
 from torch import nn
 
 import lyapnet
-from lyapnet.callbacks import FigureLogger, over_seeds
+from lyapnet.callbacks import FigureLogger, mean_and_range
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
@@ -214,9 +214,9 @@ def test_terminal_shows_ranges_over_the_seeds(ensemble, single):
 
 def test_a_measure_over_seeds():
     summaries = [{"cost": 1.0, "ratio": None}, {"cost": 4.0, "ratio": None}]
-    assert over_seeds(summaries, "cost", ".2f") == "2.50 (1.00 – 4.00)"
-    assert over_seeds(summaries[:1], "cost", ".2f") == "1.00"
-    assert over_seeds(summaries, "ratio", ".2f") == ""
+    assert mean_and_range(summaries, "cost", ".2f") == "2.50 (1.00 – 4.00)"
+    assert mean_and_range(summaries[:1], "cost", ".2f") == "1.00"
+    assert mean_and_range(summaries, "ratio", ".2f") == ""
 
 
 # Interrupted, diverged, refused

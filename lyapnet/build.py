@@ -172,8 +172,17 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
 
 
 def build_rollout(config: Config, task: Task, V: nn.Module) -> Rollout:
-    """The closed loop of V under the config's control law, integrator and gradient route."""
+    """The closed loop of V under the config's control law, integrator and gradient route.
+
+    Raises:
+        UsageError: compile is on for a route that has nothing to compile.
+    """
     options = config.rollout
+    if options.compile == "on" and options.gradient != "discrete":
+        raise UsageError(
+            f"Expected rollout.gradient=discrete for rollout.compile=on, got {options.gradient}; only that route "
+            "compiles: take it, or leave compile at auto."
+        )
     policy = POLICIES[options.policy](task.system, task.cost, V)
     return Rollout(
         task.system, task.cost, policy, task.horizon, options.method, options.gradient, options.rtol, options.atol

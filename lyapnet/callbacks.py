@@ -5,7 +5,7 @@ import signal
 import textwrap
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
@@ -24,13 +24,11 @@ from rich.table import Column
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
-from lyapnet.compilation import cache_folder
+from lyapnet.compilation import cache_folder, has_compiler
 from lyapnet.config import to_yaml
-from lyapnet.errors import CompilationError, DivergenceError, Interrupted
+from lyapnet.errors import CompilationError, DivergenceError, Interrupted, UntraceableError
 from lyapnet.modules import ProgramModule, TrainedModule, labelled
 from lyapnet.randomness import FIGURES, stream
-
-LAST, BEST = "last", "best"
 
 # the line of a validation: name, key of the summary, format
 VALIDATED = (
@@ -52,26 +50,38 @@ LAYOUT = {
 
 
 class Compilation(Callback):
-    """Compiles the closed loop and its gradient before the first step, and says so.
+    """Compiles the closed loop and its gradient before the first step, where that pays, and says so.
 
     Args:
         console: where it is said.
         batch_size: initial states in a training batch.
+        wanted: whether to compile in any case; else only what is on disk already.
+        record: hears that the run is compiled.
     """
 
-    def __init__(self, console: Console, batch_size: int):
-        self.console, self.batch_size = console, batch_size
+    def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[[], None]):
+        self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         module = _trained_module(pl_module)
-        self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
-        started = time.perf_counter()
         try:
-            module.compile_for(self.batch_size)
+            on_disk = module.compiled_before(self.batch_size)
+            if on_disk or self.wanted:
+                self._compile(trainer, module, on_disk)
+        except UntraceableError:  # which says so itself, where it runs as it is written
+            return
         except CompilationError as error:
             self._say(trainer, f"{error}; running without compilation.")
-        else:
-            self._say(trainer, f"compiled in {time.perf_counter() - started:.0f} s, kept in {cache_folder()}")
+
+    def _compile(self, trainer: Trainer, module: TrainedModule, on_disk: bool) -> None:
+        if not on_disk and has_compiler():
+            self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
+        started = time.perf_counter()
+        module.compile_for(self.batch_size)
+        verb = "loaded" if on_disk else "compiled"
+        self._say(trainer, f"{verb} machine code in {time.perf_counter() - started:.0f} s, kept in {cache_folder()}")
+        if trainer.is_global_zero:
+            self.record()
 
     def _say(self, trainer: Trainer, line: str) -> None:
         if trainer.is_global_zero:

@@ -123,7 +123,7 @@ def bench(
 
     All routes of one task and batch are warmed up, then timed in turns.
     Memory is the peak beyond the model; errors are relative, against
-    backprop in float64. Compiling takes up to a minute for each task and
+    backprop in float64. Compiling takes about 45 s for each task and
     batch, once for a machine; rollout.compile=off leaves it out.
 
     lyapnet bench --task double_integrator,reacher --batch 12,64 --json
@@ -148,7 +148,7 @@ def bench(
     for case, names in chosen:
         for size in batches:
             with notes.status(f"{case.name}, batch {size}: {', '.join(names)}"):
-                rows += benchmark.measure(case, size, names, repeats, say)
+                rows += benchmark.time_routes(case, size, names, repeats, say)
         if not as_json:
             console.print(_bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
     if as_json:

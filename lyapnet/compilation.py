@@ -8,12 +8,13 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule
 
-from lyapnet.errors import CompilationError
+from lyapnet.errors import CompilationError, LyapnetError
 
 
 class Scan(nn.Module):
@@ -58,7 +59,7 @@ def is_on_disk(module: nn.Module, arguments: Sequence[Tensor]) -> bool:
 
 
 def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
-    """The function of a traced module for arguments like these, from disk, or compiled now in 10 to 30 seconds.
+    """The function of a traced module for arguments like these, from disk, or compiled now.
 
     Raises:
         CompilationError: there is no C++ compiler.
@@ -67,25 +68,29 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
     from torch._inductor import aoti_compile_and_package, aoti_load_package
 
     path = _file(module, arguments)
-    if not path.is_file():
-        if not has_compiler():
-            raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # torch's, about itself
-                program = torch.export.export(module, tuple(arguments))
-                package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
-            Path(package).replace(path)
+    if path.is_file():
+        try:
+            return aoti_load_package(str(path))
+        except Exception:  # of any kind: a file that was cut short or exchanged
+            path.unlink(missing_ok=True)
+    if not has_compiler():
+        raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, about itself
+            program = torch.export.export(module, tuple(arguments))
+            package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
+        Path(package).replace(path)
     return aoti_load_package(str(path))
 
 
 @contextmanager
 def compilation_errors() -> Iterator[None]:
-    """Turn whatever tracing or compiling raises into a CompilationError."""
+    """Turn whatever compiling raises into a CompilationError; what lyapnet itself says stays as it is."""
     try:
         yield
-    except CompilationError:
+    except LyapnetError:
         raise
     except Exception as error:
         line = " ".join(str(error).split())[:200]
@@ -113,8 +118,8 @@ def cache_folder() -> Path:
 def _file(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
     """One file for each function, shapes of arguments, machine and torch."""
     parts = [
-        torch.__version__, platform.machine(), torch.backends.cpu.get_cpu_capability(), torch.get_num_threads(),
-        type(module).__name__, *((tuple(a.shape), a.stride(), a.dtype, a.device.type) for a in arguments),
+        torch.__version__, platform.machine(), _processors(arguments), torch.get_num_threads(), type(module).__name__,
+        *((tuple(a.shape), a.stride(), a.dtype, a.device.type) for a in arguments),
     ]  # fmt: skip
     for graph in module.modules():
         if isinstance(graph, GraphModule):
@@ -122,3 +127,9 @@ def _file(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
             parts.append(graph.code)
             parts += [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]
     return cache_folder() / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt2"
+
+
+def _processors(arguments: Sequence[Tensor]) -> list[Any]:
+    """What machine code is written for: the instructions of the CPU, and of each GPU that holds an argument."""
+    devices = {argument.device for argument in arguments if argument.device.type == "cuda"}
+    return [sorted(torch.cpu.get_capabilities().items()), *map(torch.cuda.get_device_capability, devices)]

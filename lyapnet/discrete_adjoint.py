@@ -5,6 +5,7 @@ of the block at once; the costate runs through the block; and one product gives 
 gradient (lyapnet.runge_kutta has the equations). Memory is that of the path and of one block.
 """
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -17,9 +18,11 @@ from torch.fx import GraphModule
 
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.compilation import Scan, compilation_errors, compiled, is_on_disk
+from lyapnet.errors import LyapnetError, UntraceableError
 from lyapnet.runge_kutta import TABLEAUX, Linearise, Step
 from lyapnet.tracing import batched, cut, trace
 
+_LOG = logging.getLogger(__name__)
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 
 
@@ -49,7 +52,8 @@ class DiscreteAdjoint:
 
     The work is traced for one batch shape at its first use (lyapnet.tracing). Parameters and buffers of the system, the
     cost and V are arguments of what is traced and may change between rollouts; what else f, g and V read is frozen. A
-    loop that cannot be traced, since its course depends on values, runs as it is written.
+    loop that cannot be traced, since its course depends on values or leaves torch, runs as it is written; the log says
+    why.
 
     With an axis of members before the batch, x₀ (E, b, n) and parameters (E, *shape), it is E closed loops at once.
 
@@ -65,6 +69,7 @@ class DiscreteAdjoint:
         self._traced: dict[tuple[Any, ...], _Traced] = {}
         self._routines: dict[tuple[Any, ...], Routines] = {}
         self._compiled: Tensor | None = None  # an x₀ of the batches that run as machine code
+        self._told = False  # whether the log has said why the loop runs as it is written
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the work, which belongs to these very tensors: a copy does its own."""
@@ -76,7 +81,13 @@ class DiscreteAdjoint:
         Args:
             x0: (b, n), or (E, b, n) with members.
             theta: the members' parameters, in the order of `trained`; None for the loop's own.
+
+        Raises:
+            ValueError: parameters without an axis of members in x₀.
+            UsageError: the loop draws random numbers, which the way back could not repeat.
         """
+        if theta is not None and x0.ndim != 3:
+            raise ValueError(f"Expected x0 (E, b, n) with the members' parameters, got {tuple(x0.shape)}; stack them.")
         x0 = x0.contiguous()  # as machine code takes it, which does not check
         theta = self.trained() if theta is None else theta
         if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
@@ -89,13 +100,16 @@ class DiscreteAdjoint:
         return [p for p in self.loop.parameters() if p.requires_grad]
 
     def compile(self, x0: Tensor, theta: Sequence[Tensor] | None = None) -> None:
-        """Compile the work for batches like x₀, or take it from disk; rollouts of other batches then run in its slices.
+        """Compile the work for batches like x₀, or take it from disk.
+
+        Rollouts of other batches, where no gradient is asked for, then run in slices of that size.
 
         Raises:
-            CompilationError: the loop cannot be traced, there is no compiler, or it failed.
+            UntraceableError: the loop cannot be traced.
+            CompilationError: there is no compiler, or it failed.
         """
+        work = self._work(x0, self.trained() if theta is None else theta)
         with compilation_errors():
-            work = self._work(x0, self.trained() if theta is None else theta)
             integrate, linearise, product = (compiled(*piece) for piece in work.pieces())
         self._compiled = x0.detach()
         self._routines[self._key(x0)] = Routines(integrate, linearise, product, work.block)
@@ -104,11 +118,10 @@ class DiscreteAdjoint:
         """Whether `compile` would find everything on disk.
 
         Raises:
-            CompilationError: the loop cannot be traced.
+            UntraceableError: the loop cannot be traced.
         """
-        with compilation_errors():
-            work = self._work(x0, self.trained() if theta is None else theta)
-            return all(is_on_disk(*piece) for piece in work.pieces())
+        work = self._work(x0, self.trained() if theta is None else theta)
+        return all(is_on_disk(*piece) for piece in work.pieces())
 
     def routines(self, x0: Tensor, theta: Sequence[Tensor]) -> Routines:
         """The work for batches like x₀: compiled, else traced, else as written."""
@@ -116,9 +129,12 @@ class DiscreteAdjoint:
         if key not in self._routines:
             try:
                 self._routines[key] = self._work(x0, theta).routines()
-            except Exception:  # whatever a course that depends on values raises inside the user's own functions
+            except UntraceableError as error:
                 if x0.ndim > 2:  # members exist in a trace alone
                     raise
+                if not self._told:
+                    _LOG.warning("%s It runs as it is written, which is slower.", error)
+                    self._told = True
                 self._routines[key] = self._as_written(x0)
         return self._routines[key]
 
@@ -194,18 +210,26 @@ class DiscreteAdjoint:
         return function
 
     def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> "_Traced":
-        """The work for batches like x₀ as graphs, traced once."""
+        """The work for batches like x₀ as graphs, traced once.
+
+        Raises:
+            UntraceableError: the loop's course depends on values, or leaves torch.
+        """
         key = self._key(x0)
         if key not in self._traced:
-            self._traced[key] = self._trace(x0, theta)
+            try:
+                self._traced[key] = self._trace(x0, theta)
+            except LyapnetError:
+                raise
+            except Exception as error:  # of any kind, from inside the user's own functions
+                reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
+                raise UntraceableError(
+                    f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."
+                ) from error
         return self._traced[key]
 
     def _trace(self, x0: Tensor, theta: Sequence[Tensor]) -> "_Traced":
-        """The work for batches like x₀ as graphs.
-
-        Raises:
-            Exception: of any kind, where the loop's course depends on values.
-        """
+        """The work for batches like x₀ as graphs; raises whatever the loop's own functions raise."""
         x0, state, block = x0.detach().contiguous(), self._state(theta), self._block(x0)
         t, dt = self._grid(x0, block)
         nodes = x0.expand(block, *x0.shape)
@@ -213,12 +237,13 @@ class DiscreteAdjoint:
         bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
         grid = self._grid(x0, self.steps + 1)
         node_arguments, block_arguments = [*state, t[0], dt[0], x0], [*state, t, dt, stages, *bars, nodes.clone()]
+        elsewhere = [t[0] + self.dt, dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]
         step, joint = self._with_state(self._step), self._with_state(self._linearise)
         if x0.ndim == 2:
-            step, joint = trace(step, node_arguments), trace(joint, block_arguments)
+            step, joint = trace(step, node_arguments, elsewhere), trace(joint, block_arguments)
         else:
             axes = [*[0] * len(theta), *[None] * (len(state) - len(theta)), None, None]
-            step = batched(step, node_arguments, [*axes, 0], [0, 1, 0, 0, 0])
+            step = batched(step, node_arguments, [*axes, 0], [0, 1, 0, 0, 0], elsewhere)
             joint = batched(joint, block_arguments, [*axes, 2, 1, 1, 1, 1], [1, 1, *[0] * len(theta)])
         prepare, step = cut(step, late=3, early_outputs=0, repeat=False)
         linearise, product = cut(joint, late=1, early_outputs=2)

@@ -25,6 +25,10 @@ class CompilationError(LyapnetError):
     """A closed loop cannot be compiled; it runs without."""
 
 
+class UntraceableError(CompilationError):
+    """The course of a closed loop depends on values; it runs as it is written, which is slower."""
+
+
 class Interrupted(LyapnetError):
     """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
 

@@ -2,14 +2,9 @@
 
 import difflib
 import inspect
-import json
 import logging
-import os
-import platform
 import shlex
 import statistics
-import subprocess
-import tempfile
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,12 +19,9 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 from torch import nn
 
-import lyapnet
 from lyapnet.atomic import write_atomically
 from lyapnet.build import resolve
 from lyapnet.callbacks import (
-    BEST,
-    LAST,
     Checkpoints,
     Compilation,
     FigureLogger,
@@ -41,67 +33,19 @@ from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoin
 from lyapnet.config import Config, configs_of_seeds, differing_keys, label_of, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
 from lyapnet.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.errors import CompilationError, DivergenceError, Interrupted, LyapnetError, UsageError
+from lyapnet.errors import DivergenceError, Interrupted, UsageError
 from lyapnet.evaluation import evaluate
 from lyapnet.event_files import drop_events_after, event_files
 from lyapnet.modules import TrainedModule, build_module
 from lyapnet.networks import NETWORKS
+from lyapnet.run import CONFIG, EVALUATION, LAST, PROVENANCE, Run, last_run, new_run, write_json
 from lyapnet.runge_kutta import TABLEAUX
 
-CONFIG = "config.yaml"
-PROVENANCE = "run.json"
-EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
 TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",
     "deterministic", "benchmark", "detect_anomaly", "profiler",
 )  # fmt: skip
 CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every")
-
-
-@dataclass(frozen=True)
-class Run:
-    """The folder of one run: config.yaml, run.json, evaluation.json, checkpoints/ and TensorBoard's event files."""
-
-    folder: Path
-
-    @property
-    def checkpoints(self) -> Path:
-        """Where last.ckpt and best.ckpt are."""
-        return self.folder / "checkpoints"
-
-    @property
-    def last(self) -> Path:
-        """The newest checkpoint."""
-        return self.checkpoints / f"{LAST}.ckpt"
-
-    @property
-    def best(self) -> Path:
-        """The checkpoint of the least validation loss."""
-        return self.checkpoints / f"{BEST}.ckpt"
-
-    def members(self, config: Config) -> list["Run"]:
-        """Where each seed's best checkpoint and event files are: folders of their own, if there are several seeds."""
-        labels = [label_of(one) for one in configs_of_seeds(config)]
-        return [Run(self.folder / label) for label in labels] if config.seeds > 1 else [self]
-
-    @property
-    def finetuned_from(self) -> Path | None:
-        """The checkpoint whose weights the run started from."""
-        origin = self._provenance()["finetuned_from"]
-        return Path(origin) if origin else None
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the run started compiled, as it then goes on: machine code rounds differently."""
-        return self._provenance().get("compiled", False)
-
-    def _provenance(self) -> dict[str, Any]:
-        return json.loads((self.folder / PROVENANCE).read_text(encoding="utf-8"))
-
-    @property
-    def finished(self) -> bool:
-        """Whether the run reached its end."""
-        return (self.folder / EVALUATION).is_file()
 
 
 @dataclass(frozen=True)
@@ -112,7 +56,6 @@ class Plan:
     config: Config
     module: TrainedModule
     run: Run
-    compile: bool = False
     resume_from: Path | None = None
     finetune_from: Path | None = None
 
@@ -135,22 +78,21 @@ def plan_run(path: Path | None, overrides: list[str], resume: str | None = None,
     torch.set_num_threads(config.training.threads)  # compiled functions are kept for a number of threads
     module = build_module(config)
     if not resume:
-        compile = _earns_compilation(config, module)
         module = _start_from(module, finetune)
-        return Plan(command, config, module, _new_run(config, finetune, compile), compile, finetune_from=finetune)
-    run = _last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
+        return Plan(command, config, module, new_run(config, finetune), finetune_from=finetune)
+    run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if resume == LAST and not checkpoint.exists():  # stopped before its first checkpoint: it stands where it began
         written = run.folder / CONFIG
         if written.exists():
             _require_same_experiment(config, load_config(written), written)
         origin = run.finetuned_from
-        return Plan(command, config, _start_from(module, origin), run, run.compiled, finetune_from=origin)
+        return Plan(command, config, _start_from(module, origin), run, finetune_from=origin)
     stored = config_of(read_checkpoint(checkpoint), checkpoint)
     if not (run.folder / PROVENANCE).is_file():
         raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
     _require_same_experiment(config, stored, checkpoint)
-    return Plan(command, config, module, run, run.compiled, resume_from=checkpoint)
+    return Plan(command, config, module, run, resume_from=checkpoint)
 
 
 def fit(plan: Plan, console: Console) -> dict[str, Any]:
@@ -162,7 +104,7 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
         LyapnetError: a checkpoint or event file cannot be read or written.
     """
     config, run, module = plan.config, plan.run, plan.module
-    trainer = _trainer(config, run, console, plan.compile)
+    trainer = _trainer(plan, console)
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(f"[bold]{config.experiment}[/]  {run.folder}", soft_wrap=True)
@@ -208,7 +150,7 @@ def _finish(trainer: L.Trainer, plan: Plan) -> dict[str, Any]:
         logger.log_hyperparams(to_plain(member.config), metrics, step=trainer.global_step)
         logger.finalize("success")
     result = results[0] if config.seeds == 1 else over_seeds(results)
-    _write_json(plan.run.folder / EVALUATION, result)
+    write_json(plan.run.folder / EVALUATION, result)
     return result
 
 
@@ -233,7 +175,8 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         return read_plain_data(path, map_location or "cpu")
 
 
-def _trainer(config: Config, run: Run, console: Console, compile: bool) -> L.Trainer:
+def _trainer(plan: Plan, console: Console) -> L.Trainer:
+    config, run = plan.config, plan.run
     training, runs = config.training, run.members(config)
     loggers = [
         TensorBoardLogger(r.folder.parent, name="", version=r.folder.name, default_hp_metric=False) for r in runs
@@ -250,7 +193,7 @@ def _trainer(config: Config, run: Run, console: Console, compile: bool) -> L.Tra
         default_root_dir=run.folder,
         logger=loggers,
         callbacks=[
-            *([Compilation(console, training.batch_size)] if compile else []),
+            *_compilation(plan, console),
             Stopwatch(),
             ScalarLogger(),
             FigureLogger(training.validate_every * config.evaluation.figures_every),
@@ -278,79 +221,24 @@ def _prepare_folder(plan: Plan) -> None:
             path.unlink()
 
 
-def _earns_compilation(config: Config, module: TrainedModule) -> bool:
-    """Whether a new run is compiled: because it must, because it was before, or because it is long.
+def _compilation(plan: Plan, console: Console) -> list[Compilation]:
+    """What compiles the run, if anything may; a resumed run goes on as it was."""
+    options = plan.config.rollout
+    goes_on = plan.resume_from is not None
+    if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
+        return []
+    wanted = goes_on or options.compile == "on" or _earns_compilation(plan.config)
+    return [Compilation(console, plan.config.training.batch_size, wanted, plan.run.record_compilation)]
 
-    By measurement on a 3-64-64-1 network and one CPU core, compiling takes 45 s and then saves 0.3 ms at each stage of
-    each step, and 4 µs more for each state.
+
+def _earns_compilation(config: Config) -> bool:
+    """Whether a run is long enough to earn its compilation back.
+
+    By measurement on a 3-64-64-1 network and one CPU core, compiling takes about 45 s and then saves 0.3 ms at each
+    stage of each step, and 4 µs more for each state.
     """
-    if config.rollout.gradient != "discrete" or config.rollout.compile == "off":
-        return False
-    batch, stages = config.training.batch_size, len(TABLEAUX[config.rollout.method].b)
-    states = batch * config.seeds
-    saved = config.training.iterations * config.horizon.steps * stages * (3e-4 + 4e-6 * states)
-    try:
-        return config.rollout.compile == "on" or saved > 45 or module.compiled_before(batch)
-    except CompilationError:  # what cannot be traced is not on disk
-        return False
-
-
-def _provenance(config: Config, finetuned_from: Path | None, compile: bool) -> dict[str, Any]:
-    return {
-        "seed": config.seed,
-        "compiled": compile,
-        "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
-        "lyapnet": lyapnet.__version__,
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "lightning": L.__version__,
-        "commit": _commit(),
-    }
-
-
-def _commit() -> str | None:
-    """The commit of lyapnet's own source tree, where it is one."""
-    try:
-        here = Path(__file__).parent
-        git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return git.stdout.strip()
-
-
-def _new_run(config: Config, finetuned_from: Path | None, compile: bool) -> Run:
-    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on."""
-    if int(os.environ.get("LOCAL_RANK", "0")) > 0:  # a further process of a run whose folder the first one made
-        return _last_run(config)
-    root = Path(config.logs) / config.experiment
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
-        draft.chmod(0o755)
-        _write_json(draft / PROVENANCE, _provenance(config, finetuned_from, compile))
-        version = max((number for number, _ in _versions(root)), default=-1) + 1
-        return Run(draft.rename(root / f"version_{version}"))
-    except OSError as error:
-        raise LyapnetError(
-            f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
-        ) from error
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def _last_run(config: Config) -> Run:
-    root = Path(config.logs) / config.experiment
-    runs = sorted(_versions(root))
-    if not runs:
-        raise UsageError(f"Expected a run to resume in {str(root)!r}, got none; start one without --resume.")
-    return Run(runs[-1][1])
-
-
-def _versions(root: Path) -> list[tuple[int, Path]]:
-    numbered = [(path.name.removeprefix("version_"), path) for path in root.glob("version_*")]
-    return [(int(number), path) for number, path in numbered if number.isdigit()]
+    states, stages = config.training.batch_size * config.seeds, len(TABLEAUX[config.rollout.method].b)
+    return config.training.iterations * config.horizon.steps * stages * (3e-4 + 4e-6 * states) > 45
 
 
 def _require_same_experiment(config: Config, stored: Config, checkpoint: Path) -> None:

@@ -9,17 +9,27 @@ from torch._functorch.compile_utils import fx_graph_cse
 from torch.func import functionalize, vmap
 from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.testing import assert_close
+
+from lyapnet.errors import UsageError
 
 Tensors = tuple[Tensor, ...]
 
 
-def trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
+def trace(
+    function: Callable[..., Tensors], arguments: Sequence[Tensor], elsewhere: Sequence[Tensor] = ()
+) -> GraphModule:
     """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
 
     No Python of the function is left, nothing is computed twice, and nothing records a graph: run it under no_grad.
     The function must be one of its arguments alone; whatever else it reads is frozen as it is now.
 
+    Args:
+        elsewhere: other values of its last arguments, on which the trace is held against the function: code that
+            leaves torch (x.numpy(), say) is frozen without a word.
+
     Raises:
+        UsageError: the function draws random numbers.
         Exception: of any kind, where the function's course depends on the values of its arguments.
     """
     graph_module = make_fx(function, _allow_non_fake_inputs=True)(*arguments)
@@ -28,19 +38,31 @@ def trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Grap
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
         raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
     for node in list(graph_module.graph.nodes):
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise UsageError(
+                f"Expected a closed loop without random numbers for rollout.gradient=discrete, got {node.target}; "
+                "leave dropout and noise out, or take rollout.gradient=backprop."
+            )
         if node.op == "call_function" and node.target is torch.ops.aten.detach.default:
             node.replace_all_uses_with(node.args[0])
             graph_module.graph.erase_node(node)
-    return _tidied(graph_module, graph_module.graph)
+    graph_module = _tidied(graph_module, graph_module.graph)
+    if elsewhere:
+        _require_same(graph_module, function, [*arguments[: -len(elsewhere)], *elsewhere])
+    return graph_module
 
 
 def batched(
-    function: Callable[..., Tensors], arguments: Sequence[Tensor], axes: Sequence[int | None], out_axes: Sequence[int]
+    function: Callable[..., Tensors],
+    arguments: Sequence[Tensor],
+    axes: Sequence[int | None],
+    out_axes: Sequence[int],
+    elsewhere: Sequence[Tensor] = (),
 ) -> GraphModule:
     """The trace of a function over an axis of some of its arguments: each of its operations on all members at once."""
-    one = [a if axis is None else a.select(axis, 0).clone() for a, axis in zip(arguments, axes, strict=True)]
+    one, other = _first_member(arguments, axes), _first_member(elsewhere, axes[len(axes) - len(elsewhere) :])
     # traced before it is batched: by then no autograd is left that vmap could not enter
-    return trace(vmap(trace(function, one), tuple(axes), tuple(out_axes)), arguments)
+    return trace(vmap(trace(function, one, other), tuple(axes), tuple(out_axes)), arguments)
 
 
 def cut(
@@ -98,6 +120,25 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
         if node.op in ("placeholder", "get_attr")
         or (node.op == "call_function" and (_is_view(node.target) or _name(node.target) in cheap))
     }
+
+
+def _first_member(arguments: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
+    return [a if axis is None else a.select(axis, 0).clone() for a, axis in zip(arguments, axes, strict=True)]
+
+
+def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> None:
+    """Hold a trace against its function, up to half the digits: they may add in another order."""
+    with torch.no_grad():
+        results, expected = graph_module(*arguments), function(*arguments)
+    for result, value in zip(results, expected, strict=True):
+        half = torch.finfo(value.dtype).eps ** 0.5
+        try:
+            assert_close(result, value.detach(), rtol=half, atol=half * float(value.abs().max()), equal_nan=True)
+        except AssertionError as error:
+            raise ValueError(
+                "Expected f, g, the cost and V to compute with torch alone, got code that leaves it (x.numpy(), "
+                "float(x), …) or that computes something else each time."
+            ) from error
 
 
 def _name(target: Any) -> str:

@@ -107,7 +107,7 @@ def test_peak_of_known_tensors():
 
 def test_memory_of_backprop_grows_with_the_steps_and_exceeds_that_of_discrete():
     short, long = (
-        {row.route: row.peak_bytes for row in bench.measure(case, 16, ["backprop", "discrete"], 1, print)}
+        {row.route: row.peak_bytes for row in bench.time_routes(case, 16, ["backprop", "discrete"], 1, print)}
         for case in (case_of(f"horizon.steps={steps}", "network.hidden=[32, 32]") for steps in (20, 80))
     )
     assert long["backprop"] > 3 * short["backprop"]
@@ -120,7 +120,7 @@ def test_compiled_rows_come_after_the_eager_ones_unless_compilation_fails(monkey
     # machine code takes a minute to make: the traces stand in for it
     monkeypatch.setattr("lyapnet.discrete_adjoint.DiscreteAdjoint.compile", lambda self, x0: None)
     case, said = case_of("rollout.compile=auto"), []
-    rows = bench.measure(case, 3, ["rollout", "backprop", "discrete"], 1, said.append)
+    rows = bench.time_routes(case, 3, ["rollout", "backprop", "discrete"], 1, said.append)
     assert [(row.route, row.compiled) for row in rows] == [
         ("rollout", False), ("backprop", False), ("discrete", False), ("rollout", True), ("discrete", True),
     ]  # fmt: skip
@@ -131,7 +131,7 @@ def test_compiled_rows_come_after_the_eager_ones_unless_compilation_fails(monkey
         raise CompilationError("Expected a closed loop to compile, got none")
 
     monkeypatch.setattr("lyapnet.discrete_adjoint.DiscreteAdjoint.compile", fail)
-    assert not any(row.compiled for row in bench.measure(case, 3, ["discrete"], 1, said.append))
+    assert not any(row.compiled for row in bench.time_routes(case, 3, ["discrete"], 1, said.append))
     assert len(said) == 1
 
 

@@ -3,6 +3,7 @@
 import copy
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -13,6 +14,7 @@ from torch.testing import assert_close
 from lyapnet import discrete_adjoint
 from lyapnet.calculus import hamiltonian
 from lyapnet.cost import QuadraticCost
+from lyapnet.errors import UsageError
 from lyapnet.networks import ACTIVATIONS, FCN, NETWORKS, Scaling
 from lyapnet.networks.anchored import TerminalAnchor
 from lyapnet.oracles import discrete_riccati
@@ -424,11 +426,30 @@ def pendulum_routes():
     return build
 
 
-USERS = [Pendulum, Branching, InPlace, Adjustable]
+class LeavesTorch(Pendulum):
+    """A drag that NumPy computes, and that backpropagation therefore takes for a constant."""
+
+    def f(self, x):
+        drag = 0.3 * np.tanh(x.detach().numpy()[..., 1])
+        return super().f(x) - torch.stack([torch.zeros_like(x[..., 0]), torch.from_numpy(drag)], -1)
+
+
+class Masked(Pendulum):
+    """A stop that is set where a mask says."""
+
+    def f(self, x):
+        drift = super().f(x)
+        beyond = x[..., 0] > 0.5
+        drift[..., 1][beyond] = drift[..., 1][beyond] - 5 * (x[..., 0][beyond] - 0.5)
+        return drift
+
+
+USERS = [Pendulum, Branching, InPlace, Adjustable, LeavesTorch, Masked]
 
 
 @pytest.mark.parametrize(
-    ("system", "traced"), [*((system, False) for system in USERS), (InPlace, True), (Branching, None)]
+    ("system", "traced"),
+    [*((system, False) for system in USERS), (InPlace, True), *((s, None) for s in (Branching, LeavesTorch, Masked))],
 )
 def test_systems_of_users(system, pendulum_routes):
     x0 = torch.tensor([[0.1, 0.2], [0.6, -0.3], [-1.0, 1.0]])
@@ -448,6 +469,48 @@ def test_python_runs_once_unless_the_course_depends_on_values(build, once, pendu
     calls = system.calls
     slopes(rollouts[0], x0)
     assert (system.calls == calls) is once
+
+
+@in_either_form
+@pytest.mark.parametrize(("build", "named"), [(Pendulum, None), (LeavesTorch, "leaves it"), (Branching, "Error")])
+def test_why_a_loop_runs_as_it_is_written_is_logged_once(build, named, pendulum_routes, caplog):
+    discrete, _ = pendulum_routes(build())
+    for batch in (3, 3, 5):
+        discrete(torch.randn(batch, 2)).cost.sum().backward()
+    messages = [record.getMessage() for record in caplog.records if record.name.startswith("lyapnet")]
+    assert len(messages) == (named is not None)
+    assert all(named in message and "runs as it is written" in message for message in messages)
+
+
+@in_either_form
+def test_dropout_in_v_is_refused(pendulum_routes):
+    discrete, backprop = pendulum_routes(Pendulum())
+    for rollout in (discrete, backprop):
+        V = rollout.closed_loop.policy.V
+        rollout.closed_loop.policy.V = Dropping(V)
+    backprop(torch.randn(3, 2)).cost.sum().backward()
+    with pytest.raises(UsageError, match="without random numbers"):
+        discrete(torch.randn(3, 2))
+    discrete.eval()
+    is_exact([discrete, backprop.eval()], torch.randn(3, 2))
+
+
+class Dropping(nn.Module):
+    """A V of which units are left out at random."""
+
+    def __init__(self, V):
+        super().__init__()
+        self.V, self.dropout = V, nn.Dropout(0.2)
+
+    def forward(self, t, x):
+        return self.dropout(self.V(t, x)[..., None])[..., 0]
+
+
+@double_integrator
+def test_members_parameters_need_members(system, cost, policy, x0):
+    discrete, _ = routes(system, cost, policy)
+    with pytest.raises(ValueError, match=r"Expected x0 \(E, b, n\)"):
+        discrete.discrete(x0, discrete.discrete.trained())
 
 
 @in_either_form

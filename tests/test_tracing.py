@@ -1,9 +1,11 @@
 """Traced graphs compute what their functions do: as they are, cut in two, and over an axis of members."""
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
+from lyapnet.errors import UsageError
 from lyapnet.tracing import batched, cut, trace
 
 
@@ -64,6 +66,30 @@ def test_tensors_that_are_filled_in_place_stay_apart():
 def test_a_course_that_depends_on_values_is_no_trace(course):
     with pytest.raises(Exception):  # noqa: B017, PT011 (of any kind)
         trace(lambda x: (course(x),), (torch.ones(2),))
+
+
+@pytest.mark.parametrize("members", [(), (2,)])
+def test_code_that_leaves_torch_is_found_out_on_other_values(members):
+    def leaves(weight, x):
+        return (weight * torch.from_numpy(np.sin(x.detach().numpy())),)
+
+    def stays(weight, x):
+        return (weight * torch.sin(x),)
+
+    weight, x, other = torch.randn(3, *members, 4).unbind()
+    tracer = {(): trace, (2,): lambda f, given, *moved: batched(f, given, (0, 0), (0,), *moved)}[members]
+    with pytest.raises(ValueError, match="leaves it"):
+        tracer(leaves, (weight, x), (other,))
+    agree(tracer(stays, (weight, x), (other,))(weight, other), stays(weight, other))
+    if not members:  # in a batch, NumPy meets a tensor that it cannot read
+        agree(tracer(leaves, (weight, x))(weight, other), leaves(weight, x))
+
+
+def test_random_numbers_are_refused():
+    dropout = torch.nn.Dropout(0.5)
+    with pytest.raises(UsageError, match="without random numbers"):
+        trace(lambda x: (dropout(x),), (torch.ones(3),))
+    agree(trace(lambda x: (dropout.eval()(x),), (torch.ones(3),))(torch.ones(3)), (torch.ones(3),))
 
 
 # Cut

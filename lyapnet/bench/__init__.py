@@ -2,7 +2,7 @@
 
 from lyapnet.bench.accuracy import Accuracy, gradient_accuracy
 from lyapnet.bench.cases import Case, is_chain, load_case
-from lyapnet.bench.measurement import Row, measure, use_threads
+from lyapnet.bench.measurement import Row, time_routes, use_threads
 from lyapnet.bench.routes import BASELINE, ROUTES, routes_for
 
 __all__ = [
@@ -14,7 +14,7 @@ __all__ = [
     "gradient_accuracy",
     "is_chain",
     "load_case",
-    "measure",
     "routes_for",
+    "time_routes",
     "use_threads",
 ]

@@ -15,7 +15,7 @@ from lyapnet.runge_kutta import TABLEAUX
 from lyapnet.types import State
 
 SLICE = 256  # states whose graph the reference holds at once
-BATCH_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # of what a loss may read in a trajectory
+READ_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # of what a loss may read in a trajectory
 
 
 def reference_gradient(case: Case, x0: State) -> Tensor:
@@ -28,10 +28,10 @@ def reference_gradient(case: Case, x0: State) -> Tensor:
     theta = trained(rollout.get_submodule("closed_loop.policy.V"))
     with torch.no_grad():
         parts = [rollout(part) for part in slices]
-    whole = {key: torch.cat([getattr(part, key) for part in parts], axis) for key, axis in BATCH_AXES.items()}
+    whole = {key: torch.cat([getattr(part, key) for part in parts], axis) for key, axis in READ_AXES.items()}
     columns = [column.requires_grad_() for column in whole.values()]
     bars = derivatives([case.program(parts[0]._replace(**whole)).loss], columns)
-    sliced_bars = [bar.split(SLICE, axis) for bar, axis in zip(bars, BATCH_AXES.values(), strict=True)]
+    sliced_bars = [bar.split(SLICE, axis) for bar, axis in zip(bars, READ_AXES.values(), strict=True)]
     shares = []
     for part, *part_bars in zip(slices, *sliced_bars, strict=True):
         trajectory = rollout(part)

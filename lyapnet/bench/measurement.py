@@ -35,7 +35,7 @@ class Row:
     compile_seconds: float | None  # to trace, and to compile or load from disk; None: nothing is compiled
 
 
-def measure(case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]) -> list[Row]:
+def time_routes(case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]) -> list[Row]:
     """A row for each route, and for each compiled one: all warmed up, then timed in turns, `repeats` times each.
 
     Args:

@@ -1,0 +1,137 @@
+"""The folder of a run: what it holds, how it is made, and which one is the last."""
+
+import json
+import os
+import platform
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+
+import lyapnet
+from lyapnet.atomic import write_atomically
+from lyapnet.config import Config, configs_of_seeds, label_of
+from lyapnet.errors import LyapnetError, UsageError
+
+LAST, BEST = "last", "best"
+CONFIG = "config.yaml"
+PROVENANCE = "run.json"
+EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
+
+
+@dataclass(frozen=True)
+class Run:
+    """The folder of one run: config.yaml, run.json, evaluation.json, checkpoints/ and TensorBoard's event files."""
+
+    folder: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Where last.ckpt and best.ckpt are."""
+        return self.folder / "checkpoints"
+
+    @property
+    def last(self) -> Path:
+        """The newest checkpoint."""
+        return self.checkpoints / f"{LAST}.ckpt"
+
+    @property
+    def best(self) -> Path:
+        """The checkpoint of the least validation loss."""
+        return self.checkpoints / f"{BEST}.ckpt"
+
+    def members(self, config: Config) -> list["Run"]:
+        """Where each seed's best checkpoint and event files are: folders of their own, if there are several seeds."""
+        labels = [label_of(one) for one in configs_of_seeds(config)]
+        return [Run(self.folder / label) for label in labels] if config.seeds > 1 else [self]
+
+    @property
+    def finetuned_from(self) -> Path | None:
+        """The checkpoint whose weights the run started from."""
+        origin = self._provenance()["finetuned_from"]
+        return Path(origin) if origin else None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the run is compiled, as it then goes on: machine code rounds differently."""
+        return self._provenance().get("compiled", False)
+
+    def record_compilation(self) -> None:
+        """Note that the run is compiled."""
+        write_json(self.folder / PROVENANCE, {**self._provenance(), "compiled": True})
+
+    def _provenance(self) -> dict[str, Any]:
+        return json.loads((self.folder / PROVENANCE).read_text(encoding="utf-8"))
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run reached its end."""
+        return (self.folder / EVALUATION).is_file()
+
+
+def new_run(config: Config, finetuned_from: Path | None) -> Run:
+    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on."""
+    if int(os.environ.get("LOCAL_RANK", "0")) > 0:  # a further process of a run whose folder the first one made
+        return last_run(config)
+    root = Path(config.logs) / config.experiment
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
+        draft.chmod(0o755)
+        write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
+        version = max((number for number, _ in _versions(root)), default=-1) + 1
+        return Run(draft.rename(root / f"version_{version}"))
+    except OSError as error:
+        raise LyapnetError(
+            f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
+        ) from error
+
+
+def last_run(config: Config) -> Run:
+    """The newest run of an experiment.
+
+    Raises:
+        UsageError: there is none.
+    """
+    root = Path(config.logs) / config.experiment
+    runs = sorted(_versions(root))
+    if not runs:
+        raise UsageError(f"Expected a run to resume in {str(root)!r}, got none; start one without --resume.")
+    return Run(runs[-1][1])
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write an object as JSON, all or nothing."""
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
+    return {
+        "seed": config.seed,
+        "compiled": False,
+        "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
+        "lyapnet": lyapnet.__version__,
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "lightning": L.__version__,
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """The commit of lyapnet's own source tree, where it is one."""
+    try:
+        here = Path(__file__).parent
+        git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return git.stdout.strip()
+
+
+def _versions(root: Path) -> list[tuple[int, Path]]:
+    numbered = [(path.name.removeprefix("version_"), path) for path in root.glob("version_*")]
+    return [(int(number), path) for number, path in numbered if number.isdigit()]

@@ -49,7 +49,8 @@ def build_task(config: Config, system: ControlAffineSystem | None = None) -> Tas
         # in float64 for the checks below, and a copy: the caller's system keeps its precision
         system = build_system(config.system) if system is None else copy.deepcopy(system).double()
         with _section("initial_states"):
-            initial_states = Box(config.initial_states.lower, config.initial_states.upper)
+            bounds = (config.initial_states.lower, config.initial_states.upper)
+            initial_states = Box(*(_repeated(bound, system.n) for bound in bounds))
             _require_length("initial_states.lower", initial_states.dimension, system)
         check_system(system, initial_states.sample(3, torch.Generator().manual_seed(0)))
         with _section("cost"):
@@ -131,7 +132,7 @@ def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost
     else:
         R = _rows("R", R)
         _require_length("cost.R", len(R), system, system.m)
-    cost = QuadraticCost(_rows("Q", config.Q), R, _rows("Q_T", config.Q_T))
+    cost = QuadraticCost(_rows("Q", _repeated(config.Q, system.n)), R, _rows("Q_T", _repeated(config.Q_T, system.n)))
     _require_length("cost.Q", len(cost.Q), system)
     return cost
 
@@ -224,7 +225,8 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
 
 def _scaling(config: Config, task: Task) -> Scaling:
     extent = task.initial_states.magnitude.double()
-    scale = config.network.state_scale or [v if v > 0 else 1.0 for v in extent.tolist()]
+    given = _repeated(config.network.state_scale, task.system.n)
+    scale = given or [v if v > 0 else 1.0 for v in extent.tolist()]
     _require_length("network.state_scale", len(scale), task.system)
     value = config.network.value_scale
     if value is None:
@@ -240,6 +242,12 @@ def _rows(name: str, matrix: Any) -> Any:
     if isinstance(matrix, list | tuple) and all(isinstance(v, int | float) for v in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix
+
+
+def _repeated(entries: Any, n: int) -> Any:
+    """A list of one number as the number of every state; anything else as it is."""
+    alone = isinstance(entries, list | tuple) and len(entries) == 1 and isinstance(entries[0], int | float)
+    return [*entries] * n if alone else entries
 
 
 def _require_length(key: str, length: int, system: ControlAffineSystem, expected: int | None = None) -> None:

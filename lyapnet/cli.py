@@ -1,4 +1,4 @@
-"""The command line: lyapnet train | evaluate | bench | systems."""
+"""The command line: lyapnet train | evaluate | sweep | bench | systems."""
 
 import json
 import sys
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Column, Table
 
@@ -88,6 +89,47 @@ def evaluate(
         print(json.dumps(result))
     else:
         Console(highlight=False).print(_table(str(checkpoint), result))
+
+
+@app.command()
+def sweep(
+    overrides: Annotated[list[str] | None, typer.Argument(help="Changes to every config, as key.sub=value.")] = None,
+    config: Annotated[list[Path] | None, typer.Option(help="An experiment, a YAML file; once or more.")] = None,
+    vary: Annotated[str | None, typer.Option(help="A key and its values.", metavar="KEY=VALUE,VALUE,…")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Trainings at a time.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option(help="Write sweep.csv, and sweep.png with --vary, there.", metavar="FOLDER")
+    ] = None,
+    debug: Debug = False,
+) -> None:
+    """Train several configs, or one with several values of a key, and compare.
+
+    What is trained already is taken as it is, and what was stopped goes on:
+    the same command again only fills in what is missing.
+
+    lyapnet sweep --config conf/double_integrator.yaml --vary horizon.steps=100,200,300,400
+    lyapnet sweep --config conf/reacher.yaml --config conf/cartpole_swingup.yaml seeds=5
+    """
+    from lyapnet.sweep import points_of, write_csv
+    from lyapnet.sweep import sweep as run
+
+    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
+    points = points_of(config or [], vary, overrides or [])
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    with notes.status(f"training {len(points)} runs, {workers} at a time"):
+        rows = run(points, workers, partial(notes.print, soft_wrap=True))
+    for name in dict.fromkeys(row.config for row in rows):
+        console.print(_sweep_table(name, [row for row in rows if row.config == name]))
+    if vary:
+        best = min(rows, key=lambda row: row.measures["cost_mean"] or 0)
+        console.print(f"least mean cost: {best.key}={best.value}, {best.checkpoint}", soft_wrap=True)
+    if out is not None:
+        write_csv(rows, out / "sweep.csv")
+        if vary:
+            from lyapnet import figures
+
+            figures.swept(rows).savefig(out / "sweep.png", dpi=150)
 
 
 @app.command()
@@ -237,6 +279,53 @@ def _write_figures(folder: Path, first: Any, rows: list[Any]) -> list[Path]:
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=150)
     return [folder / f"{name}.png" for name in drawn]
+
+
+SWEEP_COLUMNS = {
+    "cost_mean": "cost J",
+    "cost_ratio": "J / J*",
+    "value_error": "value\nerror",
+    "value_to_cost": "V / J",
+    "satisfied_fraction": "condition\nholds",
+    "terminal_error": "‖x(T)‖",
+}
+
+
+def _sweep_table(config: str, rows: list[Any]) -> Table:
+    """A line for each seed of a config's runs, and after several seeds their mean and their worst."""
+    names = [rows[0].key.split(".")[-1]] if rows[0].key else []
+    headings = [*names, "seed", *SWEEP_COLUMNS.values(), "min", "MB"]
+    table = Table(*(Column(heading, justify="right", no_wrap=True) for heading in headings), box=SIMPLE, padding=0)
+    table.title = f"{config}: best checkpoints on unseen states of X₀"
+    table.caption = "min, MB: of a run with all its seeds"
+    for value in dict.fromkeys(row.value for row in rows):
+        chosen, label = [row for row in rows if row.value == value], [value] if names else []
+        took = f"{chosen[0].training_seconds / 60:.1f}", f"{chosen[0].peak_bytes / 1e6:.0f}"
+        for row in chosen:
+            shown = [_measured_or_not(key, row.measures[key]) for key in SWEEP_COLUMNS]
+            table.add_row(*label, str(row.seed), *shown, *took)
+        if len(chosen) > 1:
+            for name, summarise in (("mean", _mean), ("worst", _worst)):
+                columns = ([row.measures[key] for row in chosen] for key in SWEEP_COLUMNS)
+                shown = [summarise(key, values) for key, values in zip(SWEEP_COLUMNS, columns, strict=True)]
+                table.add_row(*label, name, *shown, "", "")
+            table.add_section()
+    return table
+
+
+def _mean(key: str, values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return _measured_or_not(key, sum(known) / len(known) if len(known) == len(values) else None)
+
+
+def _worst(key: str, values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    choose = min if key.endswith("fraction") else max
+    return _measured_or_not(key, choose(known) if len(known) == len(values) else None)
+
+
+def _measured_or_not(key: str, value: float | None) -> str:
+    return "–" if value is None else _measured(key, value)
 
 
 def main(arguments: list[str] | None = None) -> int:

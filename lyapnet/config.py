@@ -68,7 +68,7 @@ class SystemConfig:
 
 @dataclass
 class CostConfig:
-    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal, a list of rows a matrix."""
+    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (of one number: all alike), rows are a matrix."""
 
     Q: Any = option(MISSING, "State weight, symmetric positive semidefinite.")
     R: Any = option(MISSING, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
@@ -77,7 +77,7 @@ class CostConfig:
 
 @dataclass
 class InitialStatesConfig:
-    """X₀, the box of initial states."""
+    """X₀, the box of initial states; a list of one number is the bound of every state."""
 
     lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
     upper: list[float] = option(MISSING, "Upper bounds, one for each state.")

@@ -3,11 +3,14 @@
 import difflib
 import inspect
 import logging
+import resource
 import shlex
 import statistics
+import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +111,7 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(f"[bold]{config.experiment}[/]  {run.folder}", soft_wrap=True)
+    started = time.perf_counter()
     try:
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
         trainer.fit(module, _data(module), ckpt_path=plan.resume_from, weights_only=True)
@@ -117,9 +121,19 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
     except DivergenceError as error:
         kept = f" Kept: {run.last}." if run.last.exists() else ""
         raise DivergenceError(f"{error}{kept}") from error
+    finally:
+        if trainer.is_global_zero:
+            _note_what_it_took(run, time.perf_counter() - started)
     if not trainer.is_global_zero:
         return {}
     return _finish(trainer, plan)
+
+
+def _note_what_it_took(run: Run, seconds: float) -> None:
+    """Add this process's share to the run's record."""
+    record, peak = run.record(), 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # Linux counts in KiB
+    total = record.get("training_seconds", 0.0) + seconds
+    run.note(training_seconds=round(total, 2), peak_bytes=max(record.get("peak_bytes", 0), peak))
 
 
 def _start_from(module: TrainedModule, checkpoint: Path | None) -> TrainedModule:
@@ -228,7 +242,7 @@ def _compilation(plan: Plan, console: Console) -> list[Compilation]:
     if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
         return []
     wanted = goes_on or options.compile == "on" or _earns_compilation(plan.config)
-    return [Compilation(console, plan.config.training.batch_size, wanted, plan.run.record_compilation)]
+    return [Compilation(console, plan.config.training.batch_size, wanted, partial(plan.run.note, compiled=True))]
 
 
 def _earns_compilation(config: Config) -> bool:

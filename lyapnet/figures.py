@@ -1,6 +1,9 @@
 """Tables drawn as matplotlib figures: what a controller does, and where its condition holds."""
 
+import math
+from collections import defaultdict
 from collections.abc import Sequence
+from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
@@ -17,12 +20,14 @@ from lyapnet.bench import Accuracy, Row
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.sets import Box
+from lyapnet.sweep import Row as SweptRow
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import State, Value
 
 # Okabe and Ito's colours, which colour-blind readers can tell apart.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
 SKY, PURPLE = "#56B4E9", "#CC79A7"
+CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 
 ROUTE_STYLES = {  # of lyapnet.bench
     "rollout": (GREY, "o"), "adjoint": (ORANGE, "s"), "adjoint-autograd": (VERMILION, "D"), "backprop": (GREEN, "^"),
@@ -266,6 +271,54 @@ def gradient_error(points: Sequence[Accuracy], title: str) -> Figure:
     figure.suptitle(title, fontsize=9)
     _legend_below(figure, panels[1])
     return figure
+
+
+SWEPT = {  # of a sweep's row ↦ the axis that shows it
+    "cost_mean": "mean cost J",
+    "cost_ratio": "cost / optimum",
+    "value_error": "value error",
+    "constraint_loss": "constraint loss",
+    "training_seconds": "training (s)",
+    "peak_bytes": "peak memory (MB)",
+}
+
+
+def swept(rows: Sequence[SweptRow]) -> Figure:
+    """What runs reach and take against the key that was varied: a point for each seed, a line through the means."""
+    columns = {label: [_swept_number(row, name) for row in rows] for name, label in SWEPT.items()}
+    known = {label: [number for number in column if number is not None] for label, column in columns.items()}
+    shown = {label: numbers for label, numbers in known.items() if len(numbers) == len(rows)}
+    figure = Figure(figsize=(9, 2.6 * math.ceil(len(shown) / 3)), layout="constrained")
+    panels = figure.subplots(math.ceil(len(shown) / 3), 3, squeeze=False).flatten()
+    for panel, (label, column) in zip(panels, shown.items(), strict=False):
+        for config, color in zip(dict.fromkeys(row.config for row in rows), CYCLE, strict=False):
+            seeds = defaultdict(list)
+            for row, number in zip(rows, column, strict=True):
+                if row.config == config:
+                    seeds[float(row.value or "nan")].append(number)
+            for value, numbers in seeds.items():
+                panel.plot([value] * len(numbers), numbers, "o", color=color, markersize=3, alpha=0.6)
+            panel.plot([*seeds], [fmean(numbers) for numbers in seeds.values()], color=color, label=config)
+        if max(column) > 10 * min(column) > 0:
+            panel.set_yscale("log")
+        elif label != SWEPT["cost_ratio"]:
+            panel.set_ylim(bottom=0)
+        panel.set_ylabel(label, fontsize=8)
+        panel.set_xlabel(rows[0].key or "", fontsize=8)
+        panel.set_xticks(sorted({float(row.value or "nan") for row in rows}))
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        panel.tick_params(labelsize=8)
+        panel.grid(color=GREY, alpha=0.25, linewidth=0.5)
+    for panel in panels[len(shown) :]:
+        panel.set_axis_off()
+    _legend_below(figure, panels[0])
+    return figure
+
+
+def _swept_number(row: SweptRow, name: str) -> float | None:
+    if name == "peak_bytes":
+        return row.peak_bytes / 1e6
+    return row.measures[name] if name in row.measures else getattr(row, name)
 
 
 def _draw_routes(axes: Axes, rows: Sequence[Row], x: str, y: str) -> None:

@@ -6,10 +6,10 @@ import platform
 import subprocess
 import tempfile
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import torch
 
 import lyapnet
@@ -52,20 +52,21 @@ class Run:
     @property
     def finetuned_from(self) -> Path | None:
         """The checkpoint whose weights the run started from."""
-        origin = self._provenance()["finetuned_from"]
+        origin = self.record()["finetuned_from"]
         return Path(origin) if origin else None
 
     @property
     def compiled(self) -> bool:
         """Whether the run is compiled, as it then goes on: machine code rounds differently."""
-        return self._provenance().get("compiled", False)
+        return self.record().get("compiled", False)
 
-    def record_compilation(self) -> None:
-        """Note that the run is compiled."""
-        write_json(self.folder / PROVENANCE, {**self._provenance(), "compiled": True})
-
-    def _provenance(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
+        """What made the run, and what it took."""
         return json.loads((self.folder / PROVENANCE).read_text(encoding="utf-8"))
+
+    def note(self, **facts: Any) -> None:
+        """Add to the record, or replace in it."""
+        write_json(self.folder / PROVENANCE, {**self.record(), **facts})
 
     @property
     def finished(self) -> bool:
@@ -83,8 +84,8 @@ def new_run(config: Config, finetuned_from: Path | None) -> Run:
         draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
         draft.chmod(0o755)
         write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
-        version = max((number for number, _ in _versions(root)), default=-1) + 1
-        return Run(draft.rename(root / f"version_{version}"))
+        newest = max((number for number, _ in _versions(root)), default=-1)
+        return Run(draft.rename(root / f"version_{newest + 1}"))
     except OSError as error:
         raise LyapnetError(
             f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
@@ -113,11 +114,13 @@ def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
     return {
         "seed": config.seed,
         "compiled": False,
+        "training_seconds": 0.0,  # of the processes that came to an end, kill -9 aside
+        "peak_bytes": 0,  # of memory, in the process that held most
         "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
         "lyapnet": lyapnet.__version__,
         "python": platform.python_version(),
         "torch": torch.__version__,
-        "lightning": L.__version__,
+        "lightning": version("lightning"),
         "commit": _commit(),
     }
 

@@ -199,12 +199,12 @@ WRONG_SHAPE = {
     "cost.Q=[1, 1, 1]": ("cost", "Q", "3"),
     "cost.Q=[[1, 2], [3]]": ("cost", "Q", "[3]"),
     "cost.Q=[]": ("cost", "Q"),
-    "cost.Q_T=[1]": ("cost", "Q_T", "1"),
+    "cost.Q_T=[1,2,3]": ("cost", "Q_T", "3"),
     "cost.R=[1, 1]": ("cost.R", "1", "force", "2"),
     "cost.R=[[1, 0]]": ("cost", "R", "square"),
-    "initial_states.lower=[-1]": ("initial_states", "lower", "upper", "(1,)", "(2,)"),
-    "initial_states={lower: [-1], upper: [1]}": ("initial_states", "position, velocity", "1"),
-    "network.state_scale=[1]": ("network.state_scale", "position, velocity", "1"),
+    "initial_states.lower=[-1,-1,-1]": ("initial_states", "lower", "upper", "(3,)", "(2,)"),
+    "initial_states={lower: [-1,-1,-1], upper: [1,1,1]}": ("initial_states", "position, velocity", "3"),
+    "network.state_scale=[1,2,3]": ("network.state_scale", "position, velocity", "3"),
     "system={name: linear, parameters: {A: [[1, 2]], B: [[1]]}}": ("system.parameters", "A", "(1, 2)"),
 }
 IMPOSSIBLE = {
@@ -371,8 +371,36 @@ TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width o
 }  # fmt: skip
 
 
+PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
+
+
 def test_every_shipped_config_is_a_task_of_the_sheet():
-    assert {path.stem for path in CONF.glob("*.yaml")} == set(TASKS)
+    assert {path.stem for path in CONF.glob("*.yaml")} == {*TASKS, "integrator_chain"}
+    assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(PAPER)
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_papers_literal_program_has_the_task_of_ours(name):
+    """And its loss: the mean sum, without normalisation, margin or a cost term."""
+    ours, literal = load_config(CONF / f"{name}.yaml"), load_config(CONF / "paper" / f"{name}.yaml")
+    for section in ("system", "cost", "initial_states", "horizon"):
+        assert to_plain(literal)[section] == to_plain(ours)[section]
+    program = literal.program
+    assert program.name == ours.program.name
+    assert (program.constraint, program.trajectory_cost, program.normalise) == (1, 0, False)
+    assert (literal.training.batch_size, literal.rollout.gradient) == (12, "adjoint")
+    assert literal.network.hidden == {"cartpole_balancing": [200, 500], "double_integrator": [64, 64]}.get(
+        name, [128, 128]
+    )
+
+
+def test_one_number_stands_for_every_state():
+    config = load_config(CONF / "integrator_chain.yaml", ["system.parameters.length=3", "network.state_scale=[2]"])
+    task, V, _, _ = objects(config)
+    assert_close(task.cost.Q, torch.eye(3, dtype=torch.float64))
+    assert_close(task.initial_states.widths, torch.full((3,), 2.0, dtype=torch.float64))
+    assert_close(V.inputs.state_scale, torch.full((3,), 2.0, dtype=torch.float64))
+    assert_close(task.system.f(torch.tensor([1.0, 2.0, 3.0])), torch.tensor([2.0, 3.0, 0.0]).double())
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -397,9 +425,10 @@ def test_shipped_config_is_its_task(name):
     assert rollout.method == "euler"
 
 
-@pytest.mark.parametrize("path", list(CONF.glob("*.yaml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", list(CONF.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONF)))
 def test_first_line_of_a_shipped_config_runs_it(path):
-    assert path.read_text().splitlines()[0] == f"# python train.py --config conf/{path.name}"
+    command = f"# python train.py --config conf/{path.relative_to(CONF)}"
+    assert path.read_text().splitlines()[0].startswith(command)
 
 
 # The user's own classes

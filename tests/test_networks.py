@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from lyapnet.calculus import gradients, state_gradient, value_and_state_gradient
 from lyapnet.cost import QuadraticCost
-from lyapnet.networks import ACTIVATIONS, FCN, ICNN, NETWORKS, PartiallyConvexNetwork, Scaling
+from lyapnet.networks import ACTIVATIONS, FCN, ICNN, NETWORKS, PartiallyConvexNetwork, QuadraticForm, Scaling
 from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
 
 T = 2.0
@@ -306,3 +306,28 @@ def test_embedded_angles_keep_a_turn_apart():
     with torch.no_grad():
         V.hidden[0].weight[:, 1 + 1] = 0  # the column of the raw angle, after that of time
     assert_close(V(t, turned), V(t, x))
+
+
+# The quadratic form
+
+
+def quadratic_form(epsilon=1e-3):
+    return QuadraticForm(SCALING, (8,), epsilon=epsilon)
+
+
+def test_a_quadratic_form_is_a_lyapunov_candidate_for_any_weights():
+    V, t, x = quadratic_form(), T * torch.rand(50), 3 * torch.randn(50, 3)
+    for p in V.parameters():
+        p.data.normal_()
+    value, slope = value_and_state_gradient(V, t, torch.zeros(50, 3))
+    assert value.abs().max() == slope.abs().max() == 0
+    assert (V(t, x) >= 1e-3 * (x**2).sum(-1)).all()
+    assert_close(V(t, 2 * x), 4 * V(t, x))
+    assert not torch.allclose(FCN(**SMALL)(t, 2 * x), 4 * FCN(**SMALL)(t, x)), "a network that is no quadratic form"
+
+
+def test_a_quadratic_form_starts_near_a_multiple_of_the_scaled_norm():
+    V, x = quadratic_form(epsilon=1e-9), torch.randn(20, 3)
+    ratio = V(torch.tensor(0.5), x) / (SCALING.value / 3 * ((x / torch.tensor(SCALING.state)) ** 2).sum(-1))
+    assert (ratio > 0.3).all()
+    assert (ratio < 3).all()

@@ -40,7 +40,11 @@ def train(arguments: list[str]) -> int:
 
 
 def brief(arguments: list[str]) -> list[str]:
-    """A benchmark of few states and steps; any other command as it is."""
+    """A benchmark of few states and steps, a sweep over one value; any other command as it is."""
+    if arguments[0] == "sweep":
+        key, _, values = arguments[arguments.index("--vary") + 1].partition("=")
+        value = "8" if key == "horizon.steps" else values.split(",")[0]
+        return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]
     if arguments[0] != "bench":
         return arguments
     at = arguments.index("--batch") if "--batch" in arguments else len(arguments)

@@ -79,14 +79,12 @@ def _chain(length: str) -> dict[str, Any]:
     """ẋ_i = x_{i+1}, ẋ_N = u on the double integrator's horizon, as a config."""
     if not (length.isdecimal() and int(length) > 0):
         raise UsageError(f"Expected {CHAIN}N with N ≥ 1 integrators, got {CHAIN}{length}; for example {CHAIN}8.")
-    n = int(length)
-    shift = [[float(j == i + 1) for j in range(n)] for i in range(n)]
     return {
-        "experiment": f"chain_{n}",
+        "experiment": f"chain_{length}",
         "program": {"name": "value", "terminal": 1.0, "trajectory_cost": 1.0},
-        "system": {"name": "linear", "parameters": {"A": shift, "B": [[float(i == n - 1)] for i in range(n)]}},
-        "cost": {"Q": [1.0] * n, "R": [[1.0]], "Q_T": [1.0] * n},
-        "initial_states": {"lower": [-1.0] * n, "upper": [1.0] * n},
+        "system": {"name": "integrator_chain", "parameters": {"length": int(length)}},
+        "cost": {"Q": [1.0], "R": [[1.0]], "Q_T": [1.0]},
+        "initial_states": {"lower": [-1.0], "upper": [1.0]},
         "horizon": {"steps": 400, "dt": 0.01},
         "network": {"name": "fcn", "hidden": [64, 64]},
     }

@@ -9,11 +9,13 @@ from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAncho
 from lyapnet.networks.base import ACTIVATIONS, Scaling
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
+from lyapnet.networks.quadratic import QuadraticForm
 
 NETWORKS: dict[str, type[nn.Module]] = {
     "fcn": FCN,
     "icnn": ICNN,
     "anchored": AnchoredNetwork,
+    "quadratic": QuadraticForm,
 }
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "AnchoredNetwork",
     "GoalAnchor",
     "PartiallyConvexNetwork",
+    "QuadraticForm",
     "Scaling",
     "TerminalAnchor",
 ]

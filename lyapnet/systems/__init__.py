@@ -2,14 +2,24 @@
 
 from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
 from lyapnet.systems.cartpole import Cartpole
-from lyapnet.systems.linear import DoubleIntegrator, Linear
+from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear
 from lyapnet.systems.reacher import Reacher
 
 SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "double_integrator": DoubleIntegrator,
+    "integrator_chain": IntegratorChain,
     "linear": Linear,
     "cartpole": Cartpole,
     "reacher": Reacher,
 }
 
-__all__ = ["SYSTEMS", "Cartpole", "ControlAffineSystem", "DoubleIntegrator", "Linear", "MechanicalSystem", "Reacher"]
+__all__ = [
+    "SYSTEMS",
+    "Cartpole",
+    "ControlAffineSystem",
+    "DoubleIntegrator",
+    "IntegratorChain",
+    "Linear",
+    "MechanicalSystem",
+    "Reacher",
+]

@@ -1,4 +1,4 @@
-"""Linear systems, and the double integrator."""
+"""Linear systems, the double integrator and its longer kin."""
 
 from collections.abc import Sequence
 
@@ -71,6 +71,20 @@ class DoubleIntegrator(Linear):
     def inverse_mass(self, x: State) -> ControlMatrix:
         """1/m: the control weight R of the reference task."""
         return torch.full((*x.shape[:-1], 1, 1), 1.0 / self.mass).to(x)
+
+
+class IntegratorChain(Linear):
+    """ẋ_i = x_{i+1} for i < n, ẋ_n = u: n integrators in a row, with one input at the end.
+
+    Args:
+        length: n.
+    """
+
+    def __init__(self, length: int = 4):
+        if length < 1:
+            raise ValueError(f"Expected length ≥ 1, got {length}; a chain has at least one integrator.")
+        shift = [[float(j == i + 1) for j in range(length)] for i in range(length)]
+        super().__init__(shift, [[float(i == length - 1)] for i in range(length)])
 
 
 def _matrix(name: str, rows: Sequence[Sequence[float]] | Tensor) -> Tensor:

@@ -1,0 +1,143 @@
+"""Several runs of one or more configs, one key varied, side by side: each in a process of its own, none twice."""
+
+import csv
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from lyapnet.config import Config, differing_keys, load_config
+from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.run import CONFIG, EVALUATION, Run, last_run
+
+MEASURES = (
+    "cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "value_to_cost", "constraint_loss",
+    "satisfied_fraction", "decreasing_fraction", "terminal_error",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run of a sweep: a config with a value of the key that is varied."""
+
+    path: Path
+    overrides: Sequence[str]
+    key: str | None = None
+    value: str | None = None
+
+    @property
+    def settings(self) -> list[str]:
+        """All overrides; the experiment's name tells the value, so that its runs have a folder of their own."""
+        if self.key is None:
+            return [*self.overrides]
+        varied = [*self.overrides, f"{self.key}={self.value}"]
+        name = load_config(self.path, varied).experiment
+        return [*varied, f"experiment={name}/{self.key}={self.value}"]
+
+    @property
+    def config(self) -> Config:
+        """The resolved config."""
+        return load_config(self.path, self.settings)
+
+    def run(self) -> Run | None:
+        """The newest run of this very config, finished or not."""
+        config = self.config
+        try:
+            run = last_run(config)
+            stored = load_config(run.folder / CONFIG)
+        except UsageError:  # none yet, or stopped before it wrote its config
+            return None
+        changed = [key for key in differing_keys(config, stored) if not key.startswith("logs")]
+        return None if changed else run
+
+    def train(self) -> Run:
+        """Train it to its end, from where a stopped run was; a finished one is taken as it is.
+
+        Raises:
+            LyapnetError: the training fails; with its last words.
+        """
+        run = self.run()
+        if run is not None and run.finished:
+            return run
+        command = [sys.executable, "-m", "lyapnet", "train", "--config", str(self.path), *self.settings]
+        ended = subprocess.run([*command, *(["--resume", "last"] if run else [])], capture_output=True, text=True)
+        run = self.run()
+        if ended.returncode or run is None or not run.finished:
+            words = (ended.stderr.strip() or ended.stdout.strip()).splitlines()
+            raise LyapnetError(f"{self.path} {' '.join(self.settings)}: {words[-1] if words else 'stopped'}")
+        return run
+
+
+@dataclass(frozen=True)
+class Row:
+    """One seed of one run, as the table of a sweep has it."""
+
+    config: str  # the experiment's name without the value
+    key: str | None
+    value: str | None
+    seed: int
+    measures: dict[str, float | None]  # of MEASURES, as `lyapnet evaluate` has them
+    training_seconds: float  # of the run, all its seeds together
+    peak_bytes: int  # likewise, of its process
+    checkpoint: Path
+
+
+def points_of(configs: Sequence[Path], vary: str | None, overrides: Sequence[str]) -> list[Point]:
+    """The runs that a sweep consists of.
+
+    Raises:
+        UsageError: `vary` is not key=value,value,…; or one of the configs does not hold.
+    """
+    key, _, values = (vary or "").partition("=")
+    if vary is not None and not (key and values):
+        raise UsageError(f"Expected --vary key=value,value,…, got {vary!r}; for example horizon.steps=100,200,400.")
+    if not configs:
+        raise UsageError("Expected --config PATH at least once, got none; for example conf/double_integrator.yaml.")
+    varied = [(key, value.strip()) for value in values.split(",")] if vary else [(None, None)]
+    points = [Point(path, overrides, *one) for path in configs for one in varied]
+    for point in points:
+        load_config(point.path, point.settings)  # all of them are refused before any is trained
+    return points
+
+
+def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any]) -> list[Row]:
+    """Train what is not trained yet, `workers` at a time; a row for each seed of each run.
+
+    Raises:
+        LyapnetError: of the first training that fails, when all others have ended.
+    """
+
+    def train(point: Point) -> Run:
+        run = point.train()
+        say(f"{point.config.experiment}: {run.folder}")
+        return run
+
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(train, point) for point in points]
+    return [row for point, future in zip(points, futures, strict=True) for row in rows_of(point, future.result())]
+
+
+def rows_of(point: Point, run: Run) -> Iterator[Row]:
+    """A finished run's rows."""
+    config, name = point.config, load_config(point.path, point.overrides).experiment
+    result = json.loads((run.folder / EVALUATION).read_text(encoding="utf-8"))
+    record = run.record()
+    for one, member in zip(result.get("seeds", [result]), run.members(config), strict=True):
+        measures = {key: one[key] for key in MEASURES}
+        seconds, peak = record["training_seconds"], record["peak_bytes"]
+        yield Row(name, point.key, point.value, one["seed"], measures, seconds, peak, member.best)
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """The rows as comma-separated values."""
+    names = [field.name for field in fields(Row) if field.name != "measures"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*names, *MEASURES])
+        for row in rows:
+            content = asdict(row)
+            writer.writerow([*(content[name] for name in names), *(row.measures[key] for key in MEASURES)])

@@ -1,0 +1,125 @@
+"""Sweeps: each run once, in a process of its own; what is missing is filled in; what is shown is what was run."""
+
+import csv
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from lyapnet import figures, sweep
+from lyapnet.cli import main
+from lyapnet.errors import LyapnetError, UsageError
+
+CONF = Path(__file__).parents[1] / "conf"
+CHAIN = CONF / "integrator_chain.yaml"
+SMALL = [
+    "horizon.steps=5", "network.hidden=[4]", "training.iterations=2", "training.batch_size=3", "rollout.compile=off",
+    "evaluation.validation_states=2", "evaluation.test_states=4", "seeds=2",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A sweep over two lengths: its folder, and what it was asked."""
+    folder = tmp_path_factory.mktemp("sweep")
+    arguments = ["sweep", "--config", str(CHAIN), "--vary", "system.parameters.length=2,3", "--workers", "2"]
+    arguments += ["--out", str(folder / "out"), f"logs={folder / 'logs'}", *SMALL]
+    assert main(arguments) == 0
+    return folder, arguments
+
+
+@pytest.fixture
+def commands(monkeypatch):
+    """The trainings that are asked for, of which none takes place."""
+    asked = []
+
+    def run(command, **options):
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 1, "", "one line\nerror: the last words\n")
+
+    monkeypatch.setattr(subprocess, "run", run)
+    return asked
+
+
+def points(folder, *overrides, vary="system.parameters.length=2,3"):
+    return sweep.points_of([CHAIN], vary, [f"logs={folder / 'logs'}", *SMALL, *overrides])
+
+
+def test_each_seed_of_each_value_is_a_row(swept):
+    folder, _ = swept
+    with (folder / "out" / "sweep.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["value"], row["seed"]) for row in rows] == [("2", "0"), ("2", "1"), ("3", "0"), ("3", "1")]
+    stored = folder / "logs" / "integrator_chain" / "system.parameters.length=3" / "version_0" / "evaluation.json"
+    first, second = json.loads(stored.read_text())["seeds"]
+    assert [float(row["cost_mean"]) for row in rows[2:]] == [first["cost_mean"], second["cost_mean"]]
+    assert first["cost_mean"] != second["cost_mean"]
+    assert all(float(row["training_seconds"]) > 0 and int(row["peak_bytes"]) > 1e8 for row in rows)
+    assert all(Path(row["checkpoint"]).is_file() for row in rows)
+
+
+def test_finished_runs_are_not_run_again(swept, commands, capsys):
+    _, arguments = swept
+    assert main(arguments) == 0
+    assert not commands
+    shown = capsys.readouterr().out
+    assert "integrator_chain: best checkpoints" in shown
+    assert shown.count("worst") == 2
+    assert "least mean cost: system.parameters.length=2" in shown
+    assert main([*arguments, "training.iterations=3"]) == 1, "another config is another run"
+    assert len(commands) == 2
+
+
+def test_a_stopped_run_goes_on(swept, commands):
+    folder, _ = swept
+    point = points(folder)[0]
+    finished = point.run().folder / "evaluation.json"
+    content = finished.read_text()
+    finished.unlink()
+    try:
+        with pytest.raises(LyapnetError, match="the last words"):
+            point.train()
+    finally:
+        finished.write_text(content)
+    assert commands[0][-2:] == ["--resume", "last"]
+    with pytest.raises(LyapnetError, match=r"length=5.*the last words"):
+        points(folder, vary="system.parameters.length=5")[0].train()
+    assert "--resume" not in commands[1]
+
+
+def test_without_a_key_the_configs_keep_their_own_folders(tmp_path):
+    point, other = sweep.points_of([CHAIN, CONF / "double_integrator.yaml"], None, [f"logs={tmp_path}"])
+    assert (point.config.experiment, other.config.experiment) == ("integrator_chain", "double_integrator")
+    assert point.run() is None
+
+
+@pytest.mark.parametrize(
+    ("configs", "vary", "named"),
+    [
+        ([CHAIN], "horizon.steps", "key=value,value"),
+        ([CHAIN], "=3", "key=value,value"),
+        ([CHAIN], "horizon.stepz=3", "horizon.steps?"),
+        ([CHAIN], "horizon.steps=3,0", "horizon.steps ≥ 1"),
+        ([], None, "--config PATH"),
+    ],
+)
+def test_what_cannot_be_swept_is_refused_before_anything_is_trained(configs, vary, named, commands):
+    with pytest.raises(UsageError, match=named.replace("?", r"\?")):
+        sweep.points_of(configs, vary, [])
+    assert not commands
+
+
+def test_figure_shows_every_seed_and_every_measure(swept):
+    folder, _ = swept
+    rows = [row for point in points(folder) for row in sweep.rows_of(point, point.run())]
+    figure = figures.swept(rows)
+    panel = figure.axes[0]
+    assert panel.get_xlabel() == "system.parameters.length"
+    assert {axes.get_ylabel() for axes in figure.axes} >= {"mean cost J", "cost / optimum", "peak memory (MB)"}
+    *points_drawn, line = panel.lines
+    assert sorted(y for drawn in points_drawn for y in drawn.get_ydata()) == sorted(
+        row.measures["cost_mean"] for row in rows
+    )
+    two = [row.measures["cost_mean"] for row in rows if row.value == "2"]
+    assert line.get_ydata()[0] == pytest.approx(sum(two) / 2)

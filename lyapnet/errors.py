@@ -25,6 +25,10 @@ class CompilationError(LyapnetError):
     """A closed loop cannot be compiled; it runs without."""
 
 
+class OracleError(LyapnetError):
+    """There is no ground truth for a task; what is measured without it can still be reported."""
+
+
 class Interrupted(LyapnetError):
     """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
 

@@ -1,6 +1,6 @@
 """Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,18 +13,24 @@ from torch.fx.experimental.proxy_tensor import make_fx
 Tensors = tuple[Tensor, ...]
 
 
-def trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
+def trace(
+    function: Callable[..., Tensors], arguments: Sequence[Tensor], decompositions: Mapping[Any, Any] | None = None
+) -> GraphModule:
     """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
 
     No Python of the function is left, nothing is computed twice, and nothing records a graph: run it under no_grad.
     The function must be one of its arguments alone; whatever else it reads is frozen as it is now.
 
+    Args:
+        decompositions: operator ↦ the same in simpler operators, for a reader that knows only those.
+
     Raises:
         Exception: of any kind, where the function's course depends on the values of its arguments.
     """
-    graph_module = make_fx(function, _allow_non_fake_inputs=True)(*arguments)
+    options = {"decomposition_table": decompositions, "_allow_non_fake_inputs": True}
+    graph_module = make_fx(function, **options)(*arguments)
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
-        graph_module = make_fx(functionalize(graph_module), _allow_non_fake_inputs=True)(*arguments)
+        graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
         raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
     for node in list(graph_module.graph.nodes):
@@ -96,11 +102,11 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
         node
         for node in nodes
         if node.op in ("placeholder", "get_attr")
-        or (node.op == "call_function" and (_is_view(node.target) or _name(node.target) in cheap))
+        or (node.op == "call_function" and (is_view(node.target) or name_of(node.target) in cheap))
     }
 
 
-def _name(target: Any) -> str:
+def name_of(target: Any) -> str:
     return getattr(target, "__name__", "").split(".")[0]
 
 
@@ -116,7 +122,7 @@ def _mutates(node: Node) -> bool:
     return schema is not None and schema.is_mutable
 
 
-def _is_view(target: Any) -> bool:
+def is_view(target: Any) -> bool:
     schema = getattr(target, "_schema", None)
     return schema is not None and any(result.alias_info is not None for result in schema.returns)
 

@@ -107,6 +107,7 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
 
 
 def name_of(target: Any) -> str:
+    """An operator's name without its overload."""
     return getattr(target, "__name__", "").split(".")[0]
 
 
@@ -123,6 +124,7 @@ def _mutates(node: Node) -> bool:
 
 
 def is_view(target: Any) -> bool:
+    """Whether an operator's result shares its argument's memory."""
     schema = getattr(target, "_schema", None)
     return schema is not None and any(result.alias_info is not None for result in schema.returns)
 

@@ -4,7 +4,7 @@ import importlib.util
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import OracleError
-from lyapnet.oracles.base import Optima, Oracle, Progress, silent
+from lyapnet.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.oracles.riccati import RiccatiOracle, RiccatiSolution, continuous_riccati, discrete_riccati
 from lyapnet.rollout import Horizon
 from lyapnet.systems import ControlAffineSystem, Linear
@@ -12,7 +12,7 @@ from lyapnet.systems import ControlAffineSystem, Linear
 __all__ = [
     "Optima",
     "Oracle",
-    "Progress",
+    "Report",
     "RiccatiSolution",
     "continuous_riccati",
     "discrete_riccati",
@@ -42,7 +42,9 @@ def oracle_of(system: ControlAffineSystem, cost: QuadraticCost, horizon: Horizon
             "Euler's steps."
         )
     if importlib.util.find_spec("casadi") is None:
-        raise OracleError("Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'.")
+        raise OracleError(
+            "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."
+        )
     from lyapnet.oracles.transcription import Transcription  # needs the extra
 
     return Transcription(system, cost, horizon)

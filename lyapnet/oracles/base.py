@@ -8,7 +8,7 @@ import torch
 
 from lyapnet.types import ControlPath, PerState, State
 
-Progress = Callable[[int, int], None]  # (initial states done, of how many)
+Report = Callable[[int, int], None]  # (initial states done, of how many)
 
 
 def silent(done: int, total: int) -> None:
@@ -39,7 +39,7 @@ class Oracle(ABC):
     """x₀ ↦ J*(x₀), the least cost, in the dtype and on the device of x₀."""
 
     @abstractmethod
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Progress = silent) -> Optima:
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
         """The optima of a batch (b, n).
 
         Args:

@@ -17,8 +17,6 @@ from lyapnet.atomic import write_atomically
 from lyapnet.compilation import cache_folder, constants_of
 from lyapnet.types import Control
 
-ENTRY = "u"
-
 
 class OptimaCache:
     """(task, x₀) ↦ the best controls found so far, (N, m).
@@ -36,8 +34,8 @@ class OptimaCache:
         """The controls kept for a state (n,)."""
         try:
             # the archive's checksums tell a damaged file
-            with np.load(self._file(x0), allow_pickle=False) as entries:
-                u = torch.from_numpy(entries[ENTRY])
+            with np.load(io.BytesIO(self._file(x0).read_bytes()), allow_pickle=False) as entries:
+                u = torch.from_numpy(entries["u"])
         except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile):
             return None
         fits = u.dtype == torch.float64 and u.shape == self.shape and bool(torch.isfinite(u).all())
@@ -46,7 +44,7 @@ class OptimaCache:
     def write(self, x0: Tensor, u: Control) -> None:
         """Keep the controls of a state (n,), in place of what was kept."""
         content = io.BytesIO()
-        np.savez(content, **{ENTRY: u.numpy()})
+        np.savez(content, u=u.numpy())
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             with tempfile.TemporaryDirectory(dir=self.folder, prefix=".new_") as draft:  # of this process alone

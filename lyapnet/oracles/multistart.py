@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lyapnet.oracles.base import Progress
+from lyapnet.oracles.base import Report
 
 NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
 SAME = 1e-6  # relative difference of two costs that are the same
@@ -48,7 +48,7 @@ class MultiStart:
         self.x0, self.best, self.minimise = x0, list(best), minimise
         self.reasons = [""] * len(x0)  # of the last start that led nowhere
 
-    def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Progress) -> None:
+    def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
         """Try the starts of some states, given by their indices, then what that found from the states around."""
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
@@ -68,7 +68,9 @@ class MultiStart:
 
     def _try(self, i: int, start: Candidate | None) -> bool:
         """Whether a start improves a state's best."""
-        end = "no start" if start is None else self.minimise(self.x0[i], start)
+        if start is None:
+            return False
+        end = self.minimise(self.x0[i], start)
         if isinstance(end, str):
             self.reasons[i] = end
             return False

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
-from lyapnet.oracles.base import Optima, Oracle, Progress, silent
+from lyapnet.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.rollout import Horizon
 from lyapnet.systems import Linear
 from lyapnet.types import Control, ControlPath, PerState, State
@@ -46,7 +46,7 @@ class RiccatiOracle(Oracle):
     def __init__(self, solution: RiccatiSolution):
         self.solution = solution
 
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Progress = silent) -> Optima:
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
         return Optima(self.solution.value(0, x0), [""] * len(x0))
 
 

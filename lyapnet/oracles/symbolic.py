@@ -11,12 +11,16 @@ import casadi
 import numpy as np
 import torch
 from torch import Tensor
-from torch._decomp import core_aten_decompositions
+from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lyapnet.errors import OracleError
 from lyapnet.tracing import Tensors, is_view, name_of, trace
+
+# torch counts them among its core, but has them in simpler operators too
+aten = torch.ops.aten
+NOT_CORE = [aten.addmm, aten.elu, aten.gelu, aten.hardtanh, aten.leaky_relu]
 
 Symbols = np.ndarray  # of dtype object: its entries are scalar casadi.SX
 
@@ -29,7 +33,8 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
     """
     try:
         with torch.no_grad():
-            return trace(lambda *a: function(*a), arguments, core_aten_decompositions())  # make_fx would count self
+            simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
+            return trace(lambda *a: function(*a), arguments, simpler)  # lambda: make_fx would count self
     except Exception as error:  # of any kind: the function is the user's
         line = " ".join(str(error).split())[:200]
         raise OracleError(
@@ -198,6 +203,15 @@ def _converted(x: Symbols, *, dtype: torch.dtype | None = None, **options: Any) 
     return x
 
 
+def _norm(x: Symbols, ord: float = 2, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Symbols:
+    if ord != 2:
+        raise NotImplementedError
+    return RULES["sqrt"](RULES["sum"](x * x, dim, keepdim))
+
+
+NO_ERROR = torch.zeros((), dtype=torch.int32)  # what torch's linear algebra returns beside its result
+
+
 def _matrix(rows: Symbols) -> casadi.SX:
     return casadi.vertcat(*(casadi.horzcat(*row) for row in rows))
 
@@ -211,17 +225,17 @@ def _of_each(rule: Callable[..., casadi.SX], *batches: Symbols) -> Symbols:
     return _filled(entries, (*shape, *results[0].shape))
 
 
-def _solution(A: Any, B: Any, *, left: bool = True, check_errors: bool = False) -> list[Symbols]:
+def _solution(A: Any, B: Any, *, left: bool = True, check_errors: bool = False) -> list[Any]:
     """A⁻¹B, or BA⁻¹; B may be a batch of vectors."""
     A, B = _symbols(A), _symbols(B)
     vectors = B.ndim == 1 or B.shape == A.shape[:-1]
     B = B[..., None] if vectors else B
     x = _of_each(casadi.solve if left else lambda A, B: casadi.solve(A.T, B.T).T, A, B)
-    return [x[..., 0] if vectors else x]
+    return [x[..., 0] if vectors else x, None, None, NO_ERROR]
 
 
-def _inverse(A: Symbols, *, check_errors: bool = False) -> list[Symbols]:
-    return [_of_each(casadi.inv, A)]
+def _inverse(A: Symbols, *, check_errors: bool = False) -> list[Any]:
+    return [_of_each(casadi.inv, A), NO_ERROR]
 
 
 def _determinant(A: Symbols) -> list[Symbols]:
@@ -232,8 +246,29 @@ RULES: dict[str, Callable[..., Any]] = {
     **{
         name: _elementwise(getattr(casadi, name), 1)
         for name in (
-            "acos", "acosh", "asin", "asinh", "atan", "atanh", "ceil", "cos", "cosh", "erf", "exp", "expm1", "floor",
-            "log", "log10", "log1p", "sign", "sin", "sinh", "sqrt", "tan", "tanh", "trunc",
+            "acos",
+            "acosh",
+            "asin",
+            "asinh",
+            "atan",
+            "atanh",
+            "ceil",
+            "cos",
+            "cosh",
+            "erf",
+            "exp",
+            "expm1",
+            "floor",
+            "log",
+            "log10",
+            "log1p",
+            "sign",
+            "sin",
+            "sinh",
+            "sqrt",
+            "tan",
+            "tanh",
+            "trunc",
         )
         if hasattr(casadi, name)
     },
@@ -271,6 +306,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "amin": _reduction(casadi.fmin),
     "mean": _mean,
     "cumsum": _cumulative_sum,
+    "linalg_vector_norm": _norm,
     **dict.fromkeys(("mm", "bmm", "mv", "dot"), _product),
     "_linalg_solve_ex": _solution,
     "linalg_inv_ex": _inverse,

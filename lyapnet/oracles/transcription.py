@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
-from lyapnet.oracles.base import Optima, Oracle, Progress, silent
+from lyapnet.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.oracles.cache import OptimaCache
 from lyapnet.oracles.multistart import SAME, Candidate, MultiStart, is_better
 from lyapnet.oracles.symbolic import require_equal, symbolic, traced
@@ -72,7 +72,7 @@ class Transcription(Oracle):
             x, J = [*x, following], J + step_cost
         return torch.stack(x), J + self.end(x[-1])[0]
 
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Progress = silent) -> Optima:
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
         """The optima of a batch (b, n): from disk, unless `known` controls cost less than those."""
         states = x0.detach().double().cpu()
         nothing: list[Tensor | None] = [None] * len(states)

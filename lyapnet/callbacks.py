@@ -6,6 +6,7 @@ import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import fmean
 from types import FrameType
@@ -21,13 +22,16 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
+from torch import Tensor
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet import figures
 from lyapnet.compilation import cache_folder, has_compiler
 from lyapnet.config import to_yaml
-from lyapnet.errors import CompilationError, DivergenceError, Interrupted, UntraceableError
+from lyapnet.data import InitialStateDataModule
+from lyapnet.errors import CompilationError, DivergenceError, Interrupted, OracleError, UntraceableError
 from lyapnet.modules import ProgramModule, TrainedModule, labelled
+from lyapnet.oracles import Report, oracle_of
 from lyapnet.randomness import FIGURES, stream
 
 # the line of a validation: name, key of the summary, format
@@ -88,6 +92,61 @@ class Compilation(Callback):
             self.console.print(line, soft_wrap=True)
 
 
+class ValidationOptimum(Callback):
+    """Finds the optimum of the validation states before the first step, and says so.
+
+    A checkpoint keeps it, so that a run is compared with the same numbers to its end, whatever the cache has by then.
+
+    Args:
+        console: where it is said.
+    """
+
+    def __init__(self, console: Console):
+        self.console = console
+        self.cost: Tensor | None = None  # (members, b)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {} if self.cost is None else {"cost": self.cost}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.cost = state_dict.get("cost")
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        module = _trained_module(pl_module)
+        if self.cost is None and module.config.evaluation.optimum:
+            states = _data(trainer).validation_batch()
+            found = self._solve(module.members[0], states) if trainer.is_global_zero else None
+            self.cost = trainer.strategy.broadcast(found)
+        if self.cost is not None:
+            for member, cost in zip(module.members, self.cost.to(module.device), strict=True):
+                member.validation_optimum = cost
+
+    def _solve(self, member: ProgramModule, states: Tensor) -> Tensor | None:
+        """J* (members, b) of states (members, b, n), or (1, b) of (b, n); None where there is no oracle."""
+        system, cost, _, horizon = member.task
+        started = time.perf_counter()
+        try:
+            with optimum_progress(self.console) as progress:
+                oracle = oracle_of(system, cost, horizon, member.config.rollout.method)
+                optima = oracle.solve(states.flatten(0, -2), progress=progress)
+        except OracleError as error:
+            self.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
+            return None
+        missing = f"; unknown for {optima.failures}, which are left out" if optima.failures else ""
+        self.console.print(
+            f"optimum of {len(optima.cost)} validation states: mean {optima.cost.nanmean():.4g}, "
+            f"in {time.perf_counter() - started:.0f} s{missing}", soft_wrap=True,
+        )  # fmt: skip
+        return optima.cost.cpu().reshape(-1, states.shape[-2])
+
+
+@contextmanager
+def optimum_progress(console: Console) -> Iterator[Report]:
+    """A line in a terminal that says how far an oracle is."""
+    with console.status("optimum …") as status:
+        yield lambda done, total: status.update(f"optimum: {done} of {total} initial states")
+
+
 class Stopwatch(Callback):
     """Tells each member how many rollout steps per second the last training step made, gradient included."""
 
@@ -117,7 +176,7 @@ class ScalarLogger(Callback):
                 curves.add_custom_scalars(LAYOUT)
                 curves.add_text("config", textwrap.indent(to_yaml(member.config), "    "))
             with torch.no_grad():
-                states = next(iter(trainer.datamodule.val_dataloader())).to(module.device)  # pyright: ignore
+                states = _data(trainer).validation_batch().to(module.device)
                 module.validate_on(states)
             self._log_validation(trainer, module)
 
@@ -374,6 +433,11 @@ def _shown(record: T | None) -> T:
     """What a member keeps of its last step or validation, once there was one."""
     assert record is not None
     return record
+
+
+def _data(trainer: Trainer) -> InitialStateDataModule:
+    data: Any = trainer
+    return data.datamodule
 
 
 def _trained_module(module: LightningModule) -> TrainedModule:

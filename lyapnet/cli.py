@@ -11,6 +11,7 @@ import typer
 from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Column, Table
+from rich.text import Text
 
 from lyapnet.errors import LyapnetError, UsageError
 
@@ -62,11 +63,18 @@ def evaluate(
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 256,
     seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    optimum: Annotated[bool, typer.Option(help="Compare with the optimum, where there is an oracle.")] = True,
+    table: Annotated[Path | None, typer.Option(help="Write a row for each state.", metavar="FILE.csv")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
     system: Annotated[str | None, typer.Option(help="module:Class of a system of your own.")] = None,
     network: Annotated[str | None, typer.Option(help="module:Class of a network of your own.")] = None,
     debug: Debug = False,
 ) -> None:
-    """Measure a controller on fresh initial states of X₀."""
+    """Measure a controller on fresh initial states of X₀.
+
+    The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
+    once for each state: the next evaluation of any controller of the task reads it.
+    """
     import torch
     from torch import nn
 
@@ -74,7 +82,7 @@ def evaluate(
     from lyapnet.checkpoint import read_checkpoint
     from lyapnet.config import SystemConfig
     from lyapnet.controller import config_of, load
-    from lyapnet.evaluation import evaluate as measure
+    from lyapnet.evaluation import evaluation
     from lyapnet.networks import NETWORKS
 
     own = None
@@ -84,11 +92,21 @@ def evaluate(
     own_network = None if network is None else resolve(network, NETWORKS, "--network", nn.Module)
     controller = load(checkpoint, system=own, network=own_network)
     torch.set_num_threads(controller.config.training.threads)
-    result = measure(controller, samples, seed)
+    notes = Console(stderr=True, highlight=False)
+    with notes.status("measuring …") as status:
+        measured = evaluation(
+            controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
+        )
+    result = measured.result()
     if as_json:
         print(json.dumps(result))
     else:
         Console(highlight=False).print(_table(str(checkpoint), result))
+    if table is not None:
+        measured.write(table, controller.system)
+        notes.print(f"wrote {table}", soft_wrap=True)
+    if figures is not None:
+        notes.print(_write_optimality(figures, measured), soft_wrap=True)
 
 
 @app.command()
@@ -328,6 +346,18 @@ def _measured_or_not(key: str, value: float | None) -> str:
     return "–" if value is None else _measured(key, value)
 
 
+def _write_optimality(folder: Path, measured: Any) -> str:
+    """Draw cost and V(0, x₀) against the optimum; what there is to say about it."""
+    from lyapnet import figures
+
+    if measured.result()["cost_ratio"] is None:
+        return "No figure optimality.png: there is no optimum to draw against."
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "optimality.png"
+    figures.optimality(measured.table).savefig(path, dpi=150)
+    return f"wrote {path}"
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -397,17 +427,15 @@ ROWS = {
     "satisfied_fraction_1e-6": "… within 1e-6",
 }
 
-NO_ORACLE = "–: no oracle knows the optimum of this task"
-
 
 def _table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in ROWS.items():
         if result[key] is None:
             table.add_row(label, "–")
-            table.caption = NO_ORACLE
         else:
             table.add_row(label, _measured(key, result[key]))
+    table.caption = _caption([result])
     return table
 
 
@@ -418,12 +446,18 @@ def _table_over_seeds(title: str, result: dict[str, Any]) -> Table:
     for key, label in ROWS.items():
         if key not in result["mean"]:
             table.add_row(label, "–", "–", "–")
-            table.caption = NO_ORACLE
             continue
         ends = [choose(seeds, key=lambda one, key=key: one[key]) for choose in (min, max)]
         mean, spread = (_measured(key, result[name][key]) for name in ("mean", "spread"))
         table.add_row(label, f"{mean} ± {spread}", *(f"{_measured(key, end[key])} ({end['seed']})" for end in ends))
+    table.caption = _caption(seeds)
     return table
+
+
+def _caption(results: list[dict[str, Any]]) -> Text | None:
+    """Why some optimum is missing."""
+    notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
+    return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 
 def _measured(key: str, value: float) -> str:

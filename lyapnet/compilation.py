@@ -115,6 +115,12 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "lyapnet"
 
 
+def constants_of(graph: GraphModule) -> list[tuple[str, Any]]:
+    """Name and entries of every tensor that a graph holds."""
+    constants = {**vars(graph), **dict(graph.named_buffers())}
+    return [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]
+
+
 def _file(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
     """One file for each function, shapes of arguments, machine and torch."""
     parts = [
@@ -123,9 +129,7 @@ def _file(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
     ]  # fmt: skip
     for graph in module.modules():
         if isinstance(graph, GraphModule):
-            constants = {**vars(graph), **dict(graph.named_buffers())}
-            parts.append(graph.code)
-            parts += [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]
+            parts += [graph.code, *constants_of(graph)]
     return cache_folder() / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt2"
 
 

@@ -148,6 +148,7 @@ class EvaluationConfig:
 
     validation_states: int = option(64, "States of each validation.", at_least=1)
     test_states: int = option(256, "States of the table at the end of training.", at_least=1)
+    optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
     figures_every: int = option(5, "Validations between figures in TensorBoard; the last one always draws.", at_least=1)
 
 

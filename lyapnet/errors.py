@@ -29,6 +29,10 @@ class UntraceableError(CompilationError):
     """The course of a closed loop depends on values; it runs as it is written, which is slower."""
 
 
+class OracleError(LyapnetError):
+    """There is no ground truth for a task; what is measured without it can still be reported."""
+
+
 class Interrupted(LyapnetError):
     """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
 

@@ -1,20 +1,25 @@
 """Measurements of a controller, one number for each initial state, and their summary."""
 
-from collections.abc import Callable
+import csv
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lyapnet.build import build_program
 from lyapnet.controller import Controller
-from lyapnet.oracles import optimal_cost
+from lyapnet.errors import OracleError
+from lyapnet.oracles import Optima, Report, oracle_of, silent
 from lyapnet.programs import Program
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.randomness import TEST, stream
 from lyapnet.rollout import Trajectory
-from lyapnet.types import PerState, State
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.types import ControlPath, PerState, State
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 
@@ -23,9 +28,10 @@ PAPER_STATES = 100  # K, the number of states on which the paper counts satisfie
 class StateTable:
     """One row for each initial state."""
 
+    x0: State
     cost: PerState  # J_N(x₀)
     value: PerState  # V(0, x₀)
-    optimal_cost: PerState | None  # J*(x₀), where an oracle knows it
+    optimal_cost: PerState | None  # J*(x₀), where there is an oracle; NaN where it found none
     constraint_loss: PerState  # the program's sum along the trajectory
     hinge: PerState  # Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0)
     decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
@@ -44,18 +50,12 @@ class StateTable:
 
     def summary(self) -> dict[str, float | None]:
         """The means and shares over the rows, under the names of `lyapnet evaluate --json`."""
-        optimal = value_error = None
-        if self.optimal_cost is not None:
-            optimal = self.optimal_cost.mean()
-            value_error = (self.value - self.optimal_cost).abs().mean() / optimal
         return {
             "cost_mean": float(self.cost.mean()),
             "cost_max": float(self.cost.max()),
-            "optimal_cost_mean": None if optimal is None else float(optimal),
-            "cost_ratio": None if optimal is None else float(self.cost.mean() / optimal),
+            **self.against_optimum(),
             "value_mean": float(self.value.mean()),
             "value_to_cost": float(self.value.mean() / self.cost.mean()),
-            "value_error": None if value_error is None else float(value_error),
             "constraint_loss": float(self.constraint_loss.mean()),
             "terminal_error": float(self.terminal_error.mean()),
             "bounded_fraction": _share(self.cost <= self.value),
@@ -65,14 +65,33 @@ class StateTable:
             "satisfied_fraction_1e-6": _share(self.satisfied(1e-6)),
         }
 
+    def against_optimum(self) -> dict[str, float | None]:
+        """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""
+        optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
+        known = torch.isfinite(optimal)
+        mean, count = optimal[known].mean(), int(known.sum())
+        measured = {
+            "optimal_cost_mean": mean,
+            "cost_ratio": self.cost[known].mean() / mean,
+            "value_error": (self.value - optimal)[known].abs().mean() / mean,
+        }
+        failures = None if self.optimal_cost is None else len(known) - count
+        numbers = {key: float(number) if count else None for key, number in measured.items()}
+        return {**numbers, "optimum_failures": failures}
 
-def measure(trajectory: Trajectory, program: Program, oracle: Callable[[State], PerState] | None) -> StateTable:
-    """The table of a batch (b,) of trajectories under the control law of a V."""
+
+def measure(trajectory: Trajectory, program: Program, optimal_cost: PerState | None = None) -> StateTable:
+    """The table of a batch (b,) of trajectories under the control law of a V.
+
+    Args:
+        optimal_cost: J* of each, where it is known.
+    """
     values = trajectory.require_value()
     return StateTable(
+        x0=trajectory.x[0],
         cost=trajectory.cost,
         value=values[0],
-        optimal_cost=None if oracle is None else oracle(trajectory.x[0]),
+        optimal_cost=optimal_cost,
         constraint_loss=program.constraint_loss(values, trajectory),
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),
@@ -80,10 +99,75 @@ def measure(trajectory: Trajectory, program: Program, oracle: Callable[[State], 
     )
 
 
-def evaluate(controller: Controller, samples: int = 256, seed: int = 0) -> dict[str, Any]:
-    """The summary of a controller on fresh states of X₀, as `lyapnet evaluate` prints it.
+class Evaluation(NamedTuple):
+    """What a controller does from fresh states of X₀."""
 
-    Costs, errors and the decreasing share are over `samples` states; the satisfied shares over K = 100 further ones.
+    table: StateTable
+    paper: StateTable  # of K = 100 further states
+    notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
+    seed: int
+
+    def result(self) -> dict[str, Any]:
+        """The summary, as `lyapnet evaluate --json` prints it.
+
+        Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
+        """
+        paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
+        counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
+        return {**self.table.summary(), **paper, **counts, **self._note()}
+
+    def write(self, path: Path, system: ControlAffineSystem) -> None:
+        """The table as comma-separated values with a line of names and units.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        table = self.table
+        states = [f"{name} ({unit})" if unit else name for name, unit in
+                  zip(system.state_names, system.state_units, strict=True)]  # fmt: skip
+        optimal = torch.full_like(table.cost, torch.nan) if table.optimal_cost is None else table.optimal_cost
+        columns = {
+            **dict(zip(states, table.x0.unbind(-1), strict=True)),
+            "cost": table.cost, "optimal_cost": optimal, "cost_ratio": table.cost / optimal, "value": table.value,
+            "value_error": (table.value - optimal) / optimal, "constraint_loss": table.constraint_loss,
+            "hinge": table.hinge, "decreasing": table.decreasing.int(), "terminal_error": table.terminal_error,
+        }  # fmt: skip
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([*columns, "no_optimum"])
+            writer.writerows(zip(*(column.tolist() for column in columns.values()), self.notes, strict=True))
+
+    def _note(self) -> dict[str, str]:
+        missing = [note for note in self.notes if note]
+        if not missing:
+            return {}
+        if len(set(missing)) == 1 and len(missing) == len(self.notes):
+            return {"no_optimum": missing[0]}
+        return {
+            "no_optimum": f"{len(missing)} of {len(self.notes)} states have no optimum and are left out: {missing[0]}"
+        }
+
+
+def evaluate(
+    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+) -> dict[str, Any]:
+    """The summary of a controller on fresh states of X₀; see Evaluation.result.
+
+    Raises:
+        ValueError: fewer than one sample.
+        DivergenceError: the closed loop leaves the finite numbers.
+    """
+    return evaluation(controller, samples, seed, optimum, progress).result()
+
+
+def evaluation(
+    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+) -> Evaluation:
+    """The measurements of a controller on fresh states of X₀, as many as `samples`, and on K = 100 further ones.
+
+    Args:
+        optimum: whether the first ones are compared with the optimum, where there is an oracle.
+        progress: of the oracle.
 
     Raises:
         ValueError: fewer than one sample.
@@ -91,19 +175,23 @@ def evaluate(controller: Controller, samples: int = 256, seed: int = 0) -> dict[
     """
     if samples < 1:
         raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
-    table = state_table(controller, controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
-    summary = table.rows(slice(0, samples)).summary()
-    paper = table.rows(slice(samples, None)).summary()
-    satisfied = {key: value for key, value in paper.items() if key.startswith("satisfied_fraction")}
-    return {**summary, **satisfied, "satisfied_states": PAPER_STATES, "samples": samples, "seed": seed}
-
-
-def state_table(controller: Controller, x0: State) -> StateTable:
-    """The table of a controller on given initial states (b, n)."""
-    program = build_program(controller.config)
-    oracle = optimal_cost(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
+    trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
-        return measure(controller.rollout(x0), program, oracle)
+        table = measure(trajectory, build_program(controller.config))
+    first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
+    if not optimum:
+        return Evaluation(first, paper, ["not asked for"] * samples, seed)
+    try:
+        optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
+    except OracleError as reason:
+        return Evaluation(first, paper, [str(reason)] * samples, seed)
+    return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed)
+
+
+def _optima(controller: Controller, x0: State, known: ControlPath, progress: Report) -> Optima:
+    """The optima from the states of X₀; the controller's own controls are starts of the oracle."""
+    oracle = oracle_of(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
+    return oracle.solve(x0, known, progress)
 
 
 def _share(holds: Tensor) -> float:

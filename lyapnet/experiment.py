@@ -31,6 +31,8 @@ from lyapnet.callbacks import (
     ScalarLogger,
     Stopwatch,
     TrainingProgress,
+    ValidationOptimum,
+    optimum_progress,
 )
 from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoint
 from lyapnet.config import Config, configs_of_seeds, differing_keys, label_of, load_config, to_plain, to_yaml
@@ -48,7 +50,7 @@ TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",
     "deterministic", "benchmark", "detect_anomaly", "profiler",
 )  # fmt: skip
-CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every")
+CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum")
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def fit(plan: Plan, console: Console) -> dict[str, Any]:
             _note_what_it_took(run, time.perf_counter() - started)
     if not trainer.is_global_zero:
         return {}
-    return _finish(trainer, plan)
+    return _finish(trainer, plan, console)
 
 
 def _note_what_it_took(run: Run, seconds: float) -> None:
@@ -151,14 +153,15 @@ def _data(module: TrainedModule) -> InitialStateDataModule:
     return EnsembleDataModule(*options, config.seeds) if config.seeds > 1 else InitialStateDataModule(*options)
 
 
-def _finish(trainer: L.Trainer, plan: Plan) -> dict[str, Any]:
+def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     """Evaluate each best checkpoint, log it as its run's final metrics, and mark the run as finished."""
-    config, members = plan.config, plan.module.members
+    config, members, options = plan.config, plan.module.members, plan.config.evaluation
     network = resolve(config.network.name, NETWORKS, "network.name", nn.Module)
     results = []
     for member, run, logger in zip(members, plan.run.members(config), trainer.loggers, strict=True):
         controller = load(run.best, system=member.task.system, network=network)
-        results.append(evaluate(controller, config.evaluation.test_states, member.config.seed))
+        with optimum_progress(console) as progress:
+            results.append(evaluate(controller, options.test_states, member.config.seed, options.optimum, progress))
         metrics = {f"hp/{key}": value for key, value in results[-1].items() if isinstance(value, float)}
         assert isinstance(logger, TensorBoardLogger)
         logger.log_hyperparams(to_plain(member.config), metrics, step=trainer.global_step)
@@ -170,7 +173,7 @@ def _finish(trainer: L.Trainer, plan: Plan) -> dict[str, Any]:
 
 def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The evaluations of several seeds, and mean and standard deviation of each measure that all of them have."""
-    measures = [key for key, value in results[0].items() if isinstance(value, float)]
+    measures = [key for key in results[0] if all(isinstance(result[key], float) for result in results)]
     columns = {key: [result[key] for result in results] for key in measures}
     return {
         "mean": {key: statistics.fmean(values) for key, values in columns.items()},
@@ -208,6 +211,7 @@ def _trainer(plan: Plan, console: Console) -> L.Trainer:
         logger=loggers,
         callbacks=[
             *_compilation(plan, console),
+            ValidationOptimum(console),
             Stopwatch(),
             ScalarLogger(),
             FigureLogger(training.validate_every * config.evaluation.figures_every),

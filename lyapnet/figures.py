@@ -17,6 +17,7 @@ from matplotlib.ticker import NullLocator
 from torch import Tensor
 
 from lyapnet.bench import Accuracy, Row
+from lyapnet.evaluation import StateTable
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.sets import Box
@@ -212,6 +213,31 @@ def value_slices(V: Value, system: ControlAffineSystem, initial_states: Box, dur
         panel.set_title(f"V(t, x) at t = {t:.2f} s", fontsize=9)
         panel.set_xlabel(state_label(system, region.axes[0]))
     panels[0].set_ylabel(state_label(system, region.axes[1]))
+    return figure
+
+
+def optimality(table: StateTable) -> Figure:
+    """Cost and V(0, x₀) of each initial state against its optimum; on the line, they are the optimum."""
+    assert table.optimal_cost is not None
+    known = torch.isfinite(table.optimal_cost)
+    optimal = _numpy(table.optimal_cost[known])
+    figure = Figure(figsize=(8.6, 4.3), layout="constrained")
+    panels = figure.subplots(1, 2)
+    measured = (("J(x₀), closed loop (cost)", table.cost, BLUE, "o"), ("V(0, x₀) (cost)", table.value, VERMILION, "^"))
+    for panel, (label, values, color, marker) in zip(panels, measured, strict=True):
+        y = _numpy(values[known])
+        ends = [min(optimal.min(), y.min()), max(optimal.max(), y.max())]
+        panel.plot(ends, ends, color=GREY, linewidth=0.9, label="equal to the optimum")
+        panel.plot(optimal, y, marker, color=color, markersize=3.5, alpha=0.6, label="an initial state")
+        panel.set_xlabel("optimum J*(x₀) (cost)")
+        panel.set_ylabel(label)
+        panel.grid(color=GREY, alpha=0.25, linewidth=0.5)
+        panel.legend(frameon=False, fontsize=8)
+    left_out = f", {len(known) - len(optimal)} without optimum left out" if len(optimal) < len(known) else ""
+    summary = table.against_optimum()
+    panels[0].set_title(f"cost / optimum, ratio of the means: {summary['cost_ratio']:.4f}", fontsize=9)
+    panels[1].set_title(f"mean |V(0, x₀) − J*| / mean J*: {summary['value_error']:.1%}", fontsize=9)
+    figure.suptitle(f"{len(optimal)} initial states{left_out}", fontsize=9)
     return figure
 
 

@@ -20,7 +20,6 @@ from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, t
 from lyapnet.discrete_adjoint import DiscreteAdjoint
 from lyapnet.errors import CompilationError, DivergenceError, UsageError
 from lyapnet.evaluation import StateTable, measure
-from lyapnet.oracles import optimal_cost
 from lyapnet.programs.base import ProgramOutput
 from lyapnet.rollout import ADAPTIVE_METHODS, Trajectory
 from lyapnet.types import PerState, State
@@ -134,9 +133,7 @@ class ProgramModule(TrainedModule):
         self.V = build_value_function(config, task)
         self.closed_loop = build_rollout(config, task, self.V)
         self.program = build_program(config)
-        self.oracle: Callable[[State], PerState] | None = optimal_cost(
-            task.system, task.cost, task.horizon, config.rollout.method
-        )
+        self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
         # of the last training step and the last validation, for whoever shows them
         self.gradient_norm = self.steps_per_second = math.nan
         self.output: ProgramOutput | None = None
@@ -156,7 +153,7 @@ class ProgramModule(TrainedModule):
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
         """The loss of the validation states; their table is kept in `validation`."""
-        self.validation = measure(trajectory, self.program, self.oracle)
+        self.validation = measure(trajectory, self.program, self.validation_optimum)
         return self.program(trajectory).loss
 
     def save_member(self, member: "ProgramModule", path: Path) -> None:

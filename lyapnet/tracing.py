@@ -1,6 +1,6 @@
 """Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +17,10 @@ Tensors = tuple[Tensor, ...]
 
 
 def trace(
-    function: Callable[..., Tensors], arguments: Sequence[Tensor], elsewhere: Sequence[Tensor] = ()
+    function: Callable[..., Tensors],
+    arguments: Sequence[Tensor],
+    elsewhere: Sequence[Tensor] = (),
+    decompositions: Mapping[Any, Any] | None = None,
 ) -> GraphModule:
     """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
 
@@ -27,14 +30,16 @@ def trace(
     Args:
         elsewhere: other values of its last arguments, on which the trace is held against the function: code that
             leaves torch (x.numpy(), say) is frozen without a word.
+        decompositions: operator ↦ the same in simpler operators, for a reader that knows only those.
 
     Raises:
         UsageError: the function draws random numbers.
         Exception: of any kind, where the function's course depends on the values of its arguments.
     """
-    graph_module = make_fx(function, _allow_non_fake_inputs=True)(*arguments)
+    options = {"decomposition_table": decompositions, "_allow_non_fake_inputs": True}
+    graph_module = make_fx(function, **options)(*arguments)
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
-        graph_module = make_fx(functionalize(graph_module), _allow_non_fake_inputs=True)(*arguments)
+        graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
         raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
     for node in list(graph_module.graph.nodes):
@@ -118,7 +123,7 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
         node
         for node in nodes
         if node.op in ("placeholder", "get_attr")
-        or (node.op == "call_function" and (_is_view(node.target) or _name(node.target) in cheap))
+        or (node.op == "call_function" and (is_view(node.target) or name_of(node.target) in cheap))
     }
 
 
@@ -141,7 +146,8 @@ def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], a
             ) from error
 
 
-def _name(target: Any) -> str:
+def name_of(target: Any) -> str:
+    """An operator's name without its overload."""
     return getattr(target, "__name__", "").split(".")[0]
 
 
@@ -157,7 +163,8 @@ def _mutates(node: Node) -> bool:
     return schema is not None and schema.is_mutable
 
 
-def _is_view(target: Any) -> bool:
+def is_view(target: Any) -> bool:
+    """Whether an operator's result shares its argument's memory."""
     schema = getattr(target, "_schema", None)
     return schema is not None and any(result.alias_info is not None for result in schema.returns)
 

@@ -29,6 +29,12 @@ ARGUMENTS = {
 }
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _cache(tmp_path_factory):
+    """A cache of their own for all tests and the processes they start."""
+    os.environ["LYAPNET_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+
+
 @pytest.fixture(autouse=True)
 def _float64_and_seeded():
     torch.set_default_dtype(torch.float64)

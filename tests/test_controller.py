@@ -272,11 +272,15 @@ def test_satisfied_share_follows_the_slack(quadratic):
 
 
 def test_task_without_an_oracle_has_no_gap_to_report():
-    config = load_config(CONF / "reacher.yaml", ["horizon.steps=3", "network.hidden=[4]"])
+    config = load_config(CONF / "reacher.yaml", ["horizon.steps=3", "network.hidden=[4]", "rollout.method=rk4"])
     task = build_task(config)
     result = evaluate(Controller(config, task, build_value_function(config, task)), 4)
     assert result.keys() >= DESIGNED_KEYS
     assert result["optimal_cost_mean"] is result["cost_ratio"] is result["value_error"] is None
+    assert result["optimum_failures"] is None
+    assert result["no_optimum"].startswith(
+        "Expected rollout.method=euler for the optimum of a nonlinear task, got rk4; "
+    )
     assert result["cost_mean"] > 0
 
 

@@ -13,6 +13,7 @@ from lyapnet import figures
 from lyapnet.build import build_rollout, build_task, build_value_function
 from lyapnet.cli import main
 from lyapnet.config import load_config
+from lyapnet.evaluation import StateTable
 from lyapnet.systems import SYSTEMS
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -155,3 +156,22 @@ def test_systems_command_lists_every_registered_system(capsys, monkeypatch, buil
         if name != "linear":
             for word in (*system.state_names, *system.state_units, *system.control_names, *system.control_units):
                 assert word in row
+
+
+def table(cost, value, optimal):
+    zero = torch.zeros(len(cost))
+    cost, value, optimal = map(torch.tensor, (cost, value, optimal))
+    return StateTable(zero[:, None], cost, value, optimal, zero, zero, zero > 0, zero)
+
+
+def test_optimality_is_drawn_where_the_optimum_is_known():
+    figure = figures.optimality(table([1.1, 2.2, 9.0], [1.2, 1.6, 9.0], [1.0, 2.0, float("nan")]))
+    drawn(figure)
+    assert labels(figure) == {"optimum J*(x₀) (cost)", "J(x₀), closed loop (cost)", "V(0, x₀) (cost)"}
+    assert "2 initial states, 1 without optimum left out" in title(figure)
+    assert "1.1000" in title(figure)  # 3.3 / 3
+    assert "20.0%" in title(figure)  # (0.2 + 0.4) / 3
+    for axes, points in zip(figure.axes, ([1.1, 2.2], [1.2, 1.6]), strict=True):
+        line, states = axes.get_lines()
+        assert list(line.get_xdata()) == list(line.get_ydata())
+        assert states.get_xydata().tolist() == [[1.0, points[0]], [2.0, points[1]]]

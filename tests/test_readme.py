@@ -77,6 +77,9 @@ def test_the_python_example_runs(workplace):
     exec(example, names)
     assert names["u"].shape == (1,)
     assert names["trajectory"].x.shape == (9, 2)
+    (example,) = [block for block in blocks("python") if "oracle_of" in block]
+    exec(example, names)
+    assert names["optima"].cost.shape == (4,)
 
 
 def test_a_system_of_your_own(workplace):

@@ -1,29 +1,64 @@
 """Ground truth: optima known by another route than learning. Never used in training."""
 
-from collections.abc import Callable
-from functools import partial
+import importlib.util
 
 from lyapnet.cost import QuadraticCost
-from lyapnet.oracles.riccati import RiccatiSolution, continuous_riccati, discrete_riccati
+from lyapnet.errors import OracleError
+from lyapnet.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.oracles.riccati import RiccatiOracle, RiccatiSolution, continuous_riccati, discrete_riccati
 from lyapnet.rollout import Horizon
 from lyapnet.systems import ControlAffineSystem, Linear
-from lyapnet.types import PerState, State
 
-__all__ = ["RiccatiSolution", "continuous_riccati", "discrete_riccati", "optimal_cost"]
+__all__ = [
+    "Optima",
+    "Oracle",
+    "Report",
+    "RiccatiSolution",
+    "continuous_riccati",
+    "discrete_riccati",
+    "optimal_cost",
+    "oracle_of",
+    "silent",
+]
+
+
+def oracle_of(system: ControlAffineSystem, cost: QuadraticCost, horizon: Horizon, method: str = "euler") -> Oracle:
+    """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
+
+    With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear` and
+    R a matrix, else by direct transcription. With any other integrator it is that of the continuous task, by the
+    Riccati equation alone.
+
+    Raises:
+        OracleError: there is none; says why, and what to do.
+        ValueError: a weight of the cost does not fit the system's dimensions.
+    """
+    if isinstance(system, Linear) and cost.R_constant is not None:
+        solve = discrete_riccati if method == "euler" else continuous_riccati
+        return RiccatiOracle(solve(system, cost, horizon))
+    if method != "euler":
+        raise OracleError(
+            f"Expected rollout.method=euler for the optimum of a nonlinear task, got {method}; the transcription has "
+            "Euler's steps."
+        )
+    if importlib.util.find_spec("casadi") is None:
+        raise OracleError(
+            "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."
+        )
+    from lyapnet.oracles.transcription import Transcription  # needs the extra
+
+    return Transcription(system, cost, horizon)
 
 
 def optimal_cost(
     system: ControlAffineSystem, cost: QuadraticCost, horizon: Horizon, method: str = "euler"
-) -> Callable[[State], PerState] | None:
-    """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
-
-    With Euler it is the optimum of the discretised task, J_N*; with any other integrator, that of the continuous one.
-    None where lyapnet has no formula for it: a system that is not `Linear`, or an R given as a function of x.
+) -> Oracle | None:
+    """The oracle of a task, or None where there is none.
 
     Raises:
         ValueError: a weight of the cost does not fit the system's dimensions.
     """
-    if not isinstance(system, Linear) or cost.R_constant is None:
+    try:
+        return oracle_of(system, cost, horizon, method)
+    except OracleError:
         return None
-    solve = discrete_riccati if method == "euler" else continuous_riccati
-    return partial(solve(system, cost, horizon).value, 0)

@@ -12,9 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
+from lyapnet.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.rollout import Horizon
 from lyapnet.systems import Linear
-from lyapnet.types import Control, PerState, State
+from lyapnet.types import Control, ControlPath, PerState, State
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,16 @@ class RiccatiSolution:
     def policy(self, step: int, x: State) -> Control:
         """−K_n x, the control at t_n, n = step; in the dtype of x."""
         return (-x.double() @ self.K[step].to(x.device).mT).to(x.dtype)
+
+
+class RiccatiOracle(Oracle):
+    """J*(x₀) = x₀ᵀP_0x₀."""
+
+    def __init__(self, solution: RiccatiSolution):
+        self.solution = solution
+
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+        return Optima(self.solution.value(0, x0), [""] * len(x0))
 
 
 def discrete_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) -> RiccatiSolution:

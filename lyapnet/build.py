@@ -69,6 +69,37 @@ def build_system(config: SystemConfig) -> ControlAffineSystem:
         return cls(**config.parameters)
 
 
+def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
+    """The constructor's arguments, defaults included, of the system of a config; none where they do not fit it."""
+    try:
+        bound = inspect.signature(type(system)).bind(**config.parameters)
+    except TypeError:  # a system of the user's own that was passed in the place of the config's
+        return {}
+    bound.apply_defaults()
+    return dict(bound.arguments)
+
+
+def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """The positive real numbers among a constructor's arguments; gravity is no property of a system."""
+    annotations = inspect.signature(type(system)).parameters
+    return {
+        name: float(value)
+        for name, value in parameters.items()
+        if isinstance(value, int | float)
+        and value > 0
+        and name != "gravity"
+        and annotations[name].annotation is not int
+    }
+
+
+def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> ControlAffineSystem:
+    """A system of the same class from other arguments, in the precision and on the device of the first buffer."""
+    like = next(system.buffers(), None)
+    with _float64_defaults():
+        other = type(system)(**parameters)
+    return other if like is None else other.to(like)
+
+
 def _check_parameters(cls: type, config: SystemConfig) -> None:
     """Hold the names under system.parameters against the constructor's arguments."""
     arguments = inspect.signature(cls).parameters.values()

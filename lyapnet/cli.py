@@ -66,6 +66,9 @@ def evaluate(
     optimum: Annotated[bool, typer.Option(help="Compare with the optimum, where there is an oracle.")] = True,
     table: Annotated[Path | None, typer.Option(help="Write a row for each state.", metavar="FILE.csv")] = None,
     figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
+    disturbed: Annotated[
+        bool, typer.Option("--robustness", help="Also outside X₀, on other plants, under noise, with half the Δt.")
+    ] = False,
     system: Annotated[str | None, typer.Option(help="module:Class of a system of your own.")] = None,
     network: Annotated[str | None, typer.Option(help="module:Class of a network of your own.")] = None,
     debug: Debug = False,
@@ -84,6 +87,7 @@ def evaluate(
     from lyapnet.controller import config_of, load
     from lyapnet.evaluation import evaluation
     from lyapnet.networks import NETWORKS
+    from lyapnet.robustness import robustness
 
     own = None
     if system is not None:
@@ -97,13 +101,18 @@ def evaluate(
         measured = evaluation(
             controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
         )
-    result = measured.result()
+        result = measured.result()
+        if disturbed:
+            rows = robustness(controller, min(samples, 64), seed, lambda name: status.update(f"disturbance: {name}"))
+            result["robustness"] = [row._asdict() for row in rows]
     if as_json:
         print(json.dumps(result))
     else:
         Console(highlight=False).print(_table(str(checkpoint), result))
+        if disturbed:
+            Console(highlight=False).print(_robustness_table(result["robustness"], min(samples, 64)))
     if table is not None:
-        measured.write(table, controller.system)
+        measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
         notes.print(_write_optimality(figures, measured), soft_wrap=True)
@@ -435,7 +444,21 @@ def _table(title: str, result: dict[str, Any]) -> Table:
             table.add_row(label, "–")
         else:
             table.add_row(label, _measured(key, result[key]))
+    for name, error in result["terminal_errors"].items():
+        table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
     table.caption = _caption([result])
+    return table
+
+
+def _robustness_table(rows: list[dict[str, Any]], samples: int) -> Table:
+    headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
+    columns = [Column(heading, justify="right") for heading in headings]
+    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{samples} states each")
+    for row in rows:
+        keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
+        cost, *others = (_measured_or_not(key, row[key]) for key in keys)
+        table.add_row(row["disturbance"], "diverged" if row["cost_mean"] is None else cost, *others)
+    table.caption = "J*: of the disturbed task, without noise"
     return table
 
 
@@ -461,6 +484,8 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
 
 
 def _measured(key: str, value: float) -> str:
+    if key == "cost_ratio":
+        return f"{value:.4f}"
     return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"
 
 

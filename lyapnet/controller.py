@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from lyapnet.build import Task, build_rollout, build_task, build_value_function
 from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.closed_loop import ClosedLoop
 from lyapnet.config import Config, config_from_plain
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import CheckpointError, UsageError
@@ -53,6 +54,11 @@ class Controller:
         return self._task.initial_states
 
     @property
+    def closed_loop(self) -> ClosedLoop:
+        """ẋ = f(x) + g(x)u(t, x) and its running cost."""
+        return self._rollout.closed_loop
+
+    @property
     def V(self) -> nn.Module:
         """The value function as a module: (t, x) ↦ (*batch,)."""
         return self._V
@@ -79,7 +85,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones.
         """
-        return self._answer(self._rollout.closed_loop.policy, t, x)
+        return self._answer(self.closed_loop.policy, t, x)
 
     def rollout(self, x0: Any) -> Trajectory:
         """The closed loop from x₀ (*batch, n), over the whole horizon; a Trajectory of what x₀ is, tensors or arrays.

@@ -35,7 +35,12 @@ class StateTable:
     constraint_loss: PerState  # the program's sum along the trajectory
     hinge: PerState  # Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0)
     decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
-    terminal_error: PerState  # ‖x_N‖
+    terminal_state: State  # x_N
+
+    @property
+    def terminal_error(self) -> PerState:
+        """‖x_N‖."""
+        return torch.linalg.vector_norm(self.terminal_state, dim=-1)
 
     def rows(self, chosen: slice) -> "StateTable":
         """The table of some of the states."""
@@ -95,7 +100,7 @@ def measure(trajectory: Trajectory, program: Program, optimal_cost: PerState | N
         constraint_loss=program.constraint_loss(values, trajectory),
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),
-        terminal_error=torch.linalg.vector_norm(trajectory.x[-1], dim=-1),
+        terminal_state=trajectory.x[-1],
     )
 
 
@@ -106,6 +111,7 @@ class Evaluation(NamedTuple):
     paper: StateTable  # of K = 100 further states
     notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
     seed: int
+    system: ControlAffineSystem
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -113,29 +119,34 @@ class Evaluation(NamedTuple):
         Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
+        terminal = dict(zip(self._state_names(), self.table.terminal_state.abs().mean(0).tolist(), strict=True))
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
-        return {**self.table.summary(), **paper, **counts, **self._note()}
+        return {**self.table.summary(), **paper, "terminal_errors": terminal, **counts, **self._note()}
 
-    def write(self, path: Path, system: ControlAffineSystem) -> None:
+    def write(self, path: Path) -> None:
         """The table as comma-separated values with a line of names and units.
 
         Raises:
             OSError: the file cannot be written.
         """
-        table = self.table
-        states = [f"{name} ({unit})" if unit else name for name, unit in
-                  zip(system.state_names, system.state_units, strict=True)]  # fmt: skip
+        table, states = self.table, self._state_names()
         optimal = torch.full_like(table.cost, torch.nan) if table.optimal_cost is None else table.optimal_cost
         columns = {
             **dict(zip(states, table.x0.unbind(-1), strict=True)),
             "cost": table.cost, "optimal_cost": optimal, "cost_ratio": table.cost / optimal, "value": table.value,
             "value_error": (table.value - optimal) / optimal, "constraint_loss": table.constraint_loss,
             "hinge": table.hinge, "decreasing": table.decreasing.int(), "terminal_error": table.terminal_error,
+            **{f"terminal {name}": x for name, x in zip(states, table.terminal_state.unbind(-1), strict=True)},
         }  # fmt: skip
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow([*columns, "no_optimum"])
             writer.writerows(zip(*(column.tolist() for column in columns.values()), self.notes, strict=True))
+
+    def _state_names(self) -> list[str]:
+        """Names and units, as in "pole angle (rad)"."""
+        pairs = zip(self.system.state_names, self.system.state_units, strict=True)
+        return [f"{name} ({unit})" if unit else name for name, unit in pairs]
 
     def _note(self) -> dict[str, str]:
         missing = [note for note in self.notes if note]
@@ -180,12 +191,14 @@ def evaluation(
         table = measure(trajectory, build_program(controller.config))
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     if not optimum:
-        return Evaluation(first, paper, ["not asked for"] * samples, seed)
+        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.system)
     try:
         optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
     except OracleError as reason:
-        return Evaluation(first, paper, [str(reason)] * samples, seed)
-    return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed)
+        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.system)
+    return Evaluation(
+        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.system
+    )
 
 
 def _optima(controller: Controller, x0: State, known: ControlPath, progress: Report) -> Optima:

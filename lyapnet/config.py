@@ -53,6 +53,7 @@ class ProgramConfig:
     terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
     trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
     normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
+    cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
 
 

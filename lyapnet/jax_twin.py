@@ -100,12 +100,13 @@ class JaxTwin:
         violation = jnp.diff(path.value, axis=0) + (1 + getattr(program, "margin", 0)) * step_cost
         penalty = jnp.square if isinstance(program, ValueProgram) else jax.nn.relu
         C, B = penalty(violation).sum(0).mean(), penalty(path.terminal_cost - path.value[-1]).mean()
-        J = (path.running_cost[-1] + path.terminal_cost).mean()
+        remaining = path.running_cost[-1] - path.running_cost + path.terminal_cost
+        D, J = jnp.square(path.value - remaining).mean(), remaining[0].mean()
         if program.normalise:
             unit = jax.lax.stop_gradient(J) ** program.degree
-            C, B, J = C * self.task.horizon.steps ** (program.degree - 1) / unit, B / unit, jnp.log(J)
-        weighted = ((program.constraint, C), (program.terminal, B), (program.trajectory_cost, J))
-        return sum(weight * term for weight, term in weighted if weight)
+            C, B, D, J = C * self.task.horizon.steps ** (program.degree - 1) / unit, B / unit, D / unit, jnp.log(J)
+        terms = {"constraint": C, "terminal": B, "trajectory_cost": J, "cost_to_go": D}
+        return sum(weight * terms[name] for name, weight in program.weights.items() if weight)
 
     def _rollout(self, parameters: tuple[Array, ...], x0: Array) -> Path:
         system: Any = self.task.system

@@ -209,6 +209,7 @@ WRONG_SHAPE = {
 }
 IMPOSSIBLE = {
     "program.name=value": ("program.margin", "value"),
+    "program.cost_to_go=1": ("program.cost_to_go", "lyapunov"),
     "network.name=fcn & network.epsilon=0.1": ("network.epsilon", "fcn"),
     "network.embed_angles=true": ("network.embed_angles", "anchored"),
     "network.activation=tanh": ("network", "activation", "convex", "softplus"),

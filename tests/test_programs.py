@@ -15,7 +15,15 @@ from lyapnet.cost import QuadraticCost
 from lyapnet.errors import DivergenceError
 from lyapnet.policy import HJBPolicy
 from lyapnet.programs import PROGRAMS, LyapunovProgram, ValueProgram
-from lyapnet.programs.terms import hinge, residual, satisfied, terminal_hinge, terminal_residual, violation
+from lyapnet.programs.terms import (
+    cost_to_go_error,
+    hinge,
+    residual,
+    satisfied,
+    terminal_hinge,
+    terminal_residual,
+    violation,
+)
 from lyapnet.rollout import Horizon, Rollout, Trajectory
 from lyapnet.systems import DoubleIntegrator
 
@@ -35,6 +43,18 @@ def test_terms_by_hand():
     assert hinge(VALUES, STEP_COST).tolist() == [1.0, 1.0]
     assert terminal_residual(VALUES, TERMINAL_COST).tolist() == [0.25, 0.5625]
     assert terminal_hinge(VALUES, TERMINAL_COST).tolist() == [0.5, 0.0]
+    # V_n − J_n = (−0.5, −1.5, −0.5, −0.5) and (0.75, 1.75, 0.75, 0.75)
+    assert cost_to_go_error(VALUES, STEP_COST, TERMINAL_COST).tolist() == [0.75, 1.1875]
+
+
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(0, 9)), min_size=2, max_size=6), st.floats(0, 9))
+def test_distance_from_the_cost_to_go_is_the_violations_summed_up(nodes, terminal_cost):
+    """V_n − J_n = V_N − φ − Σ_{k≥n} violation_k, for any numbers."""
+    value, step_cost = torch.tensor(nodes).T.unsqueeze(-1)
+    terminal_cost = torch.tensor([terminal_cost])
+    later = violation(value, step_cost[:-1]).flip(0).cumsum(0).flip(0)
+    error = value[-1] - terminal_cost - torch.cat([later, torch.zeros(1, 1)])
+    assert_close(cost_to_go_error(value, step_cost[:-1], terminal_cost), (error**2).mean(0))
 
 
 def test_margin_asks_for_that_share_of_the_step_cost_more():
@@ -72,6 +92,15 @@ def test_the_papers_program_is_the_mean_sum_alone(program):
     assert output.loss == output.constraint_loss == output.terms["constraint"]
 
 
+def test_value_program_weighs_the_distance_from_the_cost_to_go():
+    """With its weight in the loss, without it in the record alone."""
+    for weight in (0.0, 3.0):
+        output = ValueProgram(2.0, cost_to_go=weight, normalise=False)(trajectory_of())
+        assert output.terms["cost_to_go"] == (0.75 + 1.1875) / 2
+        assert output.loss == 2 * 2.0 + weight * output.terms["cost_to_go"]
+    assert "cost_to_go" not in LyapunovProgram()(trajectory_of()).terms
+
+
 @programs
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_of_zero_leaves_a_term_out(program, name):
@@ -105,7 +134,7 @@ def test_normalised_gradients_are_relative_to_the_mean_cost(program, loop):
     J, N = rollout(x0).cost.mean().item(), rollout.horizon.steps
     value = program is ValueProgram
     factors = (N / J**2, 1 / J**2, 1 / J) if value else (1 / J, 1 / J, 1 / J)
-    for name, factor in zip(TERMS, factors, strict=True):
+    for name, factor in [*zip(TERMS, factors, strict=True), *([("cost_to_go", 1 / J**2)] if value else [])]:
         alone = partial(program, **dict.fromkeys(TERMS, 0.0) | {name: 1.0})
         plain, normalised = (slopes(alone(normalise=on), rollout, x0) for on in (False, True))
         assert plain.norm() > 1e-3
@@ -118,7 +147,7 @@ def test_normalised_terms_have_no_unit_of_cost(program):
     def terms(unit, normalise):
         trajectory = trajectory_of(unit * VALUES, unit * STEP_COST, unit * TERMINAL_COST)
         output = program(1.0, 1.0, normalise=normalise)(trajectory)
-        return torch.stack([output.terms["constraint"], output.terms["terminal"]])
+        return torch.stack([term for name, term in output.terms.items() if name != "trajectory_cost"])
 
     assert_close(terms(7.0, normalise=True), terms(1.0, normalise=True))
     assert not torch.allclose(terms(7.0, normalise=False), terms(1.0, normalise=False))
@@ -168,14 +197,14 @@ def cost_to_go(quadratic):
 def losses(program, V, trajectory):
     values = V(trajectory.t[:, None], trajectory.x)
     output = program(1.0, 1.0, normalise=False)(trajectory._replace(value=values))
-    return output.constraint_loss.item(), output.terms["terminal"].item()
+    return tuple(term.item() for name, term in output.terms.items() if name != "trajectory_cost")
 
 
 @programs
 def test_the_exact_cost_to_go_leaves_nothing(program, cost_to_go):
     V, trajectory = cost_to_go.V(), cost_to_go.trajectory
     assert_close(V(trajectory.t[0], trajectory.x[0]), trajectory.cost)
-    assert losses(program, V, trajectory) == pytest.approx((0, 0), abs=1e-12)
+    assert max(losses(program, V, trajectory)) < 1e-12
 
 
 def test_any_other_V_leaves_a_residual(cost_to_go):
@@ -229,6 +258,13 @@ def test_weights_without_meaning_are_refused(program, weights):
     with pytest.raises(ValueError, match="Expected"):
         program(**weights)
     program(**dict.fromkeys(weights, 1.0))
+
+
+@pytest.mark.parametrize("weight", [-1.0, math.nan])
+def test_a_weight_of_the_cost_to_go_without_meaning_is_refused(weight):
+    with pytest.raises(ValueError, match="Expected weight cost_to_go ≥ 0"):
+        ValueProgram(cost_to_go=weight)
+    ValueProgram(constraint=0.0, cost_to_go=1.0)
 
 
 @pytest.mark.parametrize("margin", [-0.1, math.nan])

@@ -35,6 +35,7 @@ class Program(ABC):
     """
 
     degree: ClassVar[int]  # C and B are of this degree in units of cost
+    weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
 
     constraint: float = 1.0
     terminal: float = 0.0
@@ -42,11 +43,16 @@ class Program(ABC):
     normalise: bool = True
 
     def __post_init__(self) -> None:
-        for name in ("constraint", "terminal", "trajectory_cost"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"Expected weight {name} ≥ 0, got {getattr(self, name)}; terms are minimised.")
-        if not self.constraint + self.terminal + self.trajectory_cost > 0:
+        for name, weight in self.weights.items():
+            if not weight >= 0:
+                raise ValueError(f"Expected weight {name} ≥ 0, got {weight}; terms are minimised.")
+        if not any(self.weights.values()):
             raise ValueError("Expected at least one positive weight, got none; nothing would be learned.")
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """The weight of each term."""
+        return {name: getattr(self, name) for name in self.weighted}
 
     def __call__(
         self, trajectory: Trajectory, mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value
@@ -64,11 +70,7 @@ class Program(ABC):
         """
         values = trajectory.require_value()
         J = trajectory.cost.mean()
-        per_state = {
-            "constraint": self.constraint_term(values, trajectory),
-            "terminal": self.terminal_term(values, trajectory),
-            "trajectory_cost": trajectory.cost,
-        }
+        per_state = self.per_state(values, trajectory)
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
@@ -76,13 +78,20 @@ class Program(ABC):
             mean_cost = mean_over_processes(J.detach())
             unit = mean_cost**self.degree
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
-            terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1) / unit
-            terms["terminal"] = terms["terminal"] / unit
+            terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
+            terms = {name: term / unit for name, term in terms.items()}
             # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
             terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
-        weights = {"constraint": self.constraint, "terminal": self.terminal, "trajectory_cost": self.trajectory_cost}
-        loss = torch.stack([weight * terms[name] for name, weight in weights.items() if weight]).sum()
+        loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
+
+    def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
+        """Each term for each trajectory."""
+        return {
+            "constraint": self.constraint_term(values, trajectory),
+            "terminal": self.terminal_term(values, trajectory),
+            "trajectory_cost": trajectory.cost,
+        }
 
     @abstractmethod
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:

@@ -15,6 +15,16 @@ def residual(values: ValuePath, step_cost: StepPath) -> PerState:
     return (violation(values, step_cost) ** 2).sum(0)
 
 
+def cost_to_go_error(values: ValuePath, step_cost: StepPath, terminal_cost: PerState) -> PerState:
+    """Mean over the nodes of (V_n − J_n)², J_n = Σ_{k≥n} Δt ℓ_k + φ(x_N) being what the closed loop still pays.
+
+    V_n − J_n = V_N − φ − Σ_{k≥n} violation_k: zero where residual and terminal residual are, which see the level of V
+    only faintly, as it adds up over the steps.
+    """
+    remaining = torch.cat([step_cost, terminal_cost[None]]).flip(0).cumsum(0).flip(0)
+    return ((values - remaining) ** 2).mean(0)
+
+
 def hinge(values: ValuePath, step_cost: StepPath, margin: float = 0.0) -> PerState:
     """Σ_n max(V_{n+1} − V_n + (1 + margin) Δt ℓ_n, 0): zero where V falls at least as fast as the cost accrues.
 

@@ -3,16 +3,27 @@
 from dataclasses import dataclass
 
 from lyapnet.programs.base import Program
-from lyapnet.programs.terms import residual, terminal_residual
+from lyapnet.programs.terms import cost_to_go_error, residual, terminal_residual
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
 
 @dataclass(frozen=True)
 class ValueProgram(Program):
-    """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244."""
+    """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244.
+
+    The loss has a further term, cost_to_go · D, with D the mean over the nodes of (V_n − J_n)², J_n being what the
+    closed loop still pays. D is zero where C and B are, and holds V to its level, which they hardly see.
+    """
 
     degree = 2
+    weighted = (*Program.weighted, "cost_to_go")
+
+    cost_to_go: float = 0.0
+
+    def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
+        error = cost_to_go_error(values, trajectory.step_cost, trajectory.terminal_cost)
+        return {**super().per_state(values, trajectory), "cost_to_go": error}
 
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return residual(values, trajectory.step_cost)

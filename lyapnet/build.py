@@ -184,8 +184,9 @@ def build_program(config: Config) -> Program:
     """The program of a config."""
     options = {key: value for key, value in vars(config.program).items() if key != "name" and value is not None}
     cls = PROGRAMS[config.program.name]
-    if "margin" in options and "margin" not in inspect.signature(cls).parameters:
-        raise UsageError("Expected no program.margin with the value program, got one; a residual has no margin.")
+    for key in options:
+        if key not in inspect.signature(cls).parameters:
+            raise UsageError(f"Expected no program.{key} with the {config.program.name} program, got one; remove it.")
     with _section("program"):
         return cls(**options)
 

@@ -54,6 +54,7 @@ class ProgramConfig:
     trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
     normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
+    bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
 
 
 @dataclass

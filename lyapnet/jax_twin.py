@@ -100,11 +100,13 @@ class JaxTwin:
         violation = jnp.diff(path.value, axis=0) + (1 + getattr(program, "margin", 0)) * step_cost
         penalty = jnp.square if isinstance(program, ValueProgram) else jax.nn.relu
         C, B = penalty(violation).sum(0).mean(), penalty(path.terminal_cost - path.value[-1]).mean()
-        J = (path.running_cost[-1] + path.terminal_cost).mean()
+        J, bound = (path.running_cost[-1] + path.terminal_cost).mean(), path.value[0].mean()
         if program.normalise:
             unit = jax.lax.stop_gradient(J) ** program.degree
             C, B, J = C * self.task.horizon.steps ** (program.degree - 1) / unit, B / unit, jnp.log(J)
-        weighted = ((program.constraint, C), (program.terminal, B), (program.trajectory_cost, J))
+            bound = bound / unit
+        weighted = [(program.constraint, C), (program.terminal, B), (program.trajectory_cost, J)]
+        weighted += [(program.bound, bound)] if isinstance(program, LyapunovProgram) else []
         return sum(weight * term for weight, term in weighted if weight)
 
     def _rollout(self, parameters: tuple[Array, ...], x0: Array) -> Path:

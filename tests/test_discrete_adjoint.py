@@ -136,7 +136,7 @@ def test_gradient_against_finite_differences(system, cost):
 
 PROGRAMS = [
     program(2.0, 3.0, 5.0, normalise)
-    for program in (ValueProgram, LyapunovProgram, partial(LyapunovProgram, margin=0.5))
+    for program in (ValueProgram, LyapunovProgram, partial(LyapunovProgram, margin=0.5, bound=1.0))
     for normalise in (True, False)
 ]
 

@@ -27,14 +27,15 @@ class ProgramOutput(NamedTuple):
 class Program(ABC):
     """loss = constraint · C + terminal · B + trajectory_cost · J: the weighted terms of one program.
 
-    C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop.
-    A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is the paper's program.
+    C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop; a
+    program may add further terms. A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is
+    the paper's program.
 
-    With `normalise`, the weights are numbers without units: C and B are measured against the batch's mean cost
-    J̄ (detached; C as the mean over time), and J enters as log J̄, whose gradient is ∇J̄/J̄.
+    With `normalise`, the weights are numbers without units: every term is measured against the batch's mean cost
+    J̄ (detached; C as the mean over time), but J, which enters as log J̄, whose gradient is ∇J̄/J̄.
     """
 
-    degree: ClassVar[int]  # C and B are of this degree in units of cost
+    degree: ClassVar[int]  # all terms but J are of this degree in units of cost
 
     constraint: float = 1.0
     terminal: float = 0.0
@@ -68,19 +69,19 @@ class Program(ABC):
             "constraint": self.constraint_term(values, trajectory),
             "terminal": self.terminal_term(values, trajectory),
             "trajectory_cost": trajectory.cost,
+            **self.further_terms(values, trajectory),
         }
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
             mean_cost = mean_over_processes(J.detach())
-            unit = mean_cost**self.degree
+            terms = {name: term / mean_cost**self.degree for name, term in terms.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
-            terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1) / unit
-            terms["terminal"] = terms["terminal"] / unit
+            terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
             # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
             terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
-        weights = {"constraint": self.constraint, "terminal": self.terminal, "trajectory_cost": self.trajectory_cost}
+        weights = {name: getattr(self, name) for name in terms}
         loss = torch.stack([weight * terms[name] for name, weight in weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
 
@@ -95,6 +96,10 @@ class Program(ABC):
     def constraint_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         """C for each trajectory: the paper's sum, unless the program asks for more."""
         return self.constraint_loss(values, trajectory)
+
+    def further_terms(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
+        """The program's own terms for each trajectory, by the name of the field that is the weight."""
+        return {}
 
 
 def _require_finite(name: str, term: PerState, trajectory: Trajectory) -> None:

@@ -55,6 +55,7 @@ class ProgramConfig:
     normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
     cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
+    bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
 
 
 @dataclass

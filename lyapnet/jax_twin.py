@@ -101,11 +101,12 @@ class JaxTwin:
         penalty = jnp.square if isinstance(program, ValueProgram) else jax.nn.relu
         C, B = penalty(violation).sum(0).mean(), penalty(path.terminal_cost - path.value[-1]).mean()
         remaining = path.running_cost[-1] - path.running_cost + path.terminal_cost
-        D, J = jnp.square(path.value - remaining).mean(), remaining[0].mean()
+        D, J, V = jnp.square(path.value - remaining).mean(), remaining[0].mean(), path.value[0].mean()
         if program.normalise:
             unit = jax.lax.stop_gradient(J) ** program.degree
-            C, B, D, J = C * self.task.horizon.steps ** (program.degree - 1) / unit, B / unit, D / unit, jnp.log(J)
-        terms = {"constraint": C, "terminal": B, "trajectory_cost": J, "cost_to_go": D}
+            C, B, D, V = C * self.task.horizon.steps ** (program.degree - 1) / unit, B / unit, D / unit, V / unit
+            J = jnp.log(J)
+        terms = {"constraint": C, "terminal": B, "trajectory_cost": J, "cost_to_go": D, "bound": V}
         return sum(weight * terms[name] for name, weight in program.weights.items() if weight)
 
     def _rollout(self, parameters: tuple[Array, ...], x0: Array) -> Path:

@@ -173,6 +173,7 @@ OUT_OF_RANGE = {
     "program.constraint=-1": ("program.constraint", "-1"),
     "program.constraint=0 & program.terminal=0 & program.trajectory_cost=0": ("program", "weight"),
     "program.margin=-0.1": ("program.margin", "-0.1"),
+    "program.bound=-0.1": ("program.bound", "-0.1"),
     "network.hidden=[]": ("network.hidden",),
     "network.hidden=[0]": ("network.hidden", "0"),
     "network.hidden=[-3]": ("network.hidden", "-3"),
@@ -210,6 +211,8 @@ WRONG_SHAPE = {
 IMPOSSIBLE = {
     "program.name=value": ("program.margin", "value"),
     "program.cost_to_go=1": ("program.cost_to_go", "lyapunov"),
+    "program.name=value & program.margin=null & program.bound=0.5": ("program.bound", "value"),
+    "program.bound=1": ("program", "bound < constraint"),
     "network.name=fcn & network.epsilon=0.1": ("network.epsilon", "fcn"),
     "network.embed_angles=true": ("network.embed_angles", "anchored"),
     "network.activation=tanh": ("network", "activation", "convex", "softplus"),

@@ -142,7 +142,7 @@ PROGRAMS = [
         ValueProgram,
         partial(ValueProgram, cost_to_go=7.0),
         LyapunovProgram,
-        partial(LyapunovProgram, margin=0.5),
+        partial(LyapunovProgram, margin=0.5, bound=1.0),
     )
     for normalise in (True, False)
 ]

@@ -86,6 +86,16 @@ def test_programs_by_hand(program, constraint, terminal):
     assert output.trajectory_cost == J
 
 
+@pytest.mark.parametrize(("normalise", "unit"), [(False, 1.0), (True, (10.5 + 3.25) / 2)])
+def test_bound_by_hand(normalise, unit):
+    """The mean of V(0, x₀), weighted; the value program, whose V is no bound, has no such term."""
+    without, weighted = (LyapunovProgram(bound=b, normalise=normalise)(trajectory_of()) for b in (0.0, 0.5))
+    bound = (10.0 + 4.0) / 2 / unit
+    assert weighted.terms["bound"].item() == pytest.approx(bound)
+    assert (weighted.loss - without.loss).item() == pytest.approx(0.5 * bound)
+    assert "bound" not in ValueProgram()(trajectory_of()).terms
+
+
 @programs
 def test_the_papers_program_is_the_mean_sum_alone(program):
     output = program(constraint=1.0, normalise=False)(trajectory_of())
@@ -222,6 +232,21 @@ def test_the_hinge_bounds_the_cost_from_above(cost_to_go):
     assert (trajectory.cost > small(trajectory.t[0], trajectory.x[0])).all()
 
 
+def test_with_the_bound_no_V_is_better_than_the_cost_to_go(cost_to_go):
+    """Above it the bound costs more; below it the hinges do, unless they weigh less. Without it any larger V does."""
+
+    def loss(scale, **weights):
+        V, trajectory = cost_to_go.V(scale), cost_to_go.trajectory
+        values = V(trajectory.t[:, None], trajectory.x)
+        return LyapunovProgram(**weights, normalise=False)(trajectory._replace(value=values)).loss.item()
+
+    exact, large, small = (loss(scale, constraint=1.0, terminal=1.0, bound=0.5) for scale in (1.0, 1.1, 0.9))
+    assert exact == pytest.approx(0.5 * cost_to_go.trajectory.cost.mean().item())
+    assert min(large, small) > exact + 1e-3
+    assert loss(1.1, constraint=1.0, terminal=1.0) == pytest.approx(loss(1.0, constraint=1.0, terminal=1.0), abs=1e-12)
+    assert loss(0.9, constraint=0.51, terminal=0.1, bound=0.5) < exact - 1e-3
+
+
 NUMBERS = st.floats(-1e3, 1e3)
 
 
@@ -271,6 +296,13 @@ def test_a_weight_of_the_cost_to_go_without_meaning_is_refused(weight):
 def test_a_negative_margin_is_refused(margin):
     with pytest.raises(ValueError, match="Expected margin ≥ 0"):
         LyapunovProgram(margin=margin)
+
+
+@pytest.mark.parametrize("bound", [-0.1, math.nan, 1.0, 2.0])
+def test_a_bound_that_outweighs_the_hinge_is_refused(bound):
+    with pytest.raises(ValueError, match=r"Expected (weight )?bound"):
+        LyapunovProgram(constraint=1.0, bound=bound)
+    LyapunovProgram(constraint=1.0, bound=0.99)
 
 
 @programs

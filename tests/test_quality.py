@@ -19,10 +19,25 @@ def trained(name, folder, capsys, *overrides):
 
 def test_lyapunov_program_on_the_double_integrator(tmp_path, capsys):
     result = trained("double_integrator", tmp_path, capsys)
-    assert 1 <= result["cost_ratio"] <= 1.05
-    assert result["satisfied_fraction"] >= 0.95
+    assert 1 <= result["cost_ratio"] <= 1.02
+    assert result["satisfied_fraction"] >= 0.99
     assert result["decreasing_fraction"] == 1
-    assert result["bounded_fraction"] >= 0.95
+    assert result["bounded_fraction"] >= 0.99
+    assert result["value_to_cost"] <= 1.1
+
+
+def test_the_bound_is_what_makes_V_tight(tmp_path, capsys):
+    """The twin: the same training without it proves as much, by a V that is farther above the cost."""
+    result = trained("double_integrator", tmp_path, capsys, "program.bound=0")
+    assert result["satisfied_fraction"] >= 0.99
+    assert result["value_to_cost"] > 1.1
+
+
+def test_lyapunov_program_on_balancing(tmp_path, capsys):
+    result = trained("cartpole_balancing", tmp_path, capsys)
+    assert result["cost_mean"] <= 1.05 * 16.16  # of direct transcription, on the same states
+    assert result["satisfied_fraction"] >= 0.95  # of 100 states
+    assert result["value_to_cost"] <= 1.25
 
 
 def test_value_program_on_the_double_integrator(tmp_path, capsys):
@@ -37,10 +52,6 @@ def test_value_program_where_the_initial_states_are_thin(name, optimum, tmp_path
     result = trained(name, tmp_path, capsys)
     assert result["cost_mean"] <= 1.01 * optimum
     assert result["value_to_cost"] == pytest.approx(1, abs=0.02)
-
-
-def test_cost_falls_well_below_its_start(tmp_path, capsys):
-    assert trained("cartpole_balancing", tmp_path, capsys)["cost_mean"] < 20
 
 
 def test_without_its_own_term_the_value_is_wrong(tmp_path, capsys):

@@ -27,14 +27,15 @@ class ProgramOutput(NamedTuple):
 class Program(ABC):
     """loss = constraint · C + terminal · B + trajectory_cost · J: the weighted terms of one program.
 
-    C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop.
-    A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is the paper's program.
+    C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop; a
+    program may add further terms. A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is
+    the paper's program.
 
-    With `normalise`, the weights are numbers without units: C and B are measured against the batch's mean cost
-    J̄ (detached; C as the mean over time), and J enters as log J̄, whose gradient is ∇J̄/J̄.
+    With `normalise`, the weights are numbers without units: every term is measured against the batch's mean cost
+    J̄ (detached; C as the mean over time), but J, which enters as log J̄, whose gradient is ∇J̄/J̄.
     """
 
-    degree: ClassVar[int]  # C and B are of this degree in units of cost
+    degree: ClassVar[int]  # all terms but J are of this degree in units of cost
     weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
 
     constraint: float = 1.0
@@ -76,17 +77,16 @@ class Program(ABC):
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
             mean_cost = mean_over_processes(J.detach())
-            unit = mean_cost**self.degree
+            terms = {name: term / mean_cost**self.degree for name, term in terms.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
-            terms = {name: term / unit for name, term in terms.items()}
             # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
             terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
 
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
-        """Each term for each trajectory."""
+        """Each term of `weighted` for each trajectory."""
         return {
             "constraint": self.constraint_term(values, trajectory),
             "terminal": self.terminal_term(values, trajectory),

@@ -14,17 +14,27 @@ class LyapunovProgram(Program):
 
     Where both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 asks for a little more than is claimed, which leaves
     room for states between the sampled ones; the constraint loss that is logged has none.
+
+    The further term bound · V(0, x₀) makes that bound tight: the least V(0, ·) with C = B = 0 is the optimal cost.
+    Since V(0, x₀) ≥ J_N − C − B for any V, a V(0, x₀) below the cost is paid for in C or B at their weights: no gain
+    where these exceed the weight of the bound, so that the conditions hold as exact penalties.
     Source: P_L of arXiv 2305.15244.
     """
 
     degree = 1
+    weighted = (*Program.weighted, "bound")
 
     margin: float = 0.0
+    bound: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.margin >= 0:
             raise ValueError(f"Expected margin ≥ 0, got {self.margin}; a negative one asks for less than is claimed.")
+        if self.bound and not self.bound < self.constraint:
+            raise ValueError(
+                f"Expected bound < constraint, got {self.bound} ≥ {self.constraint}; V would sink below the cost."
+            )
 
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return hinge(values, trajectory.step_cost)
@@ -34,3 +44,6 @@ class LyapunovProgram(Program):
 
     def terminal_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return terminal_hinge(values, trajectory.terminal_cost)
+
+    def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
+        return {**super().per_state(values, trajectory), "bound": values[0]}

@@ -132,11 +132,12 @@ class ValidationOptimum(Callback):
         except OracleError as error:
             self.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
             return None
-        missing = f"; unknown for {optima.failures}, which are left out" if optima.failures else ""
-        self.console.print(
-            f"optimum of {len(optima.cost)} validation states: mean {optima.cost.nanmean():.4g}, "
-            f"in {time.perf_counter() - started:.0f} s{missing}", soft_wrap=True,
-        )  # fmt: skip
+        seconds, missing = time.perf_counter() - started, ""
+        if optima.failures:
+            missing = f"; unknown for {optima.failures}, which are left out"
+        if missing or seconds > 1:
+            mean = f"mean {optima.cost.nanmean():.4g}, in {seconds:.0f} s"
+            self.console.print(f"optimum of {len(optima.cost)} validation states: {mean}{missing}", soft_wrap=True)
         return optima.cost.cpu().reshape(-1, states.shape[-2])
 
 

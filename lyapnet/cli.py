@@ -321,21 +321,22 @@ SWEEP_COLUMNS = {
 def _sweep_table(config: str, rows: list[Any]) -> Table:
     """A line for each seed of a config's runs, and after several seeds their mean and their worst."""
     names = [rows[0].key.split(".")[-1]] if rows[0].key else []
-    headings = [*names, "seed", *SWEEP_COLUMNS.values(), "min", "MB"]
+    headings = [*names, "seed", *SWEEP_COLUMNS.values(), "s to\n1.02", "min", "MB"]
     table = Table(*(Column(heading, justify="right", no_wrap=True) for heading in headings), box=SIMPLE, padding=0)
     table.title = f"{config}: best checkpoints on unseen states of X₀"
-    table.caption = "min, MB: of a run with all its seeds"
+    table.caption = "s to 1.02: until J / J* of the validation states; min, MB: of a run with all its seeds"
     for value in dict.fromkeys(row.value for row in rows):
         chosen, label = [row for row in rows if row.value == value], [value] if names else []
         took = f"{chosen[0].training_seconds / 60:.1f}", f"{chosen[0].peak_bytes / 1e6:.0f}"
         for row in chosen:
             shown = [_measured_or_not(key, row.measures[key]) for key in SWEEP_COLUMNS]
-            table.add_row(*label, str(row.seed), *shown, *took)
+            near = "–" if row.seconds_to_near is None else f"{row.seconds_to_near:.0f}"
+            table.add_row(*label, str(row.seed), *shown, near, *took)
         if len(chosen) > 1:
             for name, summarise in (("mean", _mean), ("worst", _worst)):
                 columns = ([row.measures[key] for row in chosen] for key in SWEEP_COLUMNS)
                 shown = [summarise(key, values) for key, values in zip(SWEEP_COLUMNS, columns, strict=True)]
-                table.add_row(*label, name, *shown, "", "")
+                table.add_row(*label, name, *shown, "", "", "")
             table.add_section()
     return table
 

@@ -1,4 +1,4 @@
-"""TensorBoard event files of a run that resumes."""
+"""TensorBoard event files: cut back where a run resumes, and read."""
 
 import io
 from collections.abc import Iterator
@@ -23,6 +23,17 @@ def drop_events_after(folder: Path, step: int) -> None:
             if _keep(Event.FromString(record), step):
                 records.write(record)
         write_atomically(path, kept.getbuffer())
+
+
+def curve(folder: Path, tag: str) -> list[tuple[float, int, float]]:
+    """(seconds since the Epoch, step, value) of a run's scalar."""
+    return [
+        (event.wall_time, event.step, value.simple_value)
+        for path in event_files(folder)
+        for event in map(Event.FromString, RawEventFileLoader(str(path)).Load())
+        for value in event.summary.value
+        if value.tag == tag
+    ]
 
 
 def event_files(folder: Path) -> Iterator[Path]:

@@ -12,12 +12,14 @@ from typing import Any
 
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.event_files import curve
 from lyapnet.run import CONFIG, EVALUATION, Run, last_run
 
 MEASURES = (
     "cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "value_to_cost", "constraint_loss",
     "satisfied_fraction", "decreasing_fraction", "terminal_error",
 )  # fmt: skip
+NEAR = 0.02  # optimality gap
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Row:
     value: str | None
     seed: int
     measures: dict[str, float | None]  # of MEASURES, as `lyapnet evaluate` has them
+    seconds_to_near: float | None  # until the validation states cost within 2 % of the optimum; None: never, or unknown
     training_seconds: float  # of the run, all its seeds together
     peak_bytes: int  # likewise, of its process
     checkpoint: Path
@@ -129,7 +132,14 @@ def rows_of(point: Point, run: Run) -> Iterator[Row]:
     for one, member in zip(result.get("seeds", [result]), run.members(config), strict=True):
         measures = {key: one[key] for key in MEASURES}
         seconds, peak = record["training_seconds"], record["peak_bytes"]
-        yield Row(name, point.key, point.value, one["seed"], measures, seconds, peak, member.best)
+        near = _seconds_to_near(member.folder)
+        yield Row(name, point.key, point.value, one["seed"], measures, near, seconds, peak, member.best)
+
+
+def _seconds_to_near(folder: Path) -> float | None:
+    """Seconds from the first validation, before the first step, to the first one within NEAR of the optimum."""
+    gaps = curve(folder, "optimality_gap/val")
+    return next((round(seconds - gaps[0][0], 1) for seconds, _, gap in gaps if gap <= NEAR), None)
 
 
 def write_csv(rows: Sequence[Row], path: Path) -> None:

@@ -135,7 +135,7 @@ class ValidationOptimum(Callback):
         seconds, missing = time.perf_counter() - started, ""
         if optima.failures:
             missing = f"; unknown for {optima.failures}, which are left out"
-        if missing or seconds > 1:
+        if missing or seconds > 0.2:  # else nobody waits for it
             mean = f"mean {optima.cost.nanmean():.4g}, in {seconds:.0f} s"
             self.console.print(f"optimum of {len(optima.cost)} validation states: {mean}{missing}", soft_wrap=True)
         return optima.cost.cpu().reshape(-1, states.shape[-2])

@@ -54,11 +54,11 @@ def test_value_program_where_the_initial_states_are_thin(name, optimum, tmp_path
     assert result["value_to_cost"] == pytest.approx(1, abs=0.02)
 
 
-def test_without_its_own_term_the_value_is_wrong(tmp_path, capsys):
-    """The twin: at the length and cost of a shipped training, V does not find the level by the residual alone."""
-    overrides = ["program.cost_to_go=0", "program.constraint=0.01", "program.terminal=0.01"]
-    result = trained("cartpole_swingup", tmp_path, capsys, *overrides)
-    assert abs(result["value_to_cost"] - 1) > 0.03
+def test_a_short_training_meets_neither_bar_where_the_initial_states_are_thin(tmp_path, capsys):
+    """The twin."""
+    result = trained("cartpole_swingup", tmp_path, capsys, "training.iterations=20")
+    assert result["cost_mean"] > 1.01 * 185.95
+    assert abs(result["value_to_cost"] - 1) > 0.02
 
 
 def test_a_hundredth_of_the_training_is_not_enough(tmp_path, capsys):

@@ -13,7 +13,7 @@ class ValueProgram(Program):
     """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244.
 
     The loss has a further term, cost_to_go · D, with D the mean over the nodes of (V_n − J_n)², J_n being what the
-    closed loop still pays. D is zero where C and B are, and holds V to its level, which they hardly see.
+    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly.
     """
 
     degree = 2

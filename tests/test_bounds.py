@@ -212,7 +212,7 @@ def condition(system_name, network, policy="hjb", **options):
     cost = QuadraticCost(torch.eye(system.n), system.inverse_mass, torch.eye(system.n))
     V = NETWORKS[network](Scaling([1.0] * system.n, 1.0, 3.0), hidden=(8, 8), **options).requires_grad_(False)
     V = TerminalAnchor(V, cost, 1.0)
-    return DecreaseCondition(ClosedLoop(system, cost, POLICIES[policy](system, cost, V)), V, 0.9, 0.01), system.n
+    return DecreaseCondition(ClosedLoop(system, cost, POLICIES[policy](system, cost, V)), 0.9, 0.01), system.n
 
 
 CONDITIONS = [
@@ -278,7 +278,7 @@ def test_alpha_and_delta_are_checked():
     c, _ = condition("double_integrator", "fcn")
     for alpha, delta, named in ((0.0, 0.1, "alpha"), (1.1, 0.1, "alpha"), (0.9, -1.0, "delta")):
         with pytest.raises(UsageError, match=named):
-            DecreaseCondition(c.closed_loop, c.V, alpha, delta)
+            DecreaseCondition(c.closed_loop, alpha, delta)
 
 
 def test_float32_weights_are_taken_as_they_are():

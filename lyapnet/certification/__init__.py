@@ -3,6 +3,9 @@
 Three claims of growing strength: sampled, statistical, sound. Each class says in its first line what it claims.
 """
 
+from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
+from lyapnet.certification.branch_and_bound import Budget, Counterexample, Proof, prove
+from lyapnet.certification.funnel import SoundClaim, enclosing_box, sound_claim
 from lyapnet.certification.statistical import (
     SampledClaim,
     StatisticalClaim,
@@ -13,6 +16,15 @@ from lyapnet.certification.statistical import (
 )
 
 __all__ = [
+    "BoundedFunction",
+    "Budget",
+    "Counterexample",
+    "DecreaseCondition",
+    "Proof",
+    "SoundClaim",
+    "enclosing_box",
+    "prove",
+    "sound_claim",
     "SampledClaim",
     "StatisticalClaim",
     "Tolerances",

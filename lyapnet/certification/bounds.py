@@ -22,6 +22,7 @@ from lyapnet.certification import affine
 from lyapnet.certification.affine import AffineForm, box_form
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
+from lyapnet.policy import ValuePolicy
 from lyapnet.tracing import trace
 from lyapnet.types import PerState, State, Time
 
@@ -37,13 +38,15 @@ class DecreaseCondition(nn.Module):
         delta: δ ≥ 0, in cost per second; with δ > 0 there is room around the goal, where all else vanishes.
     """
 
-    def __init__(self, closed_loop: ClosedLoop, V: nn.Module, alpha: float, delta: float):
+    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float):
         super().__init__()
         if not 0 < alpha <= 1:
             raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
         if not 0 <= delta < float("inf"):
             raise UsageError(f"Expected delta ≥ 0, got {delta}; give it in cost per second.")
-        self.closed_loop, self.V, self.alpha, self.delta = closed_loop, V, alpha, delta
+        if not isinstance(closed_loop.policy, ValuePolicy):
+            raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")
+        self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.policy.V, alpha, delta
 
     def forward(self, t: Time, x: State) -> PerState:
         V_t, V_x = gradients(self.V, t, x)[0], state_gradient(self.V, t, x)  # the V_x of the policy: they cancel

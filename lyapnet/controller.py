@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from lyapnet.build import Task, build_rollout, build_task, build_value_function
 from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.closed_loop import ClosedLoop
 from lyapnet.config import Config, config_from_plain
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import CheckpointError, UsageError
@@ -56,6 +57,11 @@ class Controller:
     def V(self) -> nn.Module:
         """The value function as a module: (t, x) ↦ (*batch,)."""
         return self._V
+
+    @property
+    def closed_loop(self) -> ClosedLoop:
+        """(t, (x, ∫ℓ)) ↦ its derivative under u(t, x), as a module."""
+        return self._rollout.closed_loop
 
     @overload
     def value(self, t: Tensor | float, x: Tensor) -> Tensor: ...

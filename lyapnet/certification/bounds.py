@@ -54,6 +54,10 @@ class DecreaseCondition(nn.Module):
         flow = (V_x * self.closed_loop.system.dynamics(x, u)).sum(-1)
         return V_t + flow + self.alpha * self.closed_loop.cost.running(x, u) - self.delta
 
+    def height(self, t: Time, x: State) -> PerState:
+        """W(t, x) = V(t, x) − δt: where c ≤ 0, Ẇ ≤ −αℓ ≤ 0, so that sublevel sets of W hold what starts in them."""
+        return self.V(t, x) - self.delta * t
+
 
 class BoundedFunction:
     """(t, x) ↦ some numbers, with bounds of each on boxes of (t, x).

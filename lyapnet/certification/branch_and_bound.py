@@ -1,4 +1,4 @@
-"""Inequalities proved on boxes by bisection: on the part of a box where V is low, and least values over boxes.
+"""Inequalities proved on boxes by bisection: where W = V − δt is low, and least values over boxes.
 
 Every box of (t, x) is (1 + n,) long, time first. What is proved is proved by bounds that are sound up to what
 lyapnet.certification.affine says of rounding; plain evaluations serve to find counterexamples and to guess well.
@@ -24,7 +24,7 @@ class Budget:
     Args:
         seconds, boxes: the work.
         chunk: boxes that are bounded at once.
-        frontier: undecided boxes that are kept; beyond, those of highest V are given up.
+        frontier: undecided boxes that are kept; beyond, those of highest W are given up.
     """
 
     seconds: float = 60.0
@@ -49,27 +49,27 @@ class Counterexample(NamedTuple):
     t: float
     x: list[float]
     condition: float  # c(t, x) > 0
-    value: float  # V(t, x)
+    height: float  # W(t, x) = V(t, x) − δt
 
 
 @dataclass(frozen=True)
 class Proof:
-    """c ≤ 0 at every (t, x) of a box with V(t, x) ≤ `level`; −∞ where nothing is proved.
+    """c ≤ 0 at every (t, x) of a box with W(t, x) = V(t, x) − δt ≤ `level`; −∞ where nothing is proved.
 
     What remains undecided lies above that level.
     """
 
     level: float
     wanted: float  # the level up to which it was tried
-    counterexample: Counterexample | None  # the one of lowest V that was found
+    counterexample: Counterexample | None  # the one of lowest W that was found
     boxes: int
     seconds: float
     remaining_volume: float  # share of the box
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim that c ≤ 0 wherever V ≤ `wanted`."""
-        if self.counterexample is not None and self.counterexample.value <= self.wanted:
+        """Of the claim that c ≤ 0 wherever W ≤ `wanted`."""
+        if self.counterexample is not None and self.counterexample.height <= self.wanted:
             return "falsified"
         return "certified" if self.level >= self.wanted else "unknown"
 
@@ -118,7 +118,7 @@ class Boxes(NamedTuple):
         return Boxes(self.lower, upper, self.key).joined(Boxes(lower, self.upper, self.key))
 
 
-BELOW = 1e-3  # of a counterexample's V: how far under it the level goes on
+BELOW = 1e-2  # of a counterexample's W: how far under it the level goes on, lest ever smaller boxes follow its edge
 
 
 def prove(
@@ -129,10 +129,11 @@ def prove(
     stop_at_counterexample: bool = True,
     generator: torch.Generator | None = None,
 ) -> Proof:
-    """Prove c ≤ 0 on {V ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
+    """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
-    Counterexamples are sought first, by samples and by ascent from the worst of them. Then boxes of lowest V are bounded
-    first. A box is dropped where c ≤ 0 on all of it or V > level on all of it, and else cut in two. A counterexample that turns up among their centres lowers the level, and the search goes on under it.
+    Counterexamples are sought first, by samples and by ascent from the worst of them. Then boxes of lowest W are
+    bounded first. A box is dropped where c ≤ 0 on all of it or W > level on all of it, and else cut in two. A
+    counterexample that turns up among their centres lowers the level, and the search goes on under it.
 
     Args:
         condition: in float64.
@@ -141,7 +142,7 @@ def prove(
     """
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
-    bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.V(t, x)), (lower, upper))
+    bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), (lower, upper))
     level, worst = wanted, find_counterexample(condition, bounded, lower, upper, wanted, generator)
     frontier = Boxes(lower[None], upper[None], torch.full((1,), -torch.inf, dtype=torch.float64))
     boxes, given_up = 0, torch.inf
@@ -164,10 +165,10 @@ def prove(
 
 
 def _undecided(bounded: BoundedFunction, chunk: Boxes, level: float) -> tuple[Boxes, Tensor]:
-    """(the boxes on which c > 0 and V ≤ level are both possible, by their lower bounds of V; the axis to cut each)."""
-    c, V = bounded.forms(chunk.lower, chunk.upper)
-    (_, c_high), (V_low, _) = c.interval(), V.interval()
-    chunk = Boxes(chunk.lower, chunk.upper, torch.maximum(V_low, chunk.key))
+    """(the boxes on which c > 0 and W ≤ level are both possible, by their lower bounds of W; the axis to cut each)."""
+    c, W = bounded.forms(chunk.lower, chunk.upper)
+    (_, c_high), (W_low, _) = c.interval(), W.interval()
+    chunk = Boxes(chunk.lower, chunk.upper, torch.maximum(W_low, chunk.key))
     chosen = ~(c_high <= 0) & (chunk.key <= level)
     return chunk[chosen], axis_to_cut(bounded, c, chunk, chosen)
 
@@ -178,8 +179,8 @@ PROBES = 32  # boxes of a chunk that are cut along every axis
 def axis_to_cut(bounded: BoundedFunction, form: AffineForm, boxes: Boxes, chosen: Tensor) -> Tensor:
     """For each chosen box, the axis along which a cut lowers the remainder r of its first result most.
 
-    A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, r alone is in
-    the way. It is of second order in the widths, r ≈ Σ_k m_k w_k²; m is measured on a few boxes of the chunk.
+    A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, r alone is
+    in the way. It is of second order in the widths, r ≈ Σ_k m_k w_k²; m is measured on a few boxes of the chunk.
     """
     widths, radius = boxes.upper - boxes.lower, form.radius.nan_to_num(nan=1e100, posinf=1e100)
     some = torch.nonzero(chosen).flatten()[:: max(1, int(chosen.sum()) // PROBES)]
@@ -209,7 +210,7 @@ def find_counterexample(
     samples: int = 20_000,
     steps: int = 40,
 ) -> Counterexample | None:
-    """A point with c > 0 and V ≤ level, of the lowest V found: among samples, and by ascent of c from the worst 64."""
+    """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64."""
     unit = torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
     points = lower + (upper - lower) * unit
     values = _values(condition, points)
@@ -234,16 +235,16 @@ def _ascend(condition: DecreaseCondition, points: Tensor, lower: Tensor, upper: 
 def _values(condition: DecreaseCondition, points: Tensor) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         t, x = points[:, 0], points[:, 1:]
-        return condition(t, x), condition.V(t, x)
+        return condition(t, x), condition.height(t, x)
 
 
 def _lowest_violation(
     condition: DecreaseCondition, bounded: BoundedFunction, points: Tensor, level: float
 ) -> Counterexample | None:
-    """Among points at which c > 0 and V ≤ level, by bounds too, the one of lowest V."""
-    c, V = _values(condition, points)
-    candidates = torch.nonzero((c > 0) & (V <= level)).flatten()
-    candidates = candidates[V[candidates].argsort()][:256]
+    """Among points at which c > 0 and W ≤ level, by bounds too, the one of lowest W."""
+    c, W = _values(condition, points)
+    candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
+    candidates = candidates[W[candidates].argsort()][:256]
     if not len(candidates):
         return None
     (c_low, _), _ = bounded.bounds(points[candidates], points[candidates])
@@ -251,11 +252,11 @@ def _lowest_violation(
     if not len(candidates):
         return None
     first = candidates[0]
-    return Counterexample(float(points[first, 0]), points[first, 1:].tolist(), float(c[first]), float(V[first]))
+    return Counterexample(float(points[first, 0]), points[first, 1:].tolist(), float(c[first]), float(W[first]))
 
 
 def _under(found: Counterexample) -> float:
-    return found.value - BELOW * abs(found.value)
+    return found.height - BELOW * abs(found.height)
 
 
 def _just_below(value: float) -> float:
@@ -323,12 +324,12 @@ def share_below(
         inside += float(volume[high <= level].sum())
         chosen = (low <= level) & ~(high <= level) & (volume > 1e-7)
         chunk = Boxes(chunk.lower, chunk.upper, -volume / 2)
-        frontier = rest.joined(chunk[chosen].halves(form.coefficients[:, chosen].abs().argmax(0)))
+        frontier = rest.joined(chunk[chosen].halves(axis_to_cut(bounded, form, chunk, chosen)))
     return min(inside, 1.0)
 
 
 def faces(lower: Tensor, upper: Tensor, axes: range) -> tuple[Tensor, Tensor]:
-    """The faces of a box (d,) that are perpendicular to some of its axes, as boxes (2 · axes, d) without width there."""
+    """The faces of a box (d,) perpendicular to some of its axes, as boxes (2 · axes, d) without width there."""
     low, high = [], []
     for axis in axes:
         for side in (lower, upper):

@@ -24,15 +24,15 @@ from lyapnet.types import PerState, Value
 
 @dataclass(frozen=True)
 class SoundClaim:
-    """At every (t, x) in [0, T] × D with V(t, x) ≤ ρ + δT, in continuous time and for this model,
+    """With W(t, x) = V(t, x) − δt: at every (t, x) in [0, T] × D with W ≤ ρ, in continuous time and for this model,
 
-        V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,
+        V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
 
-    and V > ρ + δT on the boundary of D. Hence each closed loop that starts in D with V(0, x₀) ≤ ρ has
-    V(t, x(t)) ≤ ρ + δt, so that it stays in D up to T, and
+    and W > ρ on the boundary of D. Hence each closed loop that starts in D with V(0, x₀) ≤ ρ keeps V(t, x(t)) ≤ ρ + δt,
+    stays in D up to T, and has
 
         α ∫ℓ dt ≤ V(0, x₀) − V(T, x(T)) + δT,
-        J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max over the funnel's end of φ(x) − V(T, x)/α.
+        J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max of φ(x) − V(T, x)/α where W(T, x) ≤ ρ.
 
     The verdict is about the funnel of ρ = `wanted`, which holds all of X₀. Whatever the verdict, `rho` is the largest
     level that was proved, a funnel of its own, and `volume_share` how much of X₀ it holds.
@@ -57,7 +57,7 @@ class SoundClaim:
         if self.rho >= self.wanted:
             return "certified"
         found = self.counterexample
-        return "falsified" if found is not None and found.value <= self.wanted else "unknown"
+        return "falsified" if found is not None and found.height <= self.wanted else "unknown"
 
     def guaranteed_cost(self, value: PerState) -> PerState:
         """The bound of J(x₀) from V(0, x₀), (*batch,); infinite outside the funnel."""
@@ -88,30 +88,30 @@ def sound_claim(
     budget = budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
     x_low, x_high = initial_states.lower.double(), initial_states.upper.double()
-    rise = delta * duration
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
     if states is None:
-        states = enclosing_box(condition.V, initial_states, duration, wanted + rise)
+        states = enclosing_box(condition.height, initial_states, duration, wanted)
     domain = _domain(states, initial_states, duration)
-    needed = _just_above(wanted + rise)
-    rim = minimum(condition.V, *faces(*domain, axes=range(1, len(domain[0]))), budget, enough=_just_above(needed))
+    needed = _just_above(wanted)
+    rim = minimum(condition.height, *faces(*domain, axes=range(1, len(domain[0]))), budget, enough=_just_above(needed))
     proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator)
-    rho = wanted if proof.level >= needed else _just_below(proof.level) - rise
+    rho = wanted if proof.level >= needed else proof.level
     inside, excess = 0.0, float("inf")
     if rho > 0:
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
-        inside = share_below(condition.V, *(side[0] for side in _at(0.0, x_low, x_high)), rho, finish)
-        excess = _terminal_excess(condition, states, duration, proof.level, finish)
+        start_low, start_high = _at(0.0, x_low, x_high)
+        inside = share_below(condition.V, start_low[0], start_high[0], rho, finish)
+        excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho if rho > 0 else -float("inf"), wanted, inside, excess,
         proof.counterexample, proof.boxes, budget.elapsed, proof.remaining_volume,
     )  # fmt: skip
 
 
-def enclosing_box(V: Value, initial_states: Box, duration: float, level: float) -> Box:
-    """A box around X₀ and around {V(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
+def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) -> Box:
+    """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
 
-    Along 400 rays at 9 times the first radius is sought at which V exceeds the level; twice, the second time in units
+    Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
     of what the first gave. No ray is followed further than 8 times the largest component of X₀.
     """
     generator = torch.Generator().manual_seed(0)
@@ -125,18 +125,18 @@ def enclosing_box(V: Value, initial_states: Box, duration: float, level: float) 
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
         points = (radii[:, None, None] * rays).clamp(-8 * largest, 8 * largest)
         with torch.no_grad():
-            above = torch.stack([V(t.expand(points.shape[:-1]), points) > level for t in times])
+            above = torch.stack([W(t.expand(points.shape[:-1]), points) > level for t in times])
         below = above.cumsum(1) == 0  # from the goal to the first crossing
         reach = torch.where(below.any(0)[..., None], points.abs(), 0.0).amax((0, 1)).clamp_min(1e-6 * float(largest))
     reach = 1.15 * torch.maximum(reach, inner)
     return Box(-reach, reach)
 
 
-def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, level: float, budget: Budget) -> float:
-    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with V(T, x) ≤ level."""
+def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
+    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ."""
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
-    return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, V, level, unit=level)
+    return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=rho)
 
 
 def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The command line: lyapnet train | evaluate | sweep | bench | systems."""
+"""The command line: lyapnet train | evaluate | sweep | certify | bench | systems."""
 
 import json
 import sys
@@ -78,24 +78,10 @@ def evaluate(
     The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
     once for each state: the next evaluation of any controller of the task reads it.
     """
-    import torch
-    from torch import nn
-
-    from lyapnet.build import build_system, resolve
-    from lyapnet.checkpoint import read_checkpoint
-    from lyapnet.config import SystemConfig
-    from lyapnet.controller import config_of, load
     from lyapnet.evaluation import evaluation
-    from lyapnet.networks import NETWORKS
     from lyapnet.robustness import robustness
 
-    own = None
-    if system is not None:
-        parameters = config_of(read_checkpoint(checkpoint), checkpoint).system.parameters
-        own = build_system(SystemConfig(name=system, parameters=parameters))
-    own_network = None if network is None else resolve(network, NETWORKS, "--network", nn.Module)
-    controller = load(checkpoint, system=own, network=own_network)
-    torch.set_num_threads(controller.config.training.threads)
+    controller = _load(checkpoint, system, network)
     notes = Console(stderr=True, highlight=False)
     with notes.status("measuring …") as status:
         measured = evaluation(
@@ -157,6 +143,67 @@ def sweep(
             from lyapnet import figures
 
             figures.swept(rows).savefig(out / "sweep.png", dpi=150)
+
+
+@app.command()
+def certify(
+    checkpoint: Checkpoint,
+    kind: Annotated[str, typer.Option(help="sampled, statistical or sound.")] = "statistical",
+    samples: Annotated[
+        int | None, typer.Option(min=1, help="Initial states to draw; 100 for sampled, 10000 for statistical.")
+    ] = None,
+    confidence: Annotated[float, typer.Option(help="Of the statistical bound.")] = 1 - 1e-6,
+    share: Annotated[float, typer.Option(help="Of X₀, about which the statistical verdict is.")] = 0.99,
+    radius: Annotated[
+        float | None, typer.Option(help="Of success at T, in the norm of x; a tenth of the largest ‖x₀‖ if none.")
+    ] = None,
+    alpha: Annotated[float, typer.Option(help="Sound: the share of ℓ that V pays for.")] = 0.95,
+    delta: Annotated[
+        float | None, typer.Option(help="Sound: slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.")
+    ] = None,
+    states: Annotated[
+        str | None, typer.Option("--set", help="Sound: the set D, as lower:upper,…; found if none.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=0, help="Sound: when to stop undecided.")] = 60.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    figure: Annotated[Path | None, typer.Option(help="Sound, 2 states: draw the funnel.", metavar="FILE")] = None,
+    system: Annotated[str | None, typer.Option(help="module:Class of a system of your own.")] = None,
+    network: Annotated[str | None, typer.Option(help="module:Class of a network of your own.")] = None,
+    debug: Debug = False,
+) -> None:
+    """Certify a controller: on how much of X₀ it keeps its promises, and how sure that is.
+
+    sampled      the share of some states whose closed loop succeeds
+    statistical  a share of X₀ that succeeds, with a confidence
+    sound        a funnel that no closed loop leaves, and its cost: proved
+
+    Verdicts: certified, falsified (with a state), unknown.
+    """
+    from lyapnet import certificates
+
+    if kind not in certificates.KINDS:
+        raise UsageError(f"Expected --kind as one of {', '.join(certificates.KINDS)}, got {kind!r}; choose one.")
+    domain = None if states is None else certificates.parse_set(states)
+    controller = _load(checkpoint, system, network)
+    with Console(stderr=True).status(f"certifying, {kind}"):
+        if kind == "sound":
+            result, claim = certificates.sound(controller, alpha, delta, domain, seconds)
+            if figure is not None:
+                from lyapnet.figures import funnel
+
+                funnel(claim, controller.V, controller.initial_states, controller.system).savefig(figure, dpi=150)
+        else:
+            tolerances = certificates.default_tolerances(controller, radius)
+            result = (
+                certificates.sampled(controller, tolerances, samples or 100, seed)
+                if kind == "sampled"
+                else certificates.statistical(controller, tolerances, samples or 10_000, confidence, share, seed)
+            )
+    if as_json:
+        print(json.dumps(result))
+    else:
+        Console(highlight=False).print(_certificate_table(str(checkpoint), result))
 
 
 @app.command()
@@ -250,6 +297,27 @@ def systems(debug: Debug = False) -> None:
     console = Console(highlight=False)
     console.print(table)
     console.print("A system of your own: system.name=module:Class; see the README.")
+
+
+def _load(checkpoint: Path, system: str | None, network: str | None) -> Any:
+    """The controller of a checkpoint, with a system or network of the user's own where one is named."""
+    import torch
+    from torch import nn
+
+    from lyapnet.build import build_system, resolve
+    from lyapnet.checkpoint import read_checkpoint
+    from lyapnet.config import SystemConfig
+    from lyapnet.controller import config_of, load
+    from lyapnet.networks import NETWORKS
+
+    own = None
+    if system is not None:
+        parameters = config_of(read_checkpoint(checkpoint), checkpoint).system.parameters
+        own = build_system(SystemConfig(name=system, parameters=parameters))
+    own_network = None if network is None else resolve(network, NETWORKS, "--network", nn.Module)
+    controller = load(checkpoint, system=own, network=own_network)
+    torch.set_num_threads(controller.config.training.threads)
+    return controller
 
 
 def _items(values: list[str] | None) -> list[str]:
@@ -418,6 +486,51 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any]) -> None:
         ("use", f'lyapnet.load("{best}")'),
     ):
         console.print(f"{what:<10}{command}", soft_wrap=True)
+
+
+def _certificate_table(title: str, result: dict[str, Any]) -> Table:
+    table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
+    for key, label in CERTIFICATE_ROWS.items():
+        if result.get(key) is not None:
+            table.add_row(label, _certified(key, result[key]))
+    return table
+
+
+def _certified(key: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items())
+    if isinstance(value, list):
+        return f"[{', '.join(_certified('', entry) for entry in value)}]"
+    if key == "confidence":
+        return f"1 − {1 - value:.2g}"
+    return f"{value:.3%}" if key.endswith(("share", "bound", "volume")) else f"{value:.4g}"
+
+
+CERTIFICATE_ROWS = {
+    "samples": "states",
+    "tolerances": "tolerances",
+    "decrease_share": "condition holds along the closed loop",
+    "terminal_share": "‖x(T)‖ within the radius",
+    "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
+    "all_share": "all three",
+    "confidence": "confidence",
+    "decrease_lower_bound": "condition holds on at least",
+    "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
+    "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
+    "probability_lower_bound": "all three on at least",
+    "failure": "a state that fails",
+    "alpha": "α",
+    "delta": "δ, cost per second",
+    "set": "D",
+    "rho_wanted": "ρ for all of X₀",
+    "rho": "largest ρ proved",
+    "volume_share": "share of X₀ in that funnel, at least",
+    "guaranteed_cost_ratio": "guaranteed cost there / optimum, ratio of the means",
+    "counterexample": "counterexample of lowest V − δt",
+    "remaining_volume": "share of [0, T] × D undecided",
+    "boxes": "boxes",
+    "seconds": "seconds",
+}
 
 
 ROWS = {

@@ -54,14 +54,14 @@ class Controller:
         return self._task.initial_states
 
     @property
-    def closed_loop(self) -> ClosedLoop:
-        """ẋ = f(x) + g(x)u(t, x) and its running cost."""
-        return self._rollout.closed_loop
-
-    @property
     def V(self) -> nn.Module:
         """The value function as a module: (t, x) ↦ (*batch,)."""
         return self._V
+
+    @property
+    def closed_loop(self) -> ClosedLoop:
+        """(t, (x, ∫ℓ)) ↦ its derivative under u(t, x), as a module."""
+        return self._rollout.closed_loop
 
     @overload
     def value(self, t: Tensor | float, x: Tensor) -> Tensor: ...

@@ -17,6 +17,8 @@ from matplotlib.ticker import NullLocator
 from torch import Tensor
 
 from lyapnet.bench import Accuracy, Row
+from lyapnet.certification import SoundClaim
+from lyapnet.errors import UsageError
 from lyapnet.evaluation import StateTable
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
@@ -401,3 +403,45 @@ def _free_components(box: Box) -> int:
 
 def _numpy(tensor: Tensor) -> np.ndarray:
     return tensor.detach().cpu().numpy()
+
+
+def funnel(claim: SoundClaim, V: Value, initial_states: Box, system: ControlAffineSystem) -> Figure:
+    """The proved funnel {V(t, ·) ≤ ρ + δt} of two states at five times, with X₀, D and the counterexample.
+
+    Raises:
+        UsageError: there are not two states.
+    """
+    if system.n != 2:
+        raise UsageError(
+            f"Expected a system of 2 states for a figure of the funnel, got {system.n}; leave out --figure."
+        )
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    lower, upper = claim.states.lower, claim.states.upper
+    grid = [torch.linspace(float(a), float(b), 201).to(lower) for a, b in zip(lower, upper, strict=True)]
+    states = torch.stack(torch.meshgrid(*grid, indexing="ij"), -1).to(initial_states.lower)
+    handles: list[Artist] = []
+    for share, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True):
+        if not claim.rho > 0:
+            break
+        t = share * claim.duration
+        with torch.no_grad():
+            values = V(states.new_tensor(t).expand(states.shape[:-1]), states)
+        axes.contour(*grid, values.T, levels=[claim.rho + claim.delta * t], colors=[colour])
+        handles.append(Patch(color=colour, label=f"t = {t:.3g} s"))
+    (left, bottom), (width, height) = initial_states.lower.tolist(), initial_states.widths.tolist()
+    box = Rectangle((left, bottom), width, height, fill=False, linestyle="--", label="X₀")
+    handles.append(axes.add_patch(box))
+    if (found := claim.counterexample) is not None:
+        handles += axes.plot(*found.x, "x", color=VERMILION, label=f"fails, t = {found.t:.3g} s")
+    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]))
+    for name, unit, label in zip(
+        system.state_names, system.state_units, (axes.set_xlabel, axes.set_ylabel), strict=True
+    ):
+        label(f"{name} ({unit})" if unit else name)
+    axes.set_title(
+        f"{claim.verdict}: {claim.volume_share:.1%} of X₀ in the funnel, α = {claim.alpha:g}, δ = {claim.delta:.3g}",
+        fontsize=8,
+    )
+    axes.legend(handles=handles, fontsize=7, loc="upper right")
+    return figure

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-TRAINING, VALIDATION, TEST, FIGURES = range(4)
+TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION = range(5)
 
 
 def stream(seed: int, *path: int) -> torch.Generator:

@@ -13,7 +13,7 @@ FLOW = (
     "errors", "types", "linear_algebra", "sets", "systems", "cost", "calculus", "networks", "policy", "closed_loop",
     "tracing", "compilation", "runge_kutta", "discrete_adjoint", "rollout", "programs",
 )  # fmt: skip
-CORE = (*FLOW, "oracles")
+CORE = (*FLOW, "oracles", "certification")
 EDGE = ("lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib")
 
 

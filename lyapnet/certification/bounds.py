@@ -1,0 +1,444 @@
+"""Bounds of a function on boxes: its operator graph, interpreted with affine forms.
+
+The function is the one that training and control use, traced at one point (t, x). What a rule does with an operator is
+in RULES; an operator without one is refused by name. The arithmetic of forms, and what is covered of rounding, is in
+lyapnet.certification.affine. Numbers that do not depend on the point (weights, W → softplus(W), a constant mass matrix)
+are computed once, in float64: bounds are those of the function with these numbers.
+"""
+
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch._functorch.compile_utils import fx_graph_cse
+from torch.func import vmap
+from torch.fx import Graph, Node
+from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
+
+from lyapnet.calculus import gradients, state_gradient
+from lyapnet.certification import affine
+from lyapnet.certification.affine import AffineForm, box_form
+from lyapnet.closed_loop import ClosedLoop
+from lyapnet.errors import UsageError
+from lyapnet.policy import ValuePolicy
+from lyapnet.tracing import trace
+from lyapnet.types import PerState, State, Time
+
+aten = torch.ops.aten
+
+
+class DecreaseCondition(nn.Module):
+    """c(t, x) = V_t + V_xᵀ(f + g u) + α ℓ(x, u) − δ with u = policy(t, x): V falls where c ≤ 0, up to δ.
+
+    Args:
+        closed_loop: the system, its cost, and a control law that V defines.
+        alpha: α in (0, 1], the share of the running cost that V pays for.
+        delta: δ ≥ 0, in cost per second; with δ > 0 there is room around the goal, where all else vanishes.
+    """
+
+    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float):
+        super().__init__()
+        if not 0 < alpha <= 1:
+            raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
+        if not 0 <= delta < float("inf"):
+            raise UsageError(f"Expected delta ≥ 0, got {delta}; give it in cost per second.")
+        if not isinstance(closed_loop.policy, ValuePolicy):
+            raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")
+        self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.policy.V, alpha, delta
+
+    def forward(self, t: Time, x: State) -> PerState:
+        V_t, V_x = gradients(self.V, t, x)[0], state_gradient(self.V, t, x)  # the V_x of the policy: they cancel
+        u = self.closed_loop.policy(t, x)
+        flow = (V_x * self.closed_loop.system.dynamics(x, u)).sum(-1)
+        return V_t + flow + self.alpha * self.closed_loop.cost.running(x, u) - self.delta
+
+    def height(self, t: Time, x: State) -> PerState:
+        """W(t, x) = V(t, x) − δt: where c ≤ 0, Ẇ ≤ −αℓ ≤ 0, so that sublevel sets of W hold what starts in them."""
+        return self.V(t, x) - self.delta * t
+
+
+class BoundedFunction:
+    """(t, x) ↦ some numbers, with bounds of each on boxes of (t, x).
+
+    Args:
+        function: of t () and x (n,), with tensors of any shape as results; in float64, from torch operations whose
+            course does not depend on values.
+        sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
+
+    Raises:
+        UsageError: the function cannot be traced; or it has an operator without a rule, which is named.
+    """
+
+    def __init__(self, function: Callable[[Tensor, Tensor], tuple[Tensor, ...]], sample: tuple[Tensor, Tensor]):
+        lower, upper = sample
+        generator = torch.Generator().manual_seed(0)
+        points = [lower + (upper - lower) * torch.rand(len(lower), generator=generator).to(lower) for _ in range(2)]
+        try:
+            first, other = [(y[0].clone(), y[1:].clone()) for y in points]
+            self._graph = trace(function, first, other)
+        except UsageError:
+            raise
+        except Exception as error:
+            raise UsageError(
+                f"Expected f, g, the cost and V in torch operations whose course does not depend on values, got {error}"
+            ) from error
+        self._nodes = list(_without_copies(self._graph.graph).nodes)
+        self._fold_constants()
+        self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
+        self.forms(lower[None], upper[None])  # an operator without a rule is found here
+
+    def forms(self, lower: Tensor, upper: Tensor) -> list[AffineForm]:
+        """The results on boxes of (t, x), (boxes, 1 + n) each, as affine forms in the coordinates of the box."""
+        box = box_form(lower, upper)
+        inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
+        values: dict[Node, Any] = dict(self._constants)
+        for node in self._nodes:
+            if node.op == "placeholder":
+                values[node] = next(inputs)
+            elif node.op == "output":
+                results = tree_map(values.__getitem__, node.args[0], is_leaf=lambda leaf: isinstance(leaf, Node))
+                return [y if isinstance(y, AffineForm) else affine.constant_form(y, box) for y in results]
+            elif node not in values:
+                values[node] = _apply(node, values)
+            for source in node.all_input_nodes:
+                if self._last_use[source] is node and source not in self._constants:
+                    del values[source]
+        raise AssertionError("a graph ends with its output")
+
+    def bounds(self, lower: Tensor, upper: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where there are none."""
+        return [form.interval() for form in self.forms(lower, upper)]
+
+    def _fold_constants(self) -> None:
+        self._constants: dict[Node, Any] = {}
+        for node in self._nodes:
+            if node.op == "get_attr":
+                value = _attribute(self._graph, str(node.target))
+                self._constants[node] = value.double() if value.is_floating_point() else value
+            elif node.op == "call_function" and all(source in self._constants for source in node.all_input_nodes):
+                arguments, keywords = _values(node, self._constants)
+                self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+
+
+def _without_copies(graph: Graph) -> Graph:
+    """The graph without nodes that hand on what they get, and without what is then computed twice."""
+    constants: dict[str, Node] = {}
+    for node in list(graph.nodes):
+        if node.op == "get_attr":  # which CSE leaves apart
+            node.replace_all_uses_with(constants.setdefault(str(node.target), node))
+        elif node.target in COPIES and node.meta["val"].shape == node.args[0].meta["val"].shape:
+            node.replace_all_uses_with(node.args[0])
+            graph.erase_node(node)
+    graph = fx_graph_cse(graph)
+    graph.eliminate_dead_code()
+    return graph
+
+
+COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view.default, aten.reshape.default}
+
+Rule = Callable[..., Any]
+RULES: dict[Any, Rule] = {}
+"""Operator ↦ its rule: the operator's arguments, some of them affine forms, ↦ an affine form, or a tensor."""
+
+
+def rule(*operators: Any) -> Callable[[Rule], Rule]:
+    """Register a rule for operators."""
+
+    def register(function: Rule) -> Rule:
+        RULES.update(dict.fromkeys(operators, function))
+        return function
+
+    return register
+
+
+def _apply(node: Node, values: dict[Node, Any]) -> Any:
+    arguments, keywords = _values(node, values)
+    if not any(isinstance(values[source], AffineForm | list) for source in node.all_input_nodes):
+        return node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+    found = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
+    if found is None:
+        raise UsageError(
+            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
+            "lyapnet.certification.bounds.RULES."
+        )
+    return found(*arguments, **keywords)
+
+
+def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
+    return tree_map(
+        lambda leaf: values[leaf] if isinstance(leaf, Node) else leaf,
+        (tuple(node.args), dict(node.kwargs)),
+        is_leaf=lambda leaf: isinstance(leaf, Node),
+    )
+
+
+# Sums and products
+
+
+@rule(aten.add.Tensor, aten.add.Scalar)
+def _add(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+    """x + αy."""
+    if alpha != 1:
+        y = _multiply(y, alpha) if isinstance(y, AffineForm) else y * alpha
+    if isinstance(x, AffineForm) and isinstance(y, AffineForm):
+        return affine.add(x, y)
+    return affine.shift(x, _tensor(y)) if isinstance(x, AffineForm) else affine.shift(y, _tensor(x))
+
+
+@rule(aten.sub.Tensor, aten.sub.Scalar)
+def _subtract(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+    """x − αy."""
+    return _add(x, affine.negate(y) if isinstance(y, AffineForm) else -y, alpha)
+
+
+@rule(aten.rsub.Scalar, aten.rsub.Tensor)
+def _subtract_from(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+    """y − αx."""
+    return _subtract(y, x, alpha)
+
+
+@rule(aten.mul.Tensor, aten.mul.Scalar)
+def _multiply(x: Any, y: Any) -> AffineForm:
+    """x · y; a square where both are one value."""
+    if x is y:
+        return affine.square(x)
+    if isinstance(x, AffineForm) and isinstance(y, AffineForm):
+        return affine.multiply(x, y)
+    return affine.scale(x, _tensor(y)) if isinstance(x, AffineForm) else affine.scale(y, _tensor(x))
+
+
+@rule(aten.div.Tensor, aten.div.Scalar)
+def _divide(x: Any, y: Any) -> AffineForm:
+    """x · (1/y)."""
+    if isinstance(y, AffineForm):
+        return _multiply(x, affine.reciprocal(y))
+    return affine.scale(x, 1 / _tensor(y)).rounded()
+
+
+@rule(aten.pow.Tensor_Scalar)
+def _power(x: AffineForm, exponent: float) -> AffineForm:
+    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal."""
+    if exponent < 0:
+        return affine.reciprocal(_power(x, -exponent))
+    if exponent == 0.5:
+        return affine.sqrt(x)
+    if exponent != int(exponent) or exponent == 0:
+        raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
+    if exponent == 1:
+        return x
+    half = _power(x, exponent // 2)
+    return affine.square(half) if exponent % 2 == 0 else affine.multiply(affine.square(half), x)
+
+
+@rule(aten.mm.default, aten.matmul.default, aten.bmm.default)
+def _matrix_product(x: Any, y: Any) -> AffineForm:
+    """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
+    if not isinstance(x, AffineForm):
+        return _transposed(_matrix_product(_transposed(y), x.mT))
+    if not isinstance(y, AffineForm) and y.ndim == 2:
+        return affine.matrix_product(x, y)
+    left, right = ARRANGEMENTS[aten.unsqueeze.default](x, -1), _unsqueezed(y, -3)
+    return _sum(_multiply(left, right), [-2])
+
+
+@rule(aten.mv.default)
+def _matrix_vector_product(x: Any, y: Any) -> AffineForm:
+    """xy of a matrix and a vector."""
+    return ARRANGEMENTS[aten.squeeze.dim](_matrix_product(x, _unsqueezed(y, -1)), -1)
+
+
+@rule(aten.addmm.default)
+def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> AffineForm:
+    """β · offset + α · xy."""
+    product = _matrix_product(x, y)
+    product = product if alpha == 1 else _multiply(product, alpha)
+    return _add(product, offset, beta)
+
+
+@rule(aten.neg.default)
+def _negate(x: AffineForm) -> AffineForm:
+    """−x."""
+    return affine.negate(x)
+
+
+@rule(aten.sum.default, aten.sum.dim_IntList)
+def _sum(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
+    """Σ x over some axes; remainders add."""
+    return _rearranged(lambda y: y.sum(dim or None, keepdim), x.rounded(x.radius[0].numel()))
+
+
+@rule(aten.mean.default, aten.mean.dim)
+def _mean(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
+    """Σ x over some axes, divided by their length."""
+    total = _sum(x, dim, keepdim)
+    return _multiply(total, total.radius[0].numel() / x.radius[0].numel())
+
+
+# Functions of one number
+
+rule(aten.exp.default)(affine.exp)
+rule(aten.log1p.default)(affine.log1p)
+rule(aten.sqrt.default)(affine.sqrt)
+rule(aten.reciprocal.default)(affine.reciprocal)
+rule(aten.sigmoid.default)(affine.sigmoid)
+rule(aten.sin.default)(affine.sin)
+rule(aten.cos.default)(affine.cos)
+
+
+@rule(aten.rsqrt.default)
+def _rsqrt(x: AffineForm) -> AffineForm:
+    """1/√x."""
+    return affine.reciprocal(affine.sqrt(x))
+
+
+@rule(aten.tanh.default)
+def _tanh(x: AffineForm) -> AffineForm:
+    """tanh x = 2σ(2x) − 1; with powers of two no rounding is added."""
+    double = AffineForm(2 * x.terms, 2 * x.radius)
+    return _subtract(_multiply(affine.sigmoid(double), 2.0), 1.0)
+
+
+@rule(aten.softplus.default)
+def _softplus(x: AffineForm, beta: float = 1, threshold: float = 20) -> AffineForm:
+    """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is lower by at most e^{−threshold}/β."""
+    smooth = _divide(affine.softplus(_multiply(x, beta) if beta != 1 else x), beta)
+    return _loosened_above(smooth, x, beta, threshold, 1 / beta)
+
+
+@rule(aten.softplus_backward.default)
+def _softplus_backward(gradient: Any, x: AffineForm, beta: float, threshold: float) -> AffineForm:
+    """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
+    slope = affine.sigmoid(_multiply(x, beta) if beta != 1 else x)
+    return _multiply(gradient, _loosened_above(slope, x, beta, threshold, 1.0))
+
+
+@rule(aten.silu.default)
+def _silu(x: AffineForm) -> AffineForm:
+    """x σ(x)."""
+    return affine.multiply(x, affine.sigmoid(x))
+
+
+@rule(aten.silu_backward.default)
+def _silu_backward(gradient: Any, x: AffineForm) -> AffineForm:
+    """gradient · σ(1 + x(1 − σ))."""
+    s = affine.sigmoid(x)
+    return _multiply(gradient, _multiply(s, _add(_multiply(x, _subtract(1.0, s)), 1.0)))
+
+
+@rule(aten.sigmoid_backward.default)
+def _sigmoid_backward(gradient: Any, s: AffineForm) -> AffineForm:
+    """gradient · s(1 − s)."""
+    return _multiply(gradient, _subtract(s, affine.square(s)))
+
+
+@rule(aten.tanh_backward.default)
+def _tanh_backward(gradient: Any, y: AffineForm) -> AffineForm:
+    """gradient · (1 − y²)."""
+    return _multiply(gradient, _subtract(1.0, affine.square(y)))
+
+
+def _loosened_above(y: AffineForm, x: AffineForm, beta: float, threshold: float, factor: float) -> AffineForm:
+    above = x.interval()[1] * beta > threshold
+    return AffineForm(y.terms, y.radius + above * (factor * torch.exp(torch.tensor(-threshold, dtype=torch.float64))))
+
+
+# Arrangements: entries copied, moved or left out, without arithmetic
+
+
+def _arranging(function: Callable[..., Any]) -> Rule:
+    """The rule of an operator that only arranges entries: c, A_k and r are arranged alike."""
+    return lambda *arguments, **keywords: _rearranged(function, *arguments, **keywords)
+
+
+def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+    """The operator on c and on each A_k of its arguments, in one call, and on their r."""
+    leaves, structure = tree_flatten((arguments, keywords), is_leaf=lambda leaf: isinstance(leaf, AffineForm))
+    forms = [leaf for leaf in leaves if isinstance(leaf, AffineForm)]
+
+    def call(*tensors: Tensor) -> Any:
+        filled = iter(tensors)
+        arguments, keywords = tree_unflatten(
+            [next(filled) if isinstance(leaf, AffineForm) else leaf for leaf in leaves], structure
+        )
+        return function(*arguments, **keywords)
+
+    terms = vmap(vmap(call))(*(form.terms for form in forms))
+    radius = vmap(call)(*(form.radius for form in forms))
+    if isinstance(terms, Tensor):
+        return AffineForm(terms, radius)
+    return [AffineForm(*pair) for pair in zip(terms, radius, strict=True)]
+
+
+def _joining(function: Callable[..., Any]) -> Rule:
+    """As _arranging, of a list in which constants stand beside forms."""
+
+    def join(items: Sequence[Any], dim: int = 0) -> AffineForm:
+        like = next(item for item in items if isinstance(item, AffineForm))
+        forms = [item if isinstance(item, AffineForm) else affine.constant_form(item, like) for item in items]
+        return _rearranged(function, forms, dim)
+
+    return join
+
+
+ARRANGEMENTS: dict[Any, Rule] = {
+    **{
+        operation: _arranging(operation)
+        for operation in (
+            aten.reshape.default, aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
+            aten.unsqueeze.default, aten.squeeze.default, aten.squeeze.dim, aten.squeeze.dims, aten.select.int,
+            aten.slice.Tensor, aten.index.Tensor, aten.clone.default, aten.select_backward.default, aten.unbind.int,
+            aten.slice_backward.default, aten.split.Tensor, aten.flip.default,
+        )
+    },
+    **{operation: _arranging(aten.reshape.default) for operation in (aten.view.default, aten._unsafe_view.default)},
+    aten.squeeze_.dim: _arranging(aten.squeeze.dim),
+    aten.cat.default: _joining(aten.cat.default),
+    aten.stack.default: _joining(aten.stack.default),
+    aten.alias.default: lambda x: x,
+    operator.getitem: operator.getitem,
+}  # fmt: skip
+
+
+@rule(aten.index_add.default)
+def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> AffineForm:
+    """x with source_i added to its entry index_i: a sum of two arrangements."""
+    like = x if isinstance(x, AffineForm) else source
+    x, source = (y if isinstance(y, AffineForm) else affine.constant_form(y, like) for y in (x, source))
+    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.rounded(len(index)))
+    return affine.add(x, moved)
+
+
+def _of_shape(operation: Any) -> Rule:
+    """The rule of an operator that reads the shape of its argument alone: the result is constant."""
+    return lambda x, *arguments, **keywords: operation(torch.zeros_like(x.radius[0]), *arguments, **keywords)
+
+
+for _operation in (
+    aten.zeros_like.default, aten.ones_like.default, aten.full_like.default, aten.empty_like.default,
+    aten.new_zeros.default, aten.new_ones.default, aten.new_full.default, aten.fill.Scalar,
+):  # fmt: skip
+    rule(_operation)(_of_shape(_operation))
+
+
+def _rows(form: AffineForm, rows: int | slice) -> AffineForm:
+    return AffineForm(form.terms[:, :, rows], form.radius[:, rows])
+
+
+def _transposed(x: AffineForm) -> AffineForm:
+    return AffineForm(x.terms.mT, x.radius.mT)
+
+
+def _unsqueezed(x: Any, axis: int) -> Any:
+    return ARRANGEMENTS[aten.unsqueeze.default](x, axis) if isinstance(x, AffineForm) else x.unsqueeze(axis)
+
+
+def _tensor(number: Any) -> Tensor:
+    return number if isinstance(number, Tensor) else torch.tensor(number, dtype=torch.float64)
+
+
+def _attribute(module: Any, path: str) -> Tensor:
+    for name in path.split("."):
+        module = getattr(module, name)
+    return module.detach()

@@ -1,0 +1,170 @@
+"""The sound claim: a funnel that closed loops do not leave, and the cost that it guarantees."""
+
+import copy
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lyapnet.certification.bounds import DecreaseCondition
+from lyapnet.certification.branch_and_bound import (
+    Budget,
+    Counterexample,
+    faces,
+    minimum,
+    prove,
+    share_below,
+)
+from lyapnet.certification.statistical import Verdict
+from lyapnet.closed_loop import ClosedLoop
+from lyapnet.errors import UsageError
+from lyapnet.sets import Box
+from lyapnet.types import PerState, Value
+
+
+@dataclass(frozen=True)
+class SoundClaim:
+    """With W(t, x) = V(t, x) − δt: at every (t, x) in [0, T] × D with W ≤ ρ, in continuous time and for this model,
+
+        V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
+
+    and W > ρ on the boundary of D. Hence each closed loop that starts in D with V(0, x₀) ≤ ρ keeps V(t, x(t)) ≤ ρ + δt,
+    stays in D up to T, and has
+
+        α ∫ℓ dt ≤ V(0, x₀) − V(T, x(T)) + δT,
+        J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max of φ(x) − V(T, x)/α where W(T, x) ≤ ρ.
+
+    The verdict is about the funnel of ρ = `wanted`, which holds all of X₀. Whatever the verdict, `rho` is the largest
+    level that was proved, a funnel of its own, and `volume_share` how much of X₀ it holds.
+    """
+
+    alpha: float
+    delta: float  # in cost per second
+    duration: float  # T in s
+    states: Box  # D
+    rho: float  # the largest level proved; −∞ where there is none
+    wanted: float  # max V(0, ·) on X₀, or up to 0.1 % more: the ρ that does for all of it
+    volume_share: float  # of X₀ with V(0, ·) ≤ ρ; a lower bound
+    terminal_excess: float  # κ; an upper bound
+    counterexample: Counterexample | None
+    boxes: int
+    seconds: float
+    remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above the funnel
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the claim that a funnel holds all of X₀."""
+        if self.rho >= self.wanted:
+            return "certified"
+        found = self.counterexample
+        return "falsified" if found is not None and found.height <= self.wanted else "unknown"
+
+    def guaranteed_cost(self, value: PerState) -> PerState:
+        """The bound of J(x₀) from V(0, x₀), (*batch,); infinite outside the funnel."""
+        bound = (value + self.delta * self.duration) / self.alpha + self.terminal_excess
+        return torch.where(value <= self.rho, bound, torch.inf)
+
+
+def sound_claim(
+    closed_loop: ClosedLoop,
+    initial_states: Box,
+    duration: float,
+    alpha: float = 0.95,
+    delta: float = 1e-2,
+    states: Box | None = None,
+    budget: Budget | None = None,
+    generator: torch.Generator | None = None,
+) -> SoundClaim:
+    """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
+
+    Args:
+        closed_loop: with the law of a V; its float64 copy is what the claim is about.
+        duration: T in s.
+        states: D; by default a box around where samples of V are low enough.
+
+    Raises:
+        UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
+    """
+    budget = budget or Budget()
+    condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
+    x_low, x_high = initial_states.lower.double(), initial_states.upper.double()
+    wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
+    if states is None:
+        states = enclosing_box(condition.height, initial_states, duration, wanted)
+    domain = _domain(states, initial_states, duration)
+    needed = _just_above(wanted)
+    rim = minimum(condition.height, *faces(*domain, axes=range(1, len(domain[0]))), budget, enough=_just_above(needed))
+    proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator)
+    rho = wanted if proof.level >= needed else proof.level
+    inside, excess = 0.0, float("inf")
+    if rho > 0:
+        finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
+        start_low, start_high = _at(0.0, x_low, x_high)
+        inside = share_below(condition.V, start_low[0], start_high[0], rho, finish)
+        excess = _terminal_excess(condition, states, duration, rho, finish)
+    return SoundClaim(
+        alpha, delta, duration, states, rho if rho > 0 else -float("inf"), wanted, inside, excess,
+        proof.counterexample, proof.boxes, budget.elapsed, proof.remaining_volume,
+    )  # fmt: skip
+
+
+def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) -> Box:
+    """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
+
+    Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
+    of what the first gave. No ray is followed further than 8 times the largest component of X₀.
+    """
+    generator = torch.Generator().manual_seed(0)
+    inner = initial_states.magnitude.double()
+    largest = inner.max() if inner.max() > 0 else torch.ones(())
+    reach = torch.full_like(inner, float(largest))
+    times = torch.linspace(0, duration, 9, dtype=torch.float64)
+    radii = torch.logspace(-2, 1, 61, dtype=torch.float64)
+    for _ in range(2):
+        rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
+        rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+        points = (radii[:, None, None] * rays).clamp(-8 * largest, 8 * largest)
+        with torch.no_grad():
+            above = torch.stack([W(t.expand(points.shape[:-1]), points) > level for t in times])
+        below = above.cumsum(1) == 0  # from the goal to the first crossing
+        reach = torch.where(below.any(0)[..., None], points.abs(), 0.0).amax((0, 1)).clamp_min(1e-6 * float(largest))
+    reach = 1.15 * torch.maximum(reach, inner)
+    return Box(-reach, reach)
+
+
+def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
+    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ."""
+    V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
+    end = _at(duration, states.lower.double(), states.upper.double())
+    return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=rho)
+
+
+def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+    """The box {t} × [lower, upper] as one of (t, x), (1, 1 + n) each."""
+    time = torch.tensor([t], dtype=lower.dtype)
+    return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
+
+
+def _domain(states: Box, initial_states: Box, duration: float) -> tuple[Tensor, Tensor]:
+    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+    if states.dimension != initial_states.dimension:
+        raise UsageError(
+            f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
+        )
+    outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
+    if outside.any():
+        i = int(torch.nonzero(outside)[0])
+        raise UsageError(
+            f"Expected a set around X₀, got [{states.lower[i]:g}, {states.upper[i]:g}] around "
+            f"[{initial_states.lower[i]:g}, {initial_states.upper[i]:g}] at index {i}; choose a larger one."
+        )
+    time = torch.tensor([0.0, duration], dtype=torch.float64)
+    return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])
+
+
+def _just_above(value: float) -> float:
+    return value + 1e-9 * abs(value)
+
+
+def _just_below(value: float) -> float:
+    return value - 1e-9 * abs(value)

@@ -1,0 +1,194 @@
+"""Claims about a controller from closed-loop rollouts of sampled initial states: a share, and an exact bound of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool
+from scipy.special import betaincinv
+from torch import Tensor
+
+from lyapnet.errors import DivergenceError
+from lyapnet.programs.terms import hinge, satisfied
+from lyapnet.rollout import Trajectory
+from lyapnet.sets import Box
+from lyapnet.types import State
+
+Verdict = Literal["certified", "falsified", "unknown"]
+
+EVENTS = ("decrease", "terminal", "cost", "all")
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """What counts as success of one closed loop from x₀, on the nodes of the horizon:
+
+        decrease:  Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ decrease · V(0, x₀),
+        terminal:  ‖x_N‖ ≤ radius,
+        cost:      J_N(x₀) ≤ (1 + cost) V(0, x₀),
+        all:       the three together.
+
+    Args:
+        radius: in the norm of the state's components, each in its own unit.
+    """
+
+    radius: float
+    decrease: float = 1e-2
+    cost: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"Expected tolerance {name} ≥ 0, got {value}; state what counts as success.")
+
+
+@dataclass(frozen=True)
+class SampledClaim:
+    """On `successes["all"]` of `samples` states drawn uniformly from X₀ the closed loop succeeded. It proves no more.
+
+    The claim that every state of X₀ succeeds is falsified by one that fails, and else unknown.
+    """
+
+    samples: int
+    successes: dict[str, int]  # for each of EVENTS
+    tolerances: Tolerances
+    failure: State | None  # the first state that failed
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the claim that every state of X₀ succeeds."""
+        return "unknown" if self.failure is None else "falsified"
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The share of the samples that succeeded, for each of EVENTS."""
+        return {event: count / self.samples for event, count in self.successes.items()}
+
+
+@dataclass(frozen=True)
+class StatisticalClaim(SampledClaim):
+    """With this confidence, at least `probability_lower_bound` of X₀ by volume succeeds.
+
+    The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
+    holds for each event by itself. Like the rollouts it speaks of this model, this Δt and this integrator.
+    """
+
+    confidence: float
+    share: float  # of X₀, about which there is a verdict
+
+    @property
+    def lower_bounds(self) -> dict[str, float]:
+        """The bound for each of EVENTS."""
+        return {e: lower_bound(count, self.samples, self.confidence) for e, count in self.successes.items()}
+
+    @property
+    def probability_lower_bound(self) -> float:
+        """The bound for the three events together."""
+        return self.lower_bounds["all"]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Of the claim that at least `share` of X₀ succeeds, at this confidence either way."""
+        if self.probability_lower_bound >= self.share:
+            return "certified"
+        failures = self.samples - self.successes["all"]
+        return "falsified" if 1 - lower_bound(failures, self.samples, self.confidence) < self.share else "unknown"
+
+
+def lower_bound(successes: int, samples: int, confidence: float) -> float:
+    """The exact one-sided Clopper-Pearson bound of a probability.
+
+    It is the p at which so many successes or more have probability 1 − confidence,
+    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1), the regularised incomplete beta function, solved for p.
+
+    Raises:
+        ValueError: successes do not lie between 0 and samples, or the confidence not strictly between 0 and 1.
+
+    Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
+    Biometrika 1934.
+    """
+    if not (0 <= successes <= samples and samples >= 1):
+        raise ValueError(f"Expected 0 ≤ successes ≤ samples, got {successes} of {samples}; count them again.")
+    if not 0 < confidence < 1:
+        raise ValueError(f"Expected a confidence between 0 and 1, got {confidence}; for example 0.999999.")
+    return float(betaincinv(successes, samples - successes + 1, 1 - confidence)) if successes else 0.0
+
+
+def sampled_claim(
+    rollout: Callable[[State], Trajectory],
+    initial_states: Box,
+    tolerances: Tolerances,
+    samples: int = 100,
+    generator: torch.Generator | None = None,
+    batch: int = 1000,
+) -> SampledClaim:
+    """Count successes among fresh states of X₀; K = 100 as in the paper.
+
+    Args:
+        rollout: of a control law that a V defines.
+        batch: states that are rolled out at once, which bounds the memory.
+
+    Raises:
+        ValueError: less than one sample or state at once.
+    """
+    if samples < 1 or batch < 1:
+        raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
+    x0 = initial_states.sample(samples, generator)
+    events = torch.cat([_events(rollout, part, tolerances) for part in x0.split(batch)])
+    failed = torch.nonzero(~events[:, -1]).flatten()
+    successes = {event: int(count) for event, count in zip(EVENTS, events.sum(0), strict=True)}
+    return SampledClaim(samples, successes, tolerances, x0[failed[0]] if len(failed) else None)
+
+
+def statistical_claim(
+    rollout: Callable[[State], Trajectory],
+    initial_states: Box,
+    tolerances: Tolerances,
+    samples: int = 10_000,
+    confidence: float = 1 - 1e-6,
+    share: float = 0.99,
+    generator: torch.Generator | None = None,
+    batch: int = 1000,
+) -> StatisticalClaim:
+    """Bound the share of X₀ on which the closed loop succeeds, from fresh states.
+
+    The states must be fresh, drawn by a generator on which nothing was trained or chosen, and their number fixed in
+    advance: drawing until the bound pleases voids it.
+
+    Raises:
+        ValueError: as sampled_claim and lower_bound.
+    """
+    lower_bound(0, samples, confidence)  # refuse before the work
+    sampled = sampled_claim(rollout, initial_states, tolerances, samples, generator, batch)
+    return StatisticalClaim(**vars(sampled), confidence=confidence, share=share)
+
+
+FEWEST = 16  # states that are counted as failures together where one of them diverges
+
+
+def _events(
+    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances
+) -> Bool[Tensor, "samples events"]:
+    """Which of EVENTS hold from each state.
+
+    One divergent closed loop ends its whole batch: it is sought by halves. Its last few neighbours count as failures
+    with it, which can only lower a share.
+    """
+    try:
+        with torch.no_grad():
+            trajectory = rollout(x0)
+    except DivergenceError:
+        if len(x0) <= FEWEST:
+            return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
+        return torch.cat([_events(rollout, half, tolerances) for half in x0.tensor_split(2)])
+    values = trajectory.require_value()
+    single = torch.stack(
+        [
+            satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease),
+            torch.linalg.vector_norm(trajectory.x[-1], dim=-1) <= tolerances.radius,
+            trajectory.cost <= (1 + tolerances.cost) * values[0],
+        ],
+        -1,
+    )
+    return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

@@ -343,7 +343,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, system: ControlAffi
     states = torch.stack(torch.meshgrid(*grid, indexing="ij"), -1).to(initial_states.lower)
     handles: list[Artist] = []
     for share, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True):
-        if not claim.rho > 0:
+        if not claim.volume_share:
             break
         t = share * claim.duration
         with torch.no_grad():

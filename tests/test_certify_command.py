@@ -105,7 +105,8 @@ class Bowl(nn.Module):
 def claim(rho):
     states = Box(torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]))
     found = Counterexample(1.0, [0.5, 1.5], 0.1, 2.4)
-    return SoundClaim(0.9, 0.01, 4.0, states, rho, 2.0, 0.5, 0.0, found, 10, 1.0, 0.0)
+    share = 0.5 if rho > 0 else 0.0
+    return SoundClaim(0.9, 0.01, 4.0, states, rho, 2.0, share, 0.0, found, 10, 1.0, 0.0)
 
 
 def test_the_funnel_is_drawn_with_its_levels():

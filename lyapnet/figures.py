@@ -417,17 +417,18 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, system: ControlAffi
         )
     figure = Figure(figsize=(5.6, 4.4), layout="constrained")
     axes = figure.subplots()
-    lower, upper = claim.states.lower, claim.states.upper
-    grid = [torch.linspace(float(a), float(b), 201).to(lower) for a, b in zip(lower, upper, strict=True)]
+    lower, upper = claim.states.lower.tolist(), claim.states.upper.tolist()
+    grid = [torch.linspace(a, b, 201) for a, b in zip(lower, upper, strict=True)]
     states = torch.stack(torch.meshgrid(*grid, indexing="ij"), -1).to(initial_states.lower)
     handles: list[Artist] = []
     for share, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True):
-        if not claim.rho > 0:
+        if not claim.volume_share:
             break
         t = share * claim.duration
         with torch.no_grad():
             values = V(states.new_tensor(t).expand(states.shape[:-1]), states)
-        axes.contour(*grid, values.T, levels=[claim.rho + claim.delta * t], colors=[colour])
+        level = claim.rho + claim.delta * t
+        axes.contour(*(axis.numpy() for axis in grid), values.T.numpy(), levels=[level], colors=[colour])
         handles.append(Patch(color=colour, label=f"t = {t:.3g} s"))
     (left, bottom), (width, height) = initial_states.lower.tolist(), initial_states.widths.tolist()
     box = Rectangle((left, bottom), width, height, fill=False, linestyle="--", label="X₀")

@@ -40,11 +40,14 @@ def train(arguments: list[str]) -> int:
 
 
 def brief(arguments: list[str]) -> list[str]:
-    """A benchmark of few states and steps, a sweep over one value; any other command as it is."""
+    """Few states and steps, one value of a sweep, one second for a certificate; any other command as it is."""
     if arguments[0] == "sweep":
         key, _, values = arguments[arguments.index("--vary") + 1].partition("=")
         value = "8" if key == "horizon.steps" else values.split(",")[0]
         return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]
+    if "--seconds" in arguments:
+        at = arguments.index("--seconds")
+        return [*arguments[: at + 1], "1", *arguments[at + 2 :]]
     if arguments[0] != "bench":
         return arguments
     at = arguments.index("--batch") if "--batch" in arguments else len(arguments)

@@ -146,7 +146,7 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     pairs = [(A[j] * B[k] + A[k] * B[j]).abs() for j in range(len(A)) for k in range(j + 1, len(A))]
     quadratic = diagonal.abs().sum(0) / 2 + sum(pairs, torch.zeros_like(r + s))
     remainder = (c.abs() + x.spread) * s + (d.abs() + y.spread) * r + r * s
-    rounding = (4 * len(x.terms) + 8) * EPSILON * x.magnitude * y.magnitude + TINY
+    rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
     return AffineForm(terms, quadratic + remainder + rounding)
 
 

@@ -128,12 +128,17 @@ def _without_copies(graph: Graph) -> Graph:
     for node in list(graph.nodes):
         if node.op == "get_attr":  # which CSE leaves apart
             node.replace_all_uses_with(constants.setdefault(str(node.target), node))
-        elif node.target in COPIES and node.meta["val"].shape == node.args[0].meta["val"].shape:
+        elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
             node.replace_all_uses_with(node.args[0])
             graph.erase_node(node)
     graph = fx_graph_cse(graph)
     graph.eliminate_dead_code()
     return graph
+
+
+def _shape(node: Any) -> torch.Size | Node:
+    """Of the node's value; the node itself where that was not recorded."""
+    return node.meta["val"].shape if isinstance(node.meta.get("val"), Tensor) else node
 
 
 COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view.default, aten.reshape.default}

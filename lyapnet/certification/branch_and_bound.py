@@ -29,7 +29,7 @@ class Budget:
 
     seconds: float = 60.0
     boxes: int = 100_000_000
-    chunk: int = 1024
+    chunk: int = 512
     frontier: int = 200_000
     started: float = field(default_factory=time.monotonic)
 

@@ -97,13 +97,13 @@ def sound_claim(
     proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator)
     rho = wanted if proof.level >= needed else proof.level
     inside, excess = 0.0, float("inf")
-    if rho > 0:
+    if rho > -float("inf"):
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
         start_low, start_high = _at(0.0, x_low, x_high)
         inside = share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
-        alpha, delta, duration, states, rho if rho > 0 else -float("inf"), wanted, inside, excess,
+        alpha, delta, duration, states, rho, wanted, inside, excess,
         proof.counterexample, proof.boxes, budget.elapsed, proof.remaining_volume,
     )  # fmt: skip
 
@@ -136,7 +136,7 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ."""
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
-    return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=rho)
+    return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
 
 
 def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,198 @@
+"""What the command line shows in the terminal: one table for each kind of measurement."""
+
+from typing import Any
+
+from rich.box import SIMPLE
+from rich.table import Column, Table
+from rich.text import Text
+
+ROWS = {
+    "cost_mean": "cost J, mean",
+    "cost_max": "cost J, worst",
+    "optimal_cost_mean": "optimal cost, mean",
+    "cost_ratio": "cost / optimum",
+    "value_mean": "V(0, x₀), mean",
+    "value_to_cost": "V(0, x₀) / cost J, ratio of the means",
+    "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
+    "constraint_loss": "constraint loss, mean",
+    "terminal_error": "terminal error, mean ‖x(T)‖",
+    "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
+    "decreasing_fraction": "V decreases at every step, share of states",
+    "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
+    "satisfied_fraction_1e-3": "… within 0.1 %",
+    "satisfied_fraction_1e-6": "… within 1e-6",
+}
+
+
+def evaluation_table(title: str, result: dict[str, Any]) -> Table:
+    """What a controller reaches, as evaluation.Evaluation.result has it."""
+    table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
+    for key, label in ROWS.items():
+        if result[key] is None:
+            table.add_row(label, "–")
+        else:
+            table.add_row(label, _measured(key, result[key]))
+    for name, error in result["terminal_errors"].items():
+        table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
+    table.caption = _caption([result])
+    return table
+
+
+def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
+    """What several seeds reach, as experiment.over_seeds has it: mean, spread and both ends."""
+    seeds = result["seeds"]
+    table = Table("measure", *(Column(name, no_wrap=True) for name in ("mean ± spread", "least (seed)", "most (seed)")))
+    table.title = f"{title}\n{len(seeds)} seeds, {seeds[0]['samples']} unseen states of X₀ each"
+    for key, label in ROWS.items():
+        if key not in result["mean"]:
+            table.add_row(label, "–", "–", "–")
+            continue
+        ends = [choose(seeds, key=lambda one, key=key: one[key]) for choose in (min, max)]
+        mean, spread = (_measured(key, result[name][key]) for name in ("mean", "spread"))
+        table.add_row(label, f"{mean} ± {spread}", *(f"{_measured(key, end[key])} ({end['seed']})" for end in ends))
+    table.caption = _caption(seeds)
+    return table
+
+
+def _caption(results: list[dict[str, Any]]) -> Text | None:
+    """Why some optimum is missing."""
+    notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
+    return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
+
+
+def robustness_table(rows: list[dict[str, Any]], samples: int) -> Table:
+    """What a controller costs where its assumptions fail."""
+    headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
+    columns = [Column(heading, justify="right") for heading in headings]
+    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{samples} states each")
+    for row in rows:
+        keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
+        cost, *others = (_measured_or_not(key, row[key]) for key in keys)
+        table.add_row(row["disturbance"], "diverged" if row["cost_mean"] is None else cost, *others)
+    table.caption = "J*: of the disturbed task, without noise"
+    return table
+
+
+SWEEP_COLUMNS = {
+    "cost_mean": "cost J",
+    "cost_ratio": "J / J*",
+    "value_error": "value\nerror",
+    "value_to_cost": "V / J",
+    "satisfied_fraction": "condition\nholds",
+    "terminal_error": "‖x(T)‖",
+}
+
+
+def sweep_table(config: str, rows: list[Any]) -> Table:
+    """A line for each seed of a config's runs, and after several seeds their mean and their worst."""
+    names = [rows[0].key.split(".")[-1]] if rows[0].key else []
+    headings = [*names, "seed", *SWEEP_COLUMNS.values(), "s to\n1.02", "min", "MB"]
+    table = Table(*(Column(heading, justify="right", no_wrap=True) for heading in headings), box=SIMPLE, padding=0)
+    table.title = f"{config}: best checkpoints on unseen states of X₀"
+    table.caption = "s to 1.02: until J / J* of the validation states; min, MB: of a run with all its seeds"
+    for value in dict.fromkeys(row.value for row in rows):
+        chosen, label = [row for row in rows if row.value == value], [value] if names else []
+        took = f"{chosen[0].training_seconds / 60:.1f}", f"{chosen[0].peak_bytes / 1e6:.0f}"
+        for row in chosen:
+            shown = [_measured_or_not(key, row.measures[key]) for key in SWEEP_COLUMNS]
+            near = "–" if row.seconds_to_near is None else f"{row.seconds_to_near:.0f}"
+            table.add_row(*label, str(row.seed), *shown, near, *took)
+        if len(chosen) > 1:
+            for name, summarise in (("mean", _mean), ("worst", _worst)):
+                columns = ([row.measures[key] for row in chosen] for key in SWEEP_COLUMNS)
+                shown = [summarise(key, values) for key, values in zip(SWEEP_COLUMNS, columns, strict=True)]
+                table.add_row(*label, name, *shown, "", "", "")
+            table.add_section()
+    return table
+
+
+def _mean(key: str, values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return _measured_or_not(key, sum(known) / len(known) if len(known) == len(values) else None)
+
+
+def _worst(key: str, values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    choose = min if key.endswith("fraction") else max
+    return _measured_or_not(key, choose(known) if len(known) == len(values) else None)
+
+
+CERTIFICATE_ROWS = {
+    "samples": "states",
+    "tolerances": "tolerances",
+    "decrease_share": "condition holds along the closed loop",
+    "terminal_share": "‖x(T)‖ within the radius",
+    "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
+    "all_share": "all three",
+    "confidence": "confidence",
+    "decrease_lower_bound": "condition holds on at least",
+    "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
+    "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
+    "probability_lower_bound": "all three on at least",
+    "failure": "a state that fails",
+    "alpha": "α",
+    "delta": "δ, cost per second",
+    "set": "D",
+    "rho_wanted": "ρ for all of X₀",
+    "rho": "largest ρ proved",
+    "volume_share": "share of X₀ in that funnel, at least",
+    "guaranteed_cost_ratio": "guaranteed cost there / optimum, ratio of the means",
+    "counterexample": "counterexample of lowest V − δt",
+    "remaining_volume": "share of [0, T] × D undecided",
+    "boxes": "boxes",
+    "seconds": "seconds",
+}
+
+
+def certificate_table(title: str, result: dict[str, Any]) -> Table:
+    """A claim, its verdict and its figures."""
+    table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
+    for key, label in CERTIFICATE_ROWS.items():
+        if result.get(key) is not None:
+            table.add_row(label, _certified(key, result[key]))
+    return table
+
+
+def _certified(key: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items())
+    if isinstance(value, list):
+        return f"[{', '.join(_certified('', entry) for entry in value)}]"
+    if key == "confidence":
+        return f"1 − {1 - value:.2g}"
+    return f"{value:.3%}" if key.endswith(("share", "bound", "volume")) else f"{value:.4g}"
+
+
+def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
+    """What each route to one task's gradient costs, and what it gets wrong."""
+    from lyapnet.bench import BASELINE
+
+    parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.task.horizon
+    columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
+    table = Table("route", "com-\npiled", *columns)
+    table.title = (
+        f"{case.name}: one loss and its gradient\n{horizon.steps} steps, {parameters} parameters, "
+        f"{rows[0].dtype}, {threads} thread{'s' * (threads > 1)}, median of {repeats}"
+    )
+    table.caption = f"×: times faster than {BASELINE}; steps: of the environment; MB: peak"
+    baseline = {row.batch: row.seconds for row in rows if row.route == BASELINE}
+    for row, following in zip(rows, [*rows[1:], None], strict=True):
+        table.add_row(
+            row.route, "yes" if row.compiled else "no", str(row.batch), f"{row.seconds:.3g}",
+            f"{baseline[row.batch] / row.seconds:.2g}" if row.batch in baseline else "–",
+            f"{row.steps_per_second / 1e3:,.1f}",
+            "–" if row.peak_bytes is None else f"{row.peak_bytes / 1e6:.1f}",
+            "–" if row.relative_error is None else f"{row.relative_error:.0e}",
+            end_section=following is not None and following.batch != row.batch,
+        )  # fmt: skip
+    return table
+
+
+def _measured_or_not(key: str, value: float | None) -> str:
+    return "–" if value is None else _measured(key, value)
+
+
+def _measured(key: str, value: float) -> str:
+    if key == "cost_ratio":
+        return f"{value:.4f}"
+    return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"

@@ -88,7 +88,7 @@ def test_values_lie_within_bounds(name):
     for width in (2.0, 0.5, 0.1, 1e-2, 1e-5, 0.0):
         lower, upper = box(width)
         assert violations(bounded, function, lower, upper) == 0
-        assert torch.isfinite(torch.cat([torch.stack(b).flatten() for b in bounded.bounds(*box(0.1))])).all()
+    assert all(torch.stack(pair).isfinite().all() for pair in bounded.bounds(*box(0.1)))
 
 
 def without_remainder(function):
@@ -230,7 +230,7 @@ def test_whole_conditions_lie_within_bounds(system, network, options):
         return c(t, x), c.V(t, x)
 
     bounded = BoundedFunction(function, (torch.zeros(1 + n).double() - 0.5, torch.ones(1 + n).double()))
-    for width in (1.0, 0.2, 1e-2, 1e-5):
+    for width in (1.0, 0.1, 1e-5):
         lower, upper = box(width, 60, n)
         points = points_in(lower, upper)
         with torch.no_grad():

@@ -42,6 +42,8 @@ def train(arguments: list[str]) -> int:
 def brief(arguments: list[str]) -> list[str]:
     """Few states and steps, one value of a sweep, one second for a certificate; any other command as it is."""
     if arguments[0] == "sweep":
+        if "--vary" not in arguments:
+            return [*arguments[:3], *SHORT]
         key, _, values = arguments[arguments.index("--vary") + 1].partition("=")
         value = "8" if key == "horizon.steps" else values.split(",")[0]
         return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]

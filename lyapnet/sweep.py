@@ -12,7 +12,6 @@ from typing import Any
 
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.event_files import curve
 from lyapnet.run import CONFIG, EVALUATION, Run, last_run
 
 MEASURES = (
@@ -138,6 +137,8 @@ def rows_of(point: Point, run: Run) -> Iterator[Row]:
 
 def _seconds_to_near(folder: Path) -> float | None:
     """Seconds from the first validation, before the first step, to the first one within NEAR of the optimum."""
+    from lyapnet.event_files import curve  # with TensorBoard, which figures of a sweep do without
+
     gaps = curve(folder, "optimality_gap/val")
     return next((round(seconds - gaps[0][0], 1) for seconds, _, gap in gaps if gap <= NEAR), None)
 

@@ -161,7 +161,7 @@ def test_systems_command_lists_every_registered_system(capsys, monkeypatch, buil
 def table(cost, value, optimal):
     zero = torch.zeros(len(cost))
     cost, value, optimal = map(torch.tensor, (cost, value, optimal))
-    return StateTable(zero[:, None], cost, value, optimal, zero, zero, zero > 0, zero)
+    return StateTable(zero[:, None], cost, value, optimal, zero, zero, zero > 0, zero[:, None])
 
 
 def test_optimality_is_drawn_where_the_optimum_is_known():

@@ -330,7 +330,7 @@ def swept(rows: Sequence[SweptRow]) -> Figure:
         if max(column) > 10 * min(column) > 0:
             panel.set_yscale("log")
         elif label != SWEPT["cost_ratio"]:
-            panel.set_ylim(bottom=0)
+            panel.set_ylim(0, 1.08 * max(column))
         panel.set_ylabel(label, fontsize=8)
         panel.set_xlabel(rows[0].key or "", fontsize=8)
         panel.set_xticks(sorted({float(row.value or "nan") for row in rows}))

@@ -80,24 +80,24 @@ def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str
 
 
 def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """The positive real numbers among a constructor's arguments; gravity is no property of a system."""
-    annotations = inspect.signature(type(system)).parameters
+    """The positive real numbers among a constructor's arguments; gravity is no property of a system.
+
+    An integer counts where the constructor asks for a float: 1 kg, but not 3 links.
+    """
+    arguments = inspect.signature(type(system)).parameters
     return {
         name: float(value)
         for name, value in parameters.items()
-        if isinstance(value, int | float)
+        if name != "gravity"
+        and (type(value) is float or (type(value) is int and arguments[name].annotation in (float, "float")))
         and value > 0
-        and name != "gravity"
-        and annotations[name].annotation is not int
     }
 
 
-def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> ControlAffineSystem:
-    """A system of the same class from other arguments, in the precision and on the device of the first buffer."""
-    like = next(system.buffers(), None)
+def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:
+    """A system of the same class from other arguments, in the precision and on the device of a tensor."""
     with _float64_defaults():
-        other = type(system)(**parameters)
-    return other if like is None else other.to(like)
+        return type(system)(**parameters).to(like)
 
 
 def _check_parameters(cls: type, config: SystemConfig) -> None:
@@ -227,6 +227,12 @@ def build_program(config: Config) -> Program:
     cls = PROGRAMS[config.program.name]
     for name in options.keys() - inspect.signature(cls).parameters.keys():
         raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
+    bound = config.program.bound or 0
+    if config.program.constraint > bound > 0 and config.network.terminal == "free" and bound >= config.program.terminal:
+        raise UsageError(
+            f"Expected program.terminal > program.bound = {bound:g}, got {config.program.terminal:g}; V(T, ·) would "
+            "sink below φ: raise it, or set network.terminal=exact."
+        )
     with _section("program"):
         return cls(**options)
 

@@ -1,6 +1,7 @@
 """Certificates of a controller, as `lyapnet certify` prints them: one object for each kind of claim."""
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -18,19 +19,21 @@ from lyapnet.certification import (
 )
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
-from lyapnet.oracles import optimal_cost
+from lyapnet.oracles import RiccatiOracle, optimal_cost
 from lyapnet.randomness import CERTIFICATION, stream
 from lyapnet.sets import Box
-from lyapnet.types import PerState, State
 
 KINDS = ("sampled", "statistical", "sound")
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
 
 
 def default_tolerances(controller: Controller, radius: float | None = None, cost: float = 0.05) -> Tolerances:
-    """The decrease within 1 % of V(0, x₀), ‖x(T)‖ within a tenth of the largest ‖x₀‖, J within 5 % of V(0, x₀)."""
-    largest = float(torch.linalg.vector_norm(controller.initial_states.magnitude))
-    return Tolerances(radius=0.1 * largest if radius is None else radius, cost=cost)
+    """What success is by default.
+
+    J within 5 % of V(0, x₀); ‖x(T)‖ within a radius, if one is given; and the decrease within 1 % of V(0, x₀), where a
+    Lyapunov program promised it.
+    """
+    return Tolerances(radius, 1e-2 if controller.config.program.name == "lyapunov" else None, cost)
 
 
 def default_delta(controller: Controller) -> float:
@@ -60,7 +63,7 @@ def statistical(
     claim = statistical_claim(
         controller.rollout, controller.initial_states, tolerances, samples, confidence, share, generator
     )
-    bounds = {f"{event}_lower_bound": bound for event, bound in claim.lower_bounds.items() if event != "all"}
+    bounds = {f"{e}_lower_bound": bound for e, bound in claim.lower_bounds.items() if e in _asked(claim.tolerances)}
     return {
         "kind": "statistical", **_shares(claim), "confidence": confidence, "required_share": share,
         "probability_lower_bound": claim.probability_lower_bound, **bounds, "seed": seed,
@@ -76,9 +79,10 @@ def sound(
         controller.closed_loop, controller.initial_states, controller.horizon.duration, alpha,
         default_delta(controller) if delta is None else delta, states, Budget(seconds), stream(0, CERTIFICATION),
     )  # fmt: skip
+    wanted = claim.wanted if math.isfinite(claim.wanted) else None
     return {
         "kind": "sound", "verdict": claim.verdict, "alpha": claim.alpha, "delta": claim.delta,
-        "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
+        "rho": claim.rho if claim.volume_share else None, "rho_wanted": wanted,
         "set": [claim.states.lower.tolist(), claim.states.upper.tolist()], "volume_share": claim.volume_share,
         "guaranteed_cost_ratio": _guaranteed_cost_ratio(controller, claim), "boxes": claim.boxes,
         "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
@@ -105,23 +109,30 @@ def _pairs(text: str) -> Sequence[Sequence[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
+def _asked(tolerances: Tolerances) -> list[str]:
+    """The single events that success consists of."""
+    limits = {"decrease": tolerances.decrease, "terminal": tolerances.radius, "cost": tolerances.cost}
+    return [event for event, limit in limits.items() if limit is not None]
+
+
 def _shares(claim: SampledClaim | StatisticalClaim) -> dict[str, Any]:
     return {
         "verdict": claim.verdict, "samples": claim.samples,
-        **{f"{event}_share": share for event, share in claim.shares.items()},
+        **{f"{e}_share": share for e, share in claim.shares.items() if e in (*_asked(claim.tolerances), "all")},
         "tolerances": asdict(claim.tolerances),
         "failure": None if claim.failure is None else claim.failure.tolist(),
     }  # fmt: skip
 
 
 def _guaranteed_cost_ratio(controller: Controller, claim: SoundClaim) -> float | None:
-    """Mean guaranteed cost over mean optimum on states of X₀ inside the funnel; None where either is not known."""
-    oracle: Callable[[State], PerState] | None = optimal_cost(
-        controller.system, controller.cost, controller.horizon, controller.config.rollout.method
-    )
+    """Mean guaranteed cost over the mean optimum of the discretised task, on states of X₀ inside the funnel.
+
+    None where either is not known at once: a search by IPOPT would take longer than the proof.
+    """
+    oracle = optimal_cost(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
     x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
     guaranteed = claim.guaranteed_cost(controller.value(0.0, x0).double())
     inside = guaranteed.isfinite()
-    if oracle is None or not inside.any():
+    if not isinstance(oracle, RiccatiOracle) or not inside.any():
         return None
     return float(guaranteed[inside].mean() / oracle(x0[inside]).mean())

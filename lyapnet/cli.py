@@ -95,7 +95,8 @@ def evaluate(
         )
         result = measured.result()
         if disturbed:
-            rows = robustness(controller, min(samples, 64), seed, lambda name: status.update(f"disturbance: {name}"))
+            count = min(samples, 64)
+            rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]
     if as_json:
         print(json.dumps(result))
@@ -138,17 +139,22 @@ def sweep(
         out.mkdir(parents=True, exist_ok=True)
     with notes.status(f"training {len(points)} runs, {workers} at a time"):
         rows = run(points, workers, partial(notes.print, soft_wrap=True))
+    failed = len(points) - len({(row.config, row.value) for row in rows})
     for name in dict.fromkeys(row.config for row in rows):
         console.print(sweep_table(name, [row for row in rows if row.config == name]))
-    if vary:
-        best = min(rows, key=lambda row: row.measures["cost_mean"] or 0)
-        console.print(f"least mean cost: {best.key}={best.value}, {best.checkpoint}", soft_wrap=True)
-    if out is not None:
+    for name in dict.fromkeys(row.config for row in rows):
+        known = [row for row in rows if row.config == name and row.measures["cost_ratio"] is not None]
+        if vary and known:
+            best = min(known, key=lambda row: row.measures["cost_ratio"] or 0)
+            console.print(f"closest to the optimum: {best.key}={best.value}, {best.checkpoint}", soft_wrap=True)
+    if out is not None and rows:
         write_csv(rows, out / "sweep.csv")
         if vary:
             from lyapnet import figures
 
             figures.swept(rows).savefig(out / "sweep.png", dpi=150)
+    if failed:
+        raise LyapnetError(f"Expected {len(points)} runs, {failed} failed; the same command tries them again.")
 
 
 @app.command()
@@ -161,7 +167,7 @@ def certify(
     confidence: Annotated[float, typer.Option(help="Of the statistical bound.")] = 1 - 1e-6,
     share: Annotated[float, typer.Option(help="Of X₀, about which the statistical verdict is.")] = 0.99,
     radius: Annotated[
-        float | None, typer.Option(help="Of success at T, in the norm of x; a tenth of the largest ‖x₀‖ if none.")
+        float | None, typer.Option(help="Of success at T, in the norm of x; not asked for if none.")
     ] = None,
     alpha: Annotated[float, typer.Option(help="Sound: the share of ℓ that V pays for.")] = 0.95,
     delta: Annotated[

@@ -313,6 +313,7 @@ SWEPT = {  # of a sweep's row ↦ the axis that shows it
 
 def swept(rows: Sequence[SweptRow]) -> Figure:
     """What runs reach and take against the key that was varied: a point for each seed, a line through the means."""
+    places = _places([row.value for row in rows])
     columns = {label: [_swept_number(row, name) for row in rows] for name, label in SWEPT.items()}
     known = {label: [number for number in column if number is not None] for label, column in columns.items()}
     shown = {label: numbers for label, numbers in known.items() if len(numbers) == len(rows)}
@@ -323,7 +324,7 @@ def swept(rows: Sequence[SweptRow]) -> Figure:
             seeds = defaultdict(list)
             for row, number in zip(rows, column, strict=True):
                 if row.config == config:
-                    seeds[float(row.value or "nan")].append(number)
+                    seeds[places[row.value]].append(number)
             for value, numbers in seeds.items():
                 panel.plot([value] * len(numbers), numbers, "o", color=color, markersize=3, alpha=0.6)
             panel.plot([*seeds], [fmean(numbers) for numbers in seeds.values()], color=color, label=config)
@@ -333,14 +334,21 @@ def swept(rows: Sequence[SweptRow]) -> Figure:
             panel.set_ylim(0, 1.08 * max(column))
         panel.set_ylabel(label, fontsize=8)
         panel.set_xlabel(rows[0].key or "", fontsize=8)
-        panel.set_xticks(sorted({float(row.value or "nan") for row in rows}))
-        panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        panel.set_xticks([*places.values()], [str(value) for value in places])
         panel.tick_params(labelsize=8)
         panel.grid(color=GREY, alpha=0.25, linewidth=0.5)
     for panel in panels[len(shown) :]:
         panel.set_axis_off()
     _legend_below(figure, panels[0])
     return figure
+
+
+def _places(values: Sequence[str | None]) -> dict[str | None, float]:
+    """Where each value of a key lies on its axis: where the number says, or one after the other."""
+    try:
+        return {value: float(value or "") for value in values}
+    except ValueError:
+        return {value: float(i) for i, value in enumerate(dict.fromkeys(values))}
 
 
 def _swept_number(row: SweptRow, name: str) -> float | None:

@@ -98,11 +98,16 @@ def last_run(config: Config) -> Run:
     Raises:
         UsageError: there is none.
     """
-    root = Path(config.logs) / config.experiment
-    runs = sorted(_versions(root))
+    runs = runs_of(config)
     if not runs:
+        root = Path(config.logs) / config.experiment
         raise UsageError(f"Expected a run to resume in {str(root)!r}, got none; start one without --resume.")
-    return Run(runs[-1][1])
+    return runs[-1]
+
+
+def runs_of(config: Config) -> list[Run]:
+    """The runs of an experiment, oldest first."""
+    return [Run(path) for _, path in sorted(_versions(Path(config.logs) / config.experiment))]
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.run import CONFIG, EVALUATION, Run, last_run
+from lyapnet.run import CONFIG, EVALUATION, Run, runs_of
 
 MEASURES = (
     "cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "value_to_cost", "constraint_loss",
@@ -45,15 +45,15 @@ class Point:
         return load_config(self.path, self.settings)
 
     def run(self) -> Run | None:
-        """The newest run of this very config, finished or not."""
+        """The newest run of this very config from fresh weights, finished or not."""
         config = self.config
-        try:
-            run = last_run(config)
-            stored = load_config(run.folder / CONFIG)
-        except UsageError:  # none yet, or stopped before it wrote its config
-            return None
-        changed = [key for key in differing_keys(config, stored) if not key.startswith("logs")]
-        return None if changed else run
+        for run in reversed(runs_of(config)):
+            written = run.folder / CONFIG
+            if not written.is_file() or run.finetuned_from:  # stopped before it wrote its config, or another start
+                continue
+            if not [key for key in differing_keys(config, load_config(written)) if key != "logs"]:
+                return run
+        return None
 
     def train(self) -> Run:
         """Train it to its end, from where a stopped run was; a finished one is taken as it is.
@@ -65,7 +65,9 @@ class Point:
         if run is not None and run.finished:
             return run
         command = [sys.executable, "-m", "lyapnet", "train", "--config", str(self.path), *self.settings]
-        ended = subprocess.run([*command, *(["--resume", "last"] if run else [])], capture_output=True, text=True)
+        if run is not None and run.last.is_file():
+            command += ["--resume", str(run.last)]
+        ended = subprocess.run(command, capture_output=True, text=True)
         run = self.run()
         if ended.returncode or run is None or not run.finished:
             words = (ended.stderr.strip() or ended.stdout.strip()).splitlines()
@@ -92,7 +94,7 @@ def points_of(configs: Sequence[Path], vary: str | None, overrides: Sequence[str
     """The runs that a sweep consists of.
 
     Raises:
-        UsageError: `vary` is not key=value,value,…; or one of the configs does not hold.
+        UsageError: `vary` is not key=value,value,…; one of the configs does not hold; or two of them share a folder.
     """
     key, _, values = (vary or "").partition("=")
     if vary is not None and not (key and values):
@@ -101,26 +103,34 @@ def points_of(configs: Sequence[Path], vary: str | None, overrides: Sequence[str
         raise UsageError("Expected --config PATH at least once, got none; for example conf/double_integrator.yaml.")
     varied = [(key, value.strip()) for value in values.split(",")] if vary else [(None, None)]
     points = [Point(path, overrides, *one) for path in configs for one in varied]
-    for point in points:
-        load_config(point.path, point.settings)  # all of them are refused before any is trained
+    experiments = [point.config.experiment for point in points]  # all are refused before any is trained
+    for experiment in experiments:
+        if experiments.count(experiment) > 1:
+            raise UsageError(f"Expected runs of different experiments, got {experiment} twice; leave one of them out.")
     return points
 
 
 def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any]) -> list[Row]:
-    """Train what is not trained yet, `workers` at a time; a row for each seed of each run.
+    """Train what is not trained yet, `workers` at a time; a row for each seed of each run that came to its end.
 
-    Raises:
-        LyapnetError: of the first training that fails, when all others have ended.
+    Args:
+        say: hears where each run is, or why it failed.
     """
 
-    def train(point: Point) -> Run:
-        run = point.train()
+    def train(point: Point) -> list[Row]:
+        try:
+            run = point.train()
+        except LyapnetError as error:
+            say(f"failed: {error}")
+            return []
         say(f"{point.config.experiment}: {run.folder}")
-        return run
+        return list(rows_of(point, run))
 
-    with ThreadPoolExecutor(workers) as pool:
-        futures = [pool.submit(train, point) for point in points]
-    return [row for point, future in zip(points, futures, strict=True) for row in rows_of(point, future.result())]
+    pool = ThreadPoolExecutor(workers)
+    try:
+        return [row for rows in pool.map(train, points) for row in rows]
+    finally:  # also when the user interrupts: nothing more is started
+        pool.shutdown(cancel_futures=True)
 
 
 def rows_of(point: Point, run: Run) -> Iterator[Row]:

@@ -155,7 +155,7 @@ def certificate_table(title: str, result: dict[str, Any]) -> Table:
 
 def _certified(key: str, value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items())
+        return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items() if entry is not None)
     if isinstance(value, list):
         return f"[{', '.join(_certified('', entry) for entry in value)}]"
     if key == "confidence":

@@ -45,8 +45,8 @@ def trace(
     for node in list(graph_module.graph.nodes):
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
             raise UsageError(
-                f"Expected a closed loop without random numbers for rollout.gradient=discrete, got {node.target}; "
-                "leave dropout and noise out, or take rollout.gradient=backprop."
+                f"Expected f, g, the cost and V without random numbers, got {node.target}; leave dropout and noise "
+                "out, or train with rollout.gradient=backprop."
             )
         if node.op == "call_function" and node.target is torch.ops.aten.detach.default:
             node.replace_all_uses_with(node.args[0])

@@ -213,6 +213,7 @@ IMPOSSIBLE = {
     "program.cost_to_go=1": ("program.cost_to_go", "lyapunov"),
     "program.name=value & program.margin=null & program.bound=0.5": ("program.bound", "value"),
     "program.bound=1": ("program", "bound < constraint"),
+    "program.bound=0.5 & program.terminal=0.5": ("program.terminal > program.bound", "network.terminal=exact"),
     "network.name=fcn & network.epsilon=0.1": ("network.epsilon", "fcn"),
     "network.embed_angles=true": ("network.embed_angles", "anchored"),
     "network.activation=tanh": ("network", "activation", "convex", "softplus"),

@@ -66,7 +66,7 @@ def test_finished_runs_are_not_run_again(swept, commands, capsys):
     shown = capsys.readouterr().out
     assert "integrator_chain: best checkpoints" in shown
     assert shown.count("worst") == 2
-    assert "least mean cost: system.parameters.length=2" in shown
+    assert "closest to the optimum: system.parameters.length=3" in shown
     assert main([*arguments, "training.iterations=3"]) == 1, "another config is another run"
     assert len(commands) == 2
 
@@ -82,7 +82,7 @@ def test_a_stopped_run_goes_on(swept, commands):
             point.train()
     finally:
         finished.write_text(content)
-    assert commands[0][-2:] == ["--resume", "last"]
+    assert commands[0][-2:] == ["--resume", str(point.run().last)]
     with pytest.raises(LyapnetError, match=r"length=5.*the last words"):
         points(folder, vary="system.parameters.length=5")[0].train()
     assert "--resume" not in commands[1]
@@ -102,6 +102,8 @@ def test_without_a_key_the_configs_keep_their_own_folders(tmp_path):
         ([CHAIN], "horizon.stepz=3", "horizon.steps?"),
         ([CHAIN], "horizon.steps=3,0", "horizon.steps ≥ 1"),
         ([], None, "--config PATH"),
+        ([CHAIN, CHAIN], None, "integrator_chain twice"),
+        ([CHAIN], "horizon.steps=3,3", "twice"),
     ],
 )
 def test_what_cannot_be_swept_is_refused_before_anything_is_trained(configs, vary, named, commands):
@@ -123,3 +125,27 @@ def test_figure_shows_every_seed_and_every_measure(swept):
     )
     two = [row.measures["cost_mean"] for row in rows if row.value == "2"]
     assert line.get_ydata()[0] == pytest.approx(sum(two) / 2)
+
+
+def test_a_run_that_fails_is_named_and_the_others_are_shown(swept, commands, capsys):
+    _, arguments = swept
+    more = [a.replace("length=2,3", "length=2,3,4") for a in arguments]
+    assert main(more) == 1
+    shown = capsys.readouterr()
+    assert "length=4 failed" not in shown.out
+    assert "integrator_chain: best checkpoints" in shown.out
+    assert "the last words" in shown.err
+    assert "1 failed" in shown.err
+
+
+def test_a_finetuned_run_is_not_the_training_itself(swept):
+    folder, _ = swept
+    point = points(folder)[0]
+    record = point.run().folder / "run.json"
+    content = record.read_text()
+    record.write_text(json.dumps({**json.loads(content), "finetuned_from": "elsewhere.ckpt"}))
+    try:
+        assert point.run() is None
+    finally:
+        record.write_text(content)
+    assert point.run() is not None

@@ -17,7 +17,7 @@ from lyapnet.types import State
 
 Verdict = Literal["certified", "falsified", "unknown"]
 
-EVENTS = ("decrease", "terminal", "cost", "all")
+EVENTS = ("decrease", "terminal", "cost", "all")  # one that is not asked for counts as success
 
 
 @dataclass(frozen=True)
@@ -30,16 +30,16 @@ class Tolerances:
         all:       the three together.
 
     Args:
-        radius: in the norm of the state's components, each in its own unit.
+        radius: in the norm of the state's components, each in its own unit. None, here and for decrease: not asked for.
     """
 
-    radius: float
-    decrease: float = 1e-2
+    radius: float | None = None
+    decrease: float | None = 1e-2
     cost: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value < float("inf"):
+            if value is not None and not 0 <= value < float("inf"):
                 raise ValueError(f"Expected tolerance {name} ≥ 0, got {value}; state what counts as success.")
 
 
@@ -183,12 +183,10 @@ def _events(
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
         return torch.cat([_events(rollout, half, tolerances) for half in x0.tensor_split(2)])
     values = trajectory.require_value()
-    single = torch.stack(
-        [
-            satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease),
-            torch.linalg.vector_norm(trajectory.x[-1], dim=-1) <= tolerances.radius,
-            trajectory.cost <= (1 + tolerances.cost) * values[0],
-        ],
-        -1,
-    )
+    decrease = terminal = torch.ones_like(values[0], dtype=torch.bool)
+    if tolerances.decrease is not None:
+        decrease = satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease)
+    if tolerances.radius is not None:
+        terminal = torch.linalg.vector_norm(trajectory.x[-1], dim=-1) <= tolerances.radius
+    single = torch.stack([decrease, terminal, trajectory.cost <= (1 + tolerances.cost) * values[0]], -1)
     return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

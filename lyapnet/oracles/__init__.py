@@ -13,6 +13,7 @@ __all__ = [
     "Optima",
     "Oracle",
     "Report",
+    "RiccatiOracle",
     "RiccatiSolution",
     "continuous_riccati",
     "discrete_riccati",

@@ -17,7 +17,8 @@ class LyapunovProgram(Program):
 
     The further term bound · V(0, x₀) makes that bound tight: the least V(0, ·) with C = B = 0 is the optimal cost.
     Since V(0, x₀) ≥ J_N − C − B for any V, a V(0, x₀) below the cost is paid for in C or B at their weights: no gain
-    where these exceed the weight of the bound, so that the conditions hold as exact penalties.
+    where both weights exceed that of the bound, so that the conditions hold as exact penalties (where V(T, ·) = φ is
+    built in, B is zero and needs none).
     Source: P_L of arXiv 2305.15244.
     """
 

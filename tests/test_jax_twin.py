@@ -69,7 +69,7 @@ def test_twin_of_another_system_has_another_gradient(name):
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
-        ("double_integrator", ["program.normalise=false", "program.terminal=0"]),
+        ("double_integrator", ["program.normalise=false", "program.terminal=0", "program.bound=0"]),
         ("double_integrator", ["program.bound=0.5", "program.normalise=false"]),
         ("double_integrator", ["network.terminal=exact", "network.hidden=[5,6,7]", "network.epsilon=0.1"]),
         ("double_integrator", ["network.hidden=[8]", "program.margin=0", "program.constraint=0", "program.bound=0"]),

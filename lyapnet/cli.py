@@ -302,8 +302,8 @@ def systems(debug: Debug = False) -> None:
         instance = None if required else cls()
         table.add_row(
             name,
-            "any number" if instance is None else _with_units(instance.state_names, instance.state_units),
-            "any number" if instance is None else _with_units(instance.control_names, instance.control_units),
+            "any number" if instance is None else ", ".join(instance.state_labels),
+            "any number" if instance is None else ", ".join(instance.control_labels),
             ", ".join(shown),
         )
     console = Console(highlight=False)
@@ -428,7 +428,3 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any]) -> None:
         ("use", f'lyapnet.load("{best}")'),
     ):
         console.print(f"{what:<10}{command}", soft_wrap=True)
-
-
-def _with_units(names: Any, units: Any) -> str:
-    return ", ".join(f"{name} ({unit})" if unit else name for name, unit in zip(names, units, strict=True))

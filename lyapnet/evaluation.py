@@ -119,7 +119,7 @@ class Evaluation(NamedTuple):
         Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
-        terminal = dict(zip(self._state_names(), self.table.terminal_state.abs().mean(0).tolist(), strict=True))
+        terminal = dict(zip(self.system.state_labels, self.table.terminal_state.abs().mean(0).tolist(), strict=True))
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
         return {**self.table.summary(), **paper, "terminal_errors": terminal, **counts, **self._note()}
 
@@ -129,7 +129,7 @@ class Evaluation(NamedTuple):
         Raises:
             OSError: the file cannot be written.
         """
-        table, states = self.table, self._state_names()
+        table, states = self.table, self.system.state_labels
         optimal = torch.full_like(table.cost, torch.nan) if table.optimal_cost is None else table.optimal_cost
         columns = {
             **dict(zip(states, table.x0.unbind(-1), strict=True)),
@@ -142,11 +142,6 @@ class Evaluation(NamedTuple):
             writer = csv.writer(file)
             writer.writerow([*columns, "no_optimum"])
             writer.writerows(zip(*(column.tolist() for column in columns.values()), self.notes, strict=True))
-
-    def _state_names(self) -> list[str]:
-        """Names and units, as in "pole angle (rad)"."""
-        pairs = zip(self.system.state_names, self.system.state_units, strict=True)
-        return [f"{name} ({unit})" if unit else name for name, unit in pairs]
 
     def _note(self) -> dict[str, str]:
         missing = [note for note in self.notes if note]

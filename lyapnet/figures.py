@@ -381,16 +381,12 @@ def _legend_below(figure: Figure, axes: Axes) -> None:
 
 def state_label(system: ControlAffineSystem, index: int) -> str:
     """A state's name and unit, for an axis."""
-    return _with_unit(system.state_names[index], system.state_units[index])
+    return system.state_labels[index]
 
 
 def control_label(system: ControlAffineSystem, index: int) -> str:
     """A control's name and unit, for an axis."""
-    return _with_unit(system.control_names[index], system.control_units[index])
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
+    return system.control_labels[index]
 
 
 def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Sequence[int]) -> str:

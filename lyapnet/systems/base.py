@@ -48,6 +48,16 @@ class ControlAffineSystem(nn.Module, ABC):
         return len(self.control_names)
 
     @property
+    def state_labels(self) -> list[str]:
+        """Names with units, as in "pole angle (rad)"."""
+        return _with_units(self.state_names, self.state_units)
+
+    @property
+    def control_labels(self) -> list[str]:
+        """Names with units, as in "force (N)"."""
+        return _with_units(self.control_names, self.control_units)
+
+    @property
     def equilibrium(self) -> Float[Tensor, " n"]:
         """A state with f = 0: the origin unless a subclass knows another one."""
         return torch.zeros(self.n)
@@ -119,6 +129,10 @@ class MechanicalSystem(ControlAffineSystem):
         """M⁻¹B, (*batch, d, m)."""
         # expanded: torch would take a (d, d) B beside a batch of d matrices for a batch of vectors
         return solve(self.mass_matrix(q), self.B.expand(*q.shape[:-1], *self.B.shape))
+
+
+def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str]:
+    return [f"{name} ({unit})" if unit else name for name, unit in zip(names, units, strict=True)]
 
 
 def require_positive(**parameters: float) -> None:

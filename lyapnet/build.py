@@ -1,6 +1,7 @@
 """From a config to the objects it names."""
 
 import copy
+import csv
 import difflib
 import importlib
 import inspect
@@ -13,12 +14,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lyapnet.closed_loop import ClosedLoop
 from lyapnet.config import Config, CostConfig, SystemConfig
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
-from lyapnet.networks import NETWORKS, Scaling, TerminalAnchor
+from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
-from lyapnet.programs import PROGRAMS, Program
+from lyapnet.programs import PROGRAMS, PointwiseCondition, Program
 from lyapnet.rollout import Horizon, Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import SYSTEMS, ControlAffineSystem, Linear
@@ -179,11 +181,13 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
     """
     options = config.network
     cls = network or resolve(options.name, NETWORKS, "network.name", nn.Module)
+    n, kept = task.system.n, _kept_states(config, task.system)
+    angles = [kept.index(angle) for angle in task.system.angles if angle in kept]
     chosen: dict[str, Any] = {
         "hidden": options.hidden,
         "activation": options.activation,
         "epsilon": options.epsilon,
-        "embedded_angles": task.system.angles if options.embed_angles else None,
+        "embedded_angles": angles if options.embed_angles else None,
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}
     accepted = inspect.signature(cls).parameters
@@ -197,9 +201,11 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
             raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
     with _float64_defaults(), torch.random.fork_rng(devices=[]), _section("network"):
         torch.manual_seed(config.seed)
-        V = cls(scaling=_scaling(config, task), **chosen)
+        V = cls(scaling=_scaling(config, task, kept), **chosen)
         if options.terminal == "exact":
-            V = TerminalAnchor(V, task.cost, task.horizon.duration)
+            V = TerminalAnchor(V, _terminal_cost(task.cost, kept), task.horizon.duration)
+        if len(kept) < n:
+            V = IgnoringStates(V, kept, n)
     return V.to(DTYPES[config.training.precision])
 
 
@@ -237,6 +243,41 @@ def build_program(config: Config) -> Program:
         return cls(**options)
 
 
+def build_pointwise(config: Config, task: Task, V: nn.Module, closed_loop: ClosedLoop) -> PointwiseCondition | None:
+    """The program's condition off the closed loops; None without weight.
+
+    Raises:
+        UsageError: a region or a file of counterexamples that does not fit the system.
+    """
+    options = config.pointwise
+    if not options.weight:
+        return None
+    n, lower = task.system.n, task.initial_states.lower
+    extent = _repeated(options.region, n) or (1.5 * task.initial_states.magnitude).tolist()
+    _require_length("pointwise.region", len(extent), task.system)
+    if min(extent) <= 0:
+        raise UsageError("Expected pointwise.region, got none, and X₀ is thin; give a bound of each |x_i|.")
+    region = Box([-bound for bound in extent], extent).to(lower)
+    further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(lower)
+    margin = (config.program.margin or 0.0) if config.program.name == "lyapunov" else None
+    return PointwiseCondition(closed_loop, V, region, task.horizon.duration, options.points, margin, further)
+
+
+def _points_of(path: Path, n: int) -> Tensor:
+    """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            points = torch.tensor([[float(entry) for entry in row] for row in list(csv.reader(file))[1:]])
+        if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
+            raise ValueError(f"rows of {points.shape[-1:]} numbers")
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "
+            "see lyapnet certify --refine."
+        ) from error
+    return points
+
+
 def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> Any:
     """A registered class, or the user's own from module:Class, found from the working directory.
 
@@ -260,7 +301,30 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     return cls
 
 
-def _scaling(config: Config, task: Task) -> Scaling:
+def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
+    """The indices of the states that V depends on."""
+    names, ignored = list(system.state_names), config.network.ignored_states
+    for name in ignored:
+        if name not in names:
+            raise UsageError(
+                f"Expected network.ignored_states among {', '.join(names)}, got {name!r}; name states of the system."
+            )
+    if len(set(ignored)) == len(names):
+        raise UsageError("Expected V to depend on a state, got all in network.ignored_states; leave some out.")
+    return [i for i, name in enumerate(names) if name not in ignored]
+
+
+def _terminal_cost(cost: QuadraticCost, kept: list[int]) -> QuadraticCost:
+    """φ as a function of the kept states alone, which it has to be."""
+    Q_T = cost.Q_T[kept][:, kept]
+    if (cost.Q_T != 0).sum() != (Q_T != 0).sum():
+        raise UsageError(
+            "Expected cost.Q_T without the states in network.ignored_states for terminal=exact, got weights on them."
+        )
+    return QuadraticCost(cost.Q[kept][:, kept], torch.eye(1), Q_T)
+
+
+def _scaling(config: Config, task: Task, kept: list[int]) -> Scaling:
     extent = task.initial_states.magnitude.double()
     given = _repeated(config.network.state_scale, task.system.n)
     scale = given or [v if v > 0 else 1.0 for v in extent.tolist()]
@@ -269,7 +333,7 @@ def _scaling(config: Config, task: Task) -> Scaling:
     if value is None:
         state = torch.tensor(scale, dtype=torch.float64)
         value = float(state @ task.cost.Q_T.double() @ state) or 1.0
-    return Scaling(scale, task.horizon.duration, value)
+    return Scaling([scale[i] for i in kept], task.horizon.duration, value)
 
 
 def _rows(name: str, matrix: Any) -> Any:

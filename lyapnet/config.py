@@ -59,6 +59,18 @@ class ProgramConfig:
 
 
 @dataclass
+class PointwiseConfig:
+    """The program's condition off the closed loops, as a certificate asks for it; see PointwiseCondition."""
+
+    weight: float = option(0.0, "Of the condition at points of [0, T] × D.", at_least=0)
+    points: int = option(512, "Points of each step.", at_least=2)
+    region: list[float] | None = option(None, "D, as a bound of each |x_i|; null: 1.5 times the extent of X₀.", above=0)
+    counterexamples: str | None = option(
+        None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
+    )
+
+
+@dataclass
 class SystemConfig:
     """The dynamics ẋ = f(x) + g(x)u."""
 
@@ -102,6 +114,7 @@ class NetworkConfig:
     )
     hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
     activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
+    ignored_states: list[str] = option([], "Names of states on which V does not depend.")
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
     terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
@@ -163,6 +176,7 @@ class Config:
     seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0)
     seeds: int = option(1, "Runs trained together as one batch, with the seeds seed, seed + 1, …", at_least=1)
     program: ProgramConfig = field(default_factory=ProgramConfig)
+    pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
     system: SystemConfig = field(default_factory=SystemConfig)
     cost: CostConfig = field(default_factory=CostConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)

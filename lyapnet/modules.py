@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet import __version__
-from lyapnet.build import Task, build_program, build_rollout, build_task, build_value_function
+from lyapnet.build import Task, build_pointwise, build_program, build_rollout, build_task, build_value_function
 from lyapnet.checkpoint import KEY, write_checkpoint
 from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
 from lyapnet.discrete_adjoint import DiscreteAdjoint
 from lyapnet.errors import CompilationError, DivergenceError, UsageError
 from lyapnet.evaluation import StateTable, measure
 from lyapnet.programs.base import ProgramOutput
+from lyapnet.randomness import POINTS, VALIDATION, stream
 from lyapnet.rollout import ADAPTIVE_METHODS, Trajectory
 from lyapnet.types import PerState, State
 
@@ -57,7 +58,9 @@ class TrainedModule(L.LightningModule):
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
         """One evaluation of each member's program on its initial states."""
-        return {"loss": torch.stack(self._of_each(x0, ProgramModule.train_on)).sum()}
+        draw = (POINTS, self.global_rank, self.global_step)
+        losses = self._of_each(x0, lambda member, trajectory: member.train_on(trajectory, draw))
+        return {"loss": torch.stack(losses).sum()}
 
     def validation_step(self, x0: Tensor, batch_idx: int) -> None:
         """The tables of the fixed validation states, and the losses that pick the best checkpoints."""
@@ -133,6 +136,7 @@ class ProgramModule(TrainedModule):
         self.V = build_value_function(config, task)
         self.closed_loop = build_rollout(config, task, self.V)
         self.program = build_program(config)
+        self.pointwise = build_pointwise(config, task, self.V, self.closed_loop.closed_loop)
         self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
         # of the last training step and the last validation, for whoever shows them
         self.gradient_norm = self.steps_per_second = math.nan
@@ -142,9 +146,13 @@ class ProgramModule(TrainedModule):
     def trajectories(self, x0: State) -> Iterator[Trajectory]:
         yield self.closed_loop(x0)
 
-    def train_on(self, trajectory: Trajectory) -> Tensor:
-        """The loss of a training batch; its parts are kept in `output`."""
-        output = self.program(trajectory, mean_over_processes)
+    def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
+        """The loss of a training batch; its parts are kept in `output`.
+
+        Args:
+            draw: names the stream of the points off the closed loops.
+        """
+        output = self._with_pointwise(self.program(trajectory, mean_over_processes), trajectory, draw)
         terms = {name: term.detach() for name, term in output.terms.items()}
         self.output = ProgramOutput(
             output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
@@ -152,9 +160,18 @@ class ProgramModule(TrainedModule):
         return output.loss
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
-        """The loss of the validation states; their table is kept in `validation`."""
+        """The loss of the validation states and points; the states' table is kept in `validation`."""
         self.validation = measure(trajectory, self.program, self.validation_optimum)
-        return self.program(trajectory).loss
+        return self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+
+    def _with_pointwise(self, output: ProgramOutput, trajectory: Trajectory, draw: Sequence[int]) -> ProgramOutput:
+        """The program with its condition off the closed loops, where that has a weight."""
+        if self.pointwise is None:
+            return output
+        values, mean_cost = trajectory.require_value(), mean_over_processes(output.trajectory_cost.detach())
+        term = self.pointwise(stream(self.config.seed, *draw), mean_cost, values[0].max())
+        loss = output.loss + self.config.pointwise.weight * term
+        return output._replace(loss=loss, terms={**output.terms, "pointwise": term})
 
     def save_member(self, member: "ProgramModule", path: Path) -> None:
         self.trainer.save_checkpoint(path)

@@ -94,7 +94,7 @@ def test_values_lie_within_bounds(name):
 def without_remainder(function):
     def wrong(*arguments, **keywords):
         form = function(*arguments, **keywords)
-        return affine.AffineForm(form.terms, torch.zeros_like(form.radius))
+        return form.with_parts(form.terms, torch.zeros_like(form.radius))
 
     return wrong
 

@@ -178,7 +178,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
     def without_remainder(function):
         def wrong(*arguments, **keywords):
             form = function(*arguments, **keywords)
-            return affine.AffineForm(form.terms, torch.zeros_like(form.radius))
+            return form.with_parts(form.terms, torch.zeros_like(form.radius))
 
         return wrong
 

@@ -4,7 +4,7 @@ Three claims of growing strength: sampled, statistical, sound. Each class says i
 """
 
 from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
-from lyapnet.certification.branch_and_bound import Budget, Counterexample, Proof, prove
+from lyapnet.certification.branch_and_bound import Budget, Counterexample, Progress, Proof, prove, violations
 from lyapnet.certification.funnel import SoundClaim, enclosing_box, sound_claim
 from lyapnet.certification.statistical import (
     SampledClaim,
@@ -20,6 +20,7 @@ __all__ = [
     "Budget",
     "Counterexample",
     "DecreaseCondition",
+    "Progress",
     "Proof",
     "SampledClaim",
     "SoundClaim",
@@ -31,4 +32,5 @@ __all__ = [
     "sampled_claim",
     "sound_claim",
     "statistical_claim",
+    "violations",
 ]

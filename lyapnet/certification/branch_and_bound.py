@@ -4,17 +4,22 @@ Every box of (t, x) is (1 + n,) long, time first. What is proved is proved by bo
 lyapnet.certification.affine says of rounding; plain evaluations serve to find counterexamples and to guess well.
 """
 
+import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lyapnet.certification.affine import AffineForm
+from lyapnet.atomic import write_atomically
+from lyapnet.certification.affine import AffineForm, wide_axes
 from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
 from lyapnet.certification.statistical import Verdict
+from lyapnet.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -23,14 +28,16 @@ class Budget:
 
     Args:
         seconds, boxes: the work.
-        chunk: boxes that are bounded at once.
+        chunk: boxes that are bounded at once by each worker.
         frontier: undecided boxes that are kept; beyond, those of highest W are given up.
+        workers: threads.
     """
 
     seconds: float = 60.0
     boxes: int = 100_000_000
     chunk: int = 512
-    frontier: int = 200_000
+    frontier: int = 1_000_000
+    workers: int = 1
     started: float = field(default_factory=time.monotonic)
 
     @property
@@ -65,6 +72,7 @@ class Proof:
     boxes: int
     seconds: float
     remaining_volume: float  # share of the box
+    undecided: Tensor  # (k, 1 + n), centres (t, x) of boxes that remain
 
     @property
     def verdict(self) -> Verdict:
@@ -121,6 +129,14 @@ class Boxes(NamedTuple):
 BELOW = 1e-2  # of a counterexample's W: how far under it the level goes on, lest ever smaller boxes follow its edge
 
 
+class Progress(NamedTuple):
+    """How far a proof is."""
+
+    boxes: int  # bounded so far
+    remaining: float  # share of the domain that is undecided
+    seconds: float
+
+
 def prove(
     condition: DecreaseCondition,
     domain: tuple[Tensor, Tensor],
@@ -128,6 +144,8 @@ def prove(
     budget: Budget | None = None,
     stop_at_counterexample: bool = True,
     generator: torch.Generator | None = None,
+    report: Callable[[Progress], None] | None = None,
+    keep: Path | None = None,
 ) -> Proof:
     """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
@@ -139,29 +157,105 @@ def prove(
         condition: in float64.
         domain: (lower, upper) of (t, x).
         stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
+        report: hears how far it is, after every few thousand boxes.
+        keep: a file in which an unfinished proof is kept, and from which it goes on.
+
+    Raises:
+        UsageError: the file keeps the proof of something else.
     """
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
     bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), (lower, upper))
-    level, worst = wanted, find_counterexample(condition, bounded, lower, upper, wanted, generator)
-    frontier = Boxes(lower[None], upper[None], torch.full((1,), -torch.inf, dtype=torch.float64))
-    boxes, given_up = 0, torch.inf
-    if worst is not None:
-        level = _under(worst)
-    while len(frontier.key) and not budget.spent(boxes) and not (worst is not None and stop_at_counterexample):
-        chunk, rest = frontier.first(budget.chunk)
-        boxes += len(chunk.key)
-        undecided, axis = _undecided(bounded, chunk, level)
-        found = _lowest_violation(condition, bounded, undecided.center, level)
-        if found is not None:
-            worst, level = found, _under(found)
-        frontier = rest.joined(undecided.halves(axis))
-        frontier, beyond = frontier[frontier.key <= level].first(budget.frontier)
-        given_up = min(given_up, beyond.least)
-    stopped = worst is not None and stop_at_counterexample
-    proved = -torch.inf if stopped else min(level, _just_below(min(frontier.least, given_up)))
-    remaining = float(frontier.volumes(lower, upper).sum())
-    return Proof(proved, wanted, worst, boxes, budget.elapsed, remaining)
+    search = _kept(keep, bounded, lower, upper, wanted)
+    if search is None:
+        worst = find_counterexample(condition, bounded, lower, upper, wanted, generator)
+        everything = Boxes(lower[None], upper[None], torch.full((1,), -torch.inf, dtype=torch.float64))
+        search = Search(everything, wanted if worst is None else _under(worst), worst)
+    earlier, saved = search.seconds, budget.elapsed
+    with ThreadPoolExecutor(budget.workers) as pool:
+        while len(search.frontier.key) and not (search.worst is not None and stop_at_counterexample):
+            search.seconds = earlier + budget.elapsed
+            over = budget.spent(search.boxes)
+            if keep is not None and (over or budget.elapsed > saved + KEEP_EVERY):
+                search.save(keep, bounded.fingerprint, lower, upper, wanted)
+                saved = budget.elapsed
+            if over:
+                break
+            search.advance(condition, bounded, budget, pool.map)
+            if report is not None:
+                remaining = float(search.frontier.volumes(lower, upper).sum())
+                report(Progress(search.boxes, remaining, search.seconds))
+    stopped = search.worst is not None and stop_at_counterexample
+    proved = -torch.inf if stopped else min(search.level, _just_below(min(search.frontier.least, search.given_up)))
+    remaining = float(search.frontier.volumes(lower, upper).sum())
+    return Proof(
+        proved, wanted, search.worst, search.boxes, earlier + budget.elapsed, remaining, search.frontier.center[:KEPT]
+    )
+
+
+KEEP_EVERY = 30.0  # seconds
+KEPT = 1000  # undecided boxes whose centres a proof names
+
+
+@dataclass
+class Search:
+    """A proof on the way: what is undecided, and below which level the rest is proved."""
+
+    frontier: Boxes
+    level: float
+    worst: Counterexample | None
+    boxes: int = 0
+    seconds: float = 0.0
+    given_up: float = float("inf")  # the least W among boxes for which there was no room
+
+    def advance(
+        self, condition: DecreaseCondition, bounded: BoundedFunction, budget: Budget, run: Callable[..., Any]
+    ) -> None:
+        """Bound the boxes of lowest W, a chunk for each worker."""
+        lowest, rest = self.frontier.first(budget.chunk * budget.workers)
+        self.boxes += len(lowest.key)
+        chunks = [lowest[part] for part in torch.arange(len(lowest.key)).split(budget.chunk)]
+        for undecided, axis in run(lambda chunk: _undecided(bounded, chunk, self.level), chunks):
+            found = _lowest_violation(condition, bounded, undecided.center, self.level)
+            if found is not None:
+                self.worst, self.level = found, _under(found)
+            rest = rest.joined(undecided.halves(axis))
+        self.frontier, beyond = rest[rest.key <= self.level].first(budget.frontier)
+        self.given_up = min(self.given_up, beyond.least)
+
+    def save(self, path: Path, fingerprint: str, lower: Tensor, upper: Tensor, wanted: float) -> None:
+        """Keep it in a file, all or nothing."""
+        content = {
+            "of": _identity(fingerprint, lower, upper, wanted), "frontier": list(self.frontier),
+            "worst": None if self.worst is None else self.worst._asdict(), "level": self.level,
+            "boxes": self.boxes, "seconds": self.seconds, "given_up": self.given_up,
+        }  # fmt: skip
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_atomically(path, buffer.getbuffer())
+
+
+def _identity(fingerprint: str, lower: Tensor, upper: Tensor, wanted: float) -> list[Any]:
+    return [fingerprint, lower.tolist(), upper.tolist(), wanted]
+
+
+def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Tensor, wanted: float) -> Search | None:
+    """The search that a file keeps; None where there is no file."""
+    if path is None or not path.exists():
+        return None
+    try:
+        content = torch.load(path, weights_only=True)
+        same = content.pop("of") == _identity(bounded.fingerprint, lower, upper, wanted)
+        found = content.pop("worst")
+        frontier = Boxes(*content.pop("frontier"))
+        search = Search(frontier=frontier, worst=None if found is None else Counterexample(**found), **content)
+    except Exception as error:
+        raise UsageError(f"Expected a proof in {str(path)!r}, got another or a broken file; remove it.") from error
+    if not same:
+        raise UsageError(
+            f"Expected the proof of this V, α, δ and set in {str(path)!r}, got that of another; give each its own file."
+        )
+    return search
 
 
 def _undecided(bounded: BoundedFunction, chunk: Boxes, level: float) -> tuple[Boxes, Tensor]:
@@ -177,23 +271,24 @@ PROBES = 32  # boxes of a chunk that are cut along every axis
 
 
 def axis_to_cut(bounded: BoundedFunction, form: AffineForm, boxes: Boxes, chosen: Tensor) -> Tensor:
-    """For each chosen box, the axis along which a cut lowers the remainder r of its first result most.
+    """For each chosen box, the axis along which a cut lowers the excess of its first result most.
 
-    A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, r alone is
-    in the way. It is of second order in the widths, r ≈ Σ_k m_k w_k²; m is measured on a few boxes of the chunk.
+    A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, what the
+    bounds have beyond it is in the way. About Σ_k m_k w_k² of it is the widths'; m is measured on a few boxes.
     """
-    widths, radius = boxes.upper - boxes.lower, form.radius.nan_to_num(nan=1e100, posinf=1e100)
+    widths, excess = boxes.upper - boxes.lower, form.excess.nan_to_num(nan=1e100, posinf=1e100)
     some = torch.nonzero(chosen).flatten()[:: max(1, int(chosen.sum()) // PROBES)]
     if not len(some):
         return some
     axes = torch.arange(widths.shape[-1])
     probes = boxes[some.repeat_interleave(len(axes))]
     lower, upper, _ = probes.halves(axes.repeat(len(some)))
-    halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[0].radius
-    drop = radius[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
+    halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[0].excess
+    drop = excess[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
     m = (drop.clamp_min(0) / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
-    # the linear part and the widths decide where r does not
-    tie = 1e-3 * form.coefficients.abs().T.nan_to_num() + 1e-12 * widths
+    # the linear part and the widths decide where the excess does not
+    tie = 1e-12 * widths
+    tie[:, wide_axes(boxes.lower, boxes.upper)] += 1e-3 * form.coefficients.abs().T.nan_to_num()
     return torch.where(widths > 0, m * widths**2 + tie, -1.0)[chosen].argmax(-1)
 
 
@@ -211,13 +306,38 @@ def find_counterexample(
     steps: int = 40,
 ) -> Counterexample | None:
     """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64."""
-    unit = torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
-    points = lower + (upper - lower) * unit
-    values = _values(condition, points)
-    allowed = torch.where(values[1] <= level, values[0], -torch.inf)
-    start = points[allowed.topk(64).indices]
-    climbed = _ascend(condition, start, lower, upper, steps)
-    return _lowest_violation(condition, bounded, torch.cat([points, climbed]), level)
+    points = _likely_violations(condition, lower, upper, level, generator, samples, steps)
+    return _lowest_violation(condition, bounded, points, level)
+
+
+def violations(
+    condition: DecreaseCondition,
+    domain: tuple[Tensor, Tensor],
+    level: float,
+    count: int,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """The worst points (t, x) found with c > 0 and W ≤ level, in plain arithmetic; (k, 1 + n), k ≤ count."""
+    points = _likely_violations(condition, *domain, level, generator, 20_000, 40)
+    c, W = _values(condition, points)
+    worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
+    return points[worst.indices[worst.values > 0]]
+
+
+def _likely_violations(
+    condition: DecreaseCondition,
+    lower: Tensor,
+    upper: Tensor,
+    level: float,
+    generator: torch.Generator | None,
+    samples: int,
+    steps: int,
+) -> Tensor:
+    """Samples of the box, and what ascent from the worst 64 of them with W ≤ level passes."""
+    points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
+    c, W = _values(condition, points)
+    start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
+    return torch.cat([points, _ascend(condition, start, lower, upper, steps)])
 
 
 def _ascend(condition: DecreaseCondition, points: Tensor, lower: Tensor, upper: Tensor, steps: int) -> Tensor:
@@ -328,7 +448,7 @@ def share_below(
     return min(inside, 1.0)
 
 
-def faces(lower: Tensor, upper: Tensor, axes: range) -> tuple[Tensor, Tensor]:
+def faces(lower: Tensor, upper: Tensor, axes: Iterable[int]) -> tuple[Tensor, Tensor]:
     """The faces of a box (d,) perpendicular to some of its axes, as boxes (2 · axes, d) without width there."""
     low, high = [], []
     for axis in axes:

@@ -1,7 +1,9 @@
 """The sound claim: a funnel that closed loops do not leave, and the cost that it guarantees."""
 
 import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -10,11 +12,13 @@ from lyapnet.certification.bounds import DecreaseCondition
 from lyapnet.certification.branch_and_bound import (
     Budget,
     Counterexample,
+    Progress,
     faces,
     minimum,
     prove,
     share_below,
 )
+from lyapnet.certification.invariance import unseen_states
 from lyapnet.certification.statistical import Verdict
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
@@ -34,6 +38,10 @@ class SoundClaim:
         α ∫ℓ dt ≤ V(0, x₀) − V(T, x(T)) + δT,
         J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max of φ(x) − V(T, x)/α where W(T, x) ≤ ρ.
 
+    States that neither f, g, ℓ, φ nor V and u depend on are left out: D is all of ℝ along them. There {W ≤ ρ} is a
+    cylinder whose points are all alike, a closed loop can leave it through its side only, and what is proved on the
+    slice at 0 holds on every slice. (Such a state does not escape: its derivative is bounded along with the others.)
+
     The verdict is about the funnel of ρ = `wanted`, which holds all of X₀. Whatever the verdict, `rho` is the largest
     level that was proved, a funnel of its own, and `volume_share` how much of X₀ it holds.
     """
@@ -50,6 +58,8 @@ class SoundClaim:
     boxes: int
     seconds: float
     remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above the funnel
+    undecided: Tensor  # (k, 1 + n), centres (t, x) of boxes that remain
+    left_out: list[int]  # states on which nothing depends: D has no bounds for them, and is drawn at 0
 
     @property
     def verdict(self) -> Verdict:
@@ -74,6 +84,8 @@ def sound_claim(
     states: Box | None = None,
     budget: Budget | None = None,
     generator: torch.Generator | None = None,
+    report: Callable[[Progress], None] | None = None,
+    keep: Path | None = None,
 ) -> SoundClaim:
     """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
@@ -81,20 +93,25 @@ def sound_claim(
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
         duration: T in s.
         states: D; by default a box around where samples of V are low enough.
+        report, keep: of prove.
 
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
     """
     budget = budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
-    x_low, x_high = initial_states.lower.double(), initial_states.upper.double()
+    left_out = unseen_states(condition.closed_loop)
+    initial_states = _without(initial_states, left_out)
+    x_low, x_high = initial_states.lower, initial_states.upper
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
     if states is None:
         states = enclosing_box(condition.height, initial_states, duration, wanted)
-    domain = _domain(states, initial_states, duration)
+    states = _without(states, left_out)
+    domain = _domain(states, initial_states, duration, left_out)
     needed = _just_above(wanted)
-    rim = minimum(condition.height, *faces(*domain, axes=range(1, len(domain[0]))), budget, enough=_just_above(needed))
-    proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator)
+    axes = [1 + i for i in range(states.dimension) if i not in left_out]
+    rim = minimum(condition.height, *faces(*domain, axes), budget, enough=_just_above(needed))
+    proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator, report, keep)
     rho = wanted if proof.level >= needed else proof.level
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
@@ -104,7 +121,7 @@ def sound_claim(
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, inside, excess,
-        proof.counterexample, proof.boxes, budget.elapsed, proof.remaining_volume,
+        proof.counterexample, proof.boxes, proof.seconds, proof.remaining_volume, proof.undecided, left_out,
     )  # fmt: skip
 
 
@@ -145,13 +162,21 @@ def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
 
 
-def _domain(states: Box, initial_states: Box, duration: float) -> tuple[Tensor, Tensor]:
+def _without(states: Box, left_out: Sequence[int]) -> Box:
+    """The slice of a box at 0 of the states that are left out, in float64."""
+    lower, upper = states.lower.double(), states.upper.double()
+    seen = torch.tensor([i not in left_out for i in range(states.dimension)])
+    return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
+
+
+def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequence[int]) -> tuple[Tensor, Tensor]:
     """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
     if states.dimension != initial_states.dimension:
         raise UsageError(
             f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
         )
     outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
+    outside[left_out] = False
     if outside.any():
         i = int(torch.nonzero(outside)[0])
         raise UsageError(

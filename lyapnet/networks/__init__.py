@@ -9,6 +9,7 @@ from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAncho
 from lyapnet.networks.base import ACTIVATIONS, Scaling
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
+from lyapnet.networks.ignoring import IgnoringStates
 from lyapnet.networks.quadratic import QuadraticForm
 
 NETWORKS: dict[str, type[nn.Module]] = {
@@ -25,6 +26,7 @@ __all__ = [
     "NETWORKS",
     "AnchoredNetwork",
     "GoalAnchor",
+    "IgnoringStates",
     "PartiallyConvexNetwork",
     "QuadraticForm",
     "Scaling",

@@ -2,8 +2,9 @@
 
 from lyapnet.programs.base import Program, ProgramOutput
 from lyapnet.programs.lyapunov import LyapunovProgram
+from lyapnet.programs.pointwise import PointwiseCondition
 from lyapnet.programs.value import ValueProgram
 
 PROGRAMS: dict[str, type[Program]] = {"value": ValueProgram, "lyapunov": LyapunovProgram}
 
-__all__ = ["PROGRAMS", "LyapunovProgram", "Program", "ProgramOutput", "ValueProgram"]
+__all__ = ["PROGRAMS", "LyapunovProgram", "PointwiseCondition", "Program", "ProgramOutput", "ValueProgram"]

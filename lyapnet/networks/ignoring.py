@@ -1,0 +1,37 @@
+"""V that does not depend on some of the states."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor, nn
+
+from lyapnet.calculus import value_and_state_gradient
+from lyapnet.types import PerState, State, Time
+
+
+class IgnoringStates(nn.Module):
+    """V(t, x) = N(t, x_kept): the same whatever the other states are.
+
+    Where neither dynamics nor cost depends on them either, so does the cost-to-go, and nothing is lost.
+
+    Args:
+        network: N, of the kept states.
+        kept: their indices, in increasing order.
+        n: the number of states.
+    """
+
+    kept: Int[Tensor, " k"]
+
+    def __init__(self, network: nn.Module, kept: Sequence[int], n: int):
+        super().__init__()
+        self.network, self.n = network, n
+        self.register_buffer("kept", torch.tensor(kept, dtype=torch.long), persistent=False)
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.network(t, x[..., self.kept])
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V, and V_x with zeros for the states that are ignored."""
+        value, gradient = value_and_state_gradient(self.network, t, x[..., self.kept])
+        return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)

@@ -1,0 +1,91 @@
+"""A program's condition off the closed loops: at points of [0, T] × D, as a certificate asks for it."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.calculus import time_derivative
+from lyapnet.closed_loop import ClosedLoop
+from lyapnet.sets import Box
+from lyapnet.types import PerState, State, Time, Value
+
+FLOOR = 0.01  # of the mean running cost (and of the mean cost, at T): violations below it count as absolute ones
+SURPLUS = 4  # candidates drawn for each point that is used
+CEILING = 1.2  # times the largest V(0, x₀) of the batch: a funnel of X₀ has no points above
+
+
+class PointwiseCondition:
+    """The condition of a program at points of [0, T] × D, relative to the running cost there:
+
+        Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
+        value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
+
+    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ one per cent of the batch's mean running and whole cost (denominators are
+    detached). Points with V above what a funnel of X₀ can hold do not count.
+
+    The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
+    half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
+    ever denser towards T, where V moves fastest.
+
+    Args:
+        closed_loop: with the law of V.
+        V: what is trained.
+        region: D.
+        duration: T in s.
+        points: drawn and sought in each step.
+        margin: of a Lyapunov program; None for the value program.
+        further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
+    """
+
+    def __init__(
+        self,
+        closed_loop: ClosedLoop,
+        V: Value,
+        region: Box,
+        duration: float,
+        points: int,
+        margin: float | None,
+        further: Float[Tensor, "k 1+n"] | None = None,
+    ):
+        self.closed_loop, self.V, self.region, self.duration = closed_loop, V, region, duration
+        self.points, self.margin, self.further = points, margin, further
+
+    def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
+        """The condition at the points of one step.
+
+        Args:
+            generator: the step's stream.
+            mean_cost: J̄ of the closed loops of the step.
+            largest_value: the largest V(0, x₀) among them.
+        """
+        floor, ceiling = FLOOR * mean_cost.detach(), CEILING * largest_value.detach()
+        t, x = (y.to(mean_cost) for y in self._draw(generator))
+        with torch.no_grad():
+            worst = self._violation(t, x, floor, ceiling).topk(self.points // 2).indices
+        t, x = (torch.cat([y[worst], y[: self.points - len(worst)]]) for y in (t, x))
+        if self.further is not None:
+            further = self.further.to(mean_cost)
+            t, x = torch.cat([t, further[:, 0]]), torch.cat([x, further[:, 1:]])
+        return self._violation(t, x, floor, ceiling).mean() + self._end_violation(x, floor, ceiling).mean()
+
+    def _draw(self, generator: torch.Generator) -> tuple[Time, State]:
+        """More points than a step uses."""
+        x = self.region.sample(SURPLUS * self.points, generator)
+        share, late = torch.rand(2, len(x), generator=generator, dtype=torch.float64)
+        before_end = torch.where(late < 0.3, 0.1 * share**2, share)
+        return self.duration * (1 - before_end), x
+
+    def _violation(self, t: Time, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
+        u = self.closed_loop.policy(t, x)
+        running = self.closed_loop.cost.running(x, u)
+        paid = (1 + (self.margin or 0.0)) * running
+        excess = time_derivative(self.V, self.closed_loop.system, lambda *_: u, t, x) + paid
+        return self._penalty(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
+
+    def _end_violation(self, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
+        value, cost = self.V(x.new_full(x.shape[:-1], self.duration), x), self.closed_loop.cost.terminal(x)
+        return self._penalty(cost - value, cost + floor) * (value <= ceiling)
+
+    def _penalty(self, excess: PerState, unit: PerState) -> PerState:
+        relative = excess / unit.detach()
+        return relative**2 if self.margin is None else torch.relu(relative)

@@ -94,12 +94,18 @@ def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
     return AffineForm(torch.cat([center[None], coefficients]), torch.zeros_like(center))
 
 
+def aligned(*forms: AffineForm) -> list[AffineForm]:
+    """The forms with as many axes each, as broadcasting reads them."""
+    rank = max(len(form.shape) for form in forms)
+    return [form.as_rank(rank) for form in forms]
+
+
 # Affine operations
 
 
 def add(x: AffineForm, y: AffineForm) -> AffineForm:
     """x + y: coefficients add, with their signs, and so do remainders."""
-    x, y = _aligned(x, y)
+    x, y = aligned(x, y)
     return AffineForm(x.terms + y.terms, x.radius + y.radius).rounded()
 
 
@@ -139,7 +145,7 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     where LL' = Σ_k A_k A'_k ε_k² + Σ_{j<k} (A_j A'_k + A_k A'_j) ε_j ε_k and ε_k² ∈ [0, 1], so that LL' lies within
     ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k.
     """
-    x, y = _aligned(x, y)
+    x, y = aligned(x, y)
     (c, A, r), (d, B, s) = ((z.center, z.coefficients, z.radius) for z in (x, y))
     diagonal = A * B
     terms = torch.cat([(c * d + diagonal.sum(0) / 2)[None], c * B + d * A])
@@ -202,6 +208,11 @@ def exp(x: AffineForm) -> AffineForm:
     return linearised(x, torch.exp, torch.exp, lambda a, lo, hi: [torch.log(a)])
 
 
+def log(x: AffineForm) -> AffineForm:
+    """log x for x > 0; 1/x = a."""
+    return linearised(x, torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], defined=lambda lo, hi: lo > 0)
+
+
 def log1p(x: AffineForm) -> AffineForm:
     """log(1 + x) for x > −1; 1/(1 + x) = a."""
     return linearised(
@@ -262,6 +273,22 @@ def cos(x: AffineForm) -> AffineForm:
     return linearised(x, torch.cos, lambda v: -torch.sin(v), stationary, defined=_two_periods)
 
 
+def tan(x: AffineForm) -> AffineForm:
+    """tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
+
+    def branch(lo: Tensor, hi: Tensor) -> Tensor:
+        return ((lo + hi) / (2 * torch.pi)).round() * torch.pi
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        base = torch.atan((a - 1).clamp_min(0).sqrt())
+        return [branch(lo, hi) - base, branch(lo, hi) + base]
+
+    def defined(lo: Tensor, hi: Tensor) -> Tensor:
+        return (lo - branch(lo, hi) > -1.57) & (hi - branch(lo, hi) < 1.57)
+
+    return linearised(x, torch.tan, lambda v: 1 + torch.tan(v) ** 2, stationary, defined)
+
+
 def _two_periods(lo: Tensor, hi: Tensor) -> Tensor:
     return hi - lo < 4 * torch.pi
 
@@ -284,8 +311,3 @@ def _sigmoid_derivative(v: Tensor) -> Tensor:
 
 def _softplus(v: Tensor) -> Tensor:
     return v.clamp_min(0) + torch.log1p(torch.exp(-v.abs()))
-
-
-def _aligned(x: AffineForm, y: AffineForm) -> tuple[AffineForm, AffineForm]:
-    rank = max(len(x.shape), len(y.shape))
-    return x.as_rank(rank), y.as_rank(rank)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lyapnet.certification.bounds import DecreaseCondition
+from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
 from lyapnet.certification.branch_and_bound import (
     Budget,
     Counterexample,
@@ -15,6 +15,7 @@ from lyapnet.certification.branch_and_bound import (
     prove,
     share_below,
 )
+from lyapnet.certification.branches import JUMPS
 from lyapnet.certification.statistical import Verdict
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
@@ -88,6 +89,7 @@ def sound_claim(
     budget = budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
     x_low, x_high = initial_states.lower.double(), initial_states.upper.double()
+    _require_continuous(condition.V, x_low, x_high)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
     if states is None:
         states = enclosing_box(condition.height, initial_states, duration, wanted)
@@ -137,6 +139,17 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
+
+
+def _require_continuous(V: Value, x_low: Tensor, x_high: Tensor) -> None:
+    """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
+    lower, upper = _at(0.0, x_low, x_high)
+    jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
+    if jumps:
+        raise UsageError(
+            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write it with "
+            "relu, abs, maximum, minimum or clamp."
+        )
 
 
 def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:

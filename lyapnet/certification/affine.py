@@ -61,7 +61,8 @@ class AffineForm:
     def interval(self) -> tuple[Tensor, Tensor]:
         """(lower, upper) of c ± (Σ_k |A_k| + r), rounded outwards; infinite where nothing is known."""
         reach = self.spread + self.radius + len(self.terms) * EPSILON * self.magnitude + TINY
-        return (self.center - reach).nan_to_num(nan=-torch.inf), (self.center + reach).nan_to_num(nan=torch.inf)
+        known = reach.isfinite()
+        return (self.center - reach).where(known, -torch.inf), (self.center + reach).where(known, torch.inf)
 
     def rounded(self, operations: int = 1) -> "AffineForm":
         """The form with room for so many rounded operations on each of its entries, in sequence or in one sum."""

@@ -228,7 +228,7 @@ def _power(x: AffineForm, exponent: float) -> AffineForm:
     return affine.square(half) if exponent % 2 == 0 else affine.multiply(affine.square(half), x)
 
 
-@rule(aten.mm.default, aten.matmul.default, aten.bmm.default)
+@rule(aten.mm.default, aten.bmm.default)
 def _matrix_product(x: Any, y: Any) -> AffineForm:
     """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
     if not isinstance(x, AffineForm):
@@ -283,7 +283,7 @@ def _sum(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False,
 def _mean(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
     """Σ x over some axes, divided by their length."""
     total = _sum(x, dim, keepdim)
-    return _multiply(total, total.radius[0].numel() / x.shape.numel())
+    return _multiply(total, total.shape.numel() / x.shape.numel())
 
 
 # Functions of one number
@@ -398,18 +398,16 @@ ARRANGEMENTS: dict[Any, Rule] = {
     **{
         operation: _arranging(operation)
         for operation in (
-            aten.reshape.default, aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
+            aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
             aten.unsqueeze.default, aten.squeeze.default, aten.squeeze.dim, aten.squeeze.dims, aten.select.int,
-            aten.slice.Tensor, aten.index.Tensor, aten.clone.default, aten.select_backward.default, aten.unbind.int,
+            aten.slice.Tensor, aten.index.Tensor, aten.select_backward.default, aten.unbind.int,
             aten.slice_backward.default, aten.split.Tensor, aten.flip.default,
             aten.diagonal.default, aten.diag_embed.default,
         )
     },
     **{operation: _arranging(aten.reshape.default) for operation in (aten.view.default, aten._unsafe_view.default)},
-    aten.squeeze_.dim: _arranging(aten.squeeze.dim),
     aten.cat.default: _joining(aten.cat.default),
     aten.stack.default: _joining(aten.stack.default),
-    aten.alias.default: lambda x: x,
     operator.getitem: operator.getitem,
 }  # fmt: skip
 

@@ -11,6 +11,7 @@ from lyapnet.certification.branch_and_bound import (
     Budget,
     Counterexample,
     faces,
+    find_counterexample,
     minimum,
     prove,
     share_below,
@@ -98,6 +99,10 @@ def sound_claim(
     rim = minimum(condition.height, *faces(*domain, axes=range(1, len(domain[0]))), budget, enough=_just_above(needed))
     proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator)
     rho = wanted if proof.level >= needed else proof.level
+    found = proof.counterexample
+    if found is None and rim <= needed:  # the proof was about less than what X₀ needs, and so was its search
+        bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
+        found = find_counterexample(condition, bounded, *domain, needed, generator)
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
@@ -106,7 +111,7 @@ def sound_claim(
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, inside, excess,
-        proof.counterexample, proof.boxes, budget.elapsed, proof.remaining_volume,
+        found, proof.boxes, budget.elapsed, proof.remaining_volume,
     )  # fmt: skip
 
 

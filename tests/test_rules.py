@@ -281,9 +281,9 @@ def test_no_value_of_a_composition_lies_outside(expression):
 
 
 @pytest.mark.slow
-@settings(max_examples=1000)
+@settings(max_examples=300)
 @given(EXPRESSIONS)
-def test_no_value_of_a_thousand_compositions_lies_outside(expression):
+def test_no_value_of_many_compositions_lies_outside(expression):
     assert outside_of_composition(expression) == 0
 
 
@@ -343,7 +343,7 @@ def test_elementary_functions_err_by_less_than_is_taken_on_trust(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ELEMENTARY)
 def test_elementary_functions_err_by_less_at_many_points(name):
-    assert largest_error(name, 100_000) < 4
+    assert largest_error(name, 100_000) < 2
 
 
 def test_a_function_in_single_precision_errs_by_more(monkeypatch):

@@ -179,7 +179,8 @@ def applied(function):
 
 
 def test_an_operator_without_a_rule_is_named():
-    for function, named in ((torch.relu, "relu"), (lambda x: torch.where(x > 0, x, 2 * x), "gt"), (torch.erf, "erf")):
+    truths = lambda x: ((x > 0) + (x < 1)) * x  # noqa: E731  torch reads 1 + 1 as true there
+    for function, named in ((torch.erf, "erf"), (torch.floor, "floor"), (torch.cosh, "cosh"), (truths, "add")):
         with pytest.raises(UsageError, match=f"rule for bounds, got aten.{named}"):
             BoundedFunction(applied(function), unit())
     with pytest.raises(UsageError, match=r"whole exponent.*1\.5"):
@@ -266,12 +267,6 @@ def test_the_excess_of_the_width_is_of_second_order():
     orders = torch.tensor(excess[:-1]).div(torch.tensor(excess[1:])).log2()
     assert (orders > 1.8).all()
     assert (orders < 2.5).all()
-
-
-def test_a_law_with_branches_is_refused_by_name():
-    c, _ = condition("double_integrator", "fcn", policy="sontag")
-    with pytest.raises(UsageError, match=r"rule for bounds, got aten\.lt"):
-        BoundedFunction(several(c), unit())
 
 
 def test_alpha_and_delta_are_checked():

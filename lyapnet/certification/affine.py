@@ -3,7 +3,8 @@
 Rounding. Forms enclose the values of real arithmetic on the given float64 numbers. Every operation here adds to its
 remainder a bound of its own rounding errors: a multiple of ε = 2⁻⁵² times the magnitudes that entered it, at least
 twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. Two things are taken on
-trust: that torch's elementary functions err by at most 8 ε, and that nothing underflows by more than TINY.
+trust: that torch's elementary functions err by at most 8 ε (the largest that tests have seen, on a CPU, is 1.2 ε),
+and that nothing underflows by more than TINY.
 
 Source: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004; the remainder
 here is one number for each entry, instead of a new noise symbol for each operation.
@@ -78,7 +79,8 @@ class AffineForm:
         """(lower, upper) bounds of the set, rounded outwards; infinite where nothing is known."""
         slack = self.radius + 4 * len(self.terms) * EPSILON * self.magnitude + TINY
         lower, upper = self.center - self._reach(-1) - slack, self.center + self._reach(1) + slack
-        return lower.nan_to_num(nan=-torch.inf), upper.nan_to_num(nan=torch.inf)
+        known = lower.isfinite() & upper.isfinite()
+        return lower.where(known, -torch.inf), upper.where(known, torch.inf)
 
     def _reach(self, sign: int) -> Tensor:
         """An upper bound of ±(Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k), which is exact where B is diagonal.
@@ -148,12 +150,18 @@ def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
     return like.with_parts(torch.cat([center[None], coefficients]), torch.zeros_like(center))
 
 
+def aligned(*forms: AffineForm) -> list[AffineForm]:
+    """The forms with as many axes each, as broadcasting reads them."""
+    rank = max(len(form.shape) for form in forms)
+    return [form.as_rank(rank) for form in forms]
+
+
 # Affine operations
 
 
 def add(x: AffineForm, y: AffineForm) -> AffineForm:
     """x + y: coefficients add, with their signs, and so do remainders."""
-    x, y = _aligned(x, y)
+    x, y = aligned(x, y)
     return x.with_parts(x.terms + y.terms, x.radius + y.radius).rounded()
 
 
@@ -193,7 +201,7 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     The last four go into the remainder, by Σ|A| and Σ|B| of each. In forms of first degree LL' does as well: since
     ε_k² ∈ [0, 1], it lies within ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k.
     """
-    x, y = _aligned(x, y)
+    x, y = aligned(x, y)
     (c, A, B, r), (d, E, F, s) = ((z.center, z.coefficients, z.products, z.radius) for z in (x, y))
     remainder = (c.abs() + x.spread) * s + (d.abs() + y.spread) * r + r * s
     rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
@@ -314,6 +322,14 @@ def exp(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
+def log(x: AffineForm) -> AffineForm:
+    """log x for x > 0; 1/x = a."""
+    return linearised(
+        x, torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], lambda lo, hi: lo > 0,
+        lambda v: -1 / v**2, lambda lo, hi: _between(2 / hi**3, 2 / lo**3),
+    )  # fmt: skip
+
+
 def log1p(x: AffineForm) -> AffineForm:
     """log(1 + x) for x > −1; 1/(1 + x) = a."""
     return linearised(
@@ -416,6 +432,22 @@ def _around(middle: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
     return _between((middle - reach).clamp_min(-1), (middle + reach).clamp_max(1))
 
 
+def tan(x: AffineForm) -> AffineForm:
+    """tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
+
+    def branch(lo: Tensor, hi: Tensor) -> Tensor:
+        return ((lo + hi) / (2 * torch.pi)).round() * torch.pi
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        base = torch.atan((a - 1).clamp_min(0).sqrt())
+        return [branch(lo, hi) - base, branch(lo, hi) + base]
+
+    def defined(lo: Tensor, hi: Tensor) -> Tensor:
+        return (lo - branch(lo, hi) > -1.57) & (hi - branch(lo, hi) < 1.57)
+
+    return linearised(x, torch.tan, lambda v: 1 + torch.tan(v) ** 2, stationary, defined)
+
+
 def _two_periods(lo: Tensor, hi: Tensor) -> Tensor:
     return hi - lo < 4 * torch.pi
 
@@ -447,8 +479,3 @@ def _softplus(v: Tensor) -> Tensor:
 def _absolute_sum(terms: Tensor) -> Tensor:
     """Σ |term| over the first axis."""
     return terms.abs().sum(0)
-
-
-def _aligned(x: AffineForm, y: AffineForm) -> tuple[AffineForm, AffineForm]:
-    rank = max(len(x.shape), len(y.shape))
-    return x.as_rank(rank), y.as_rank(rank)

@@ -13,14 +13,16 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch._functorch.compile_utils import fx_graph_cse
 from torch.func import vmap
-from torch.fx import Graph, Node
+from torch.fx import Node
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from lyapnet.calculus import gradients, state_gradient
 from lyapnet.certification import affine
 from lyapnet.certification.affine import AffineForm, box_form
+from lyapnet.certification.branches import CHOICES, JUMPS, KINKS
+from lyapnet.certification.graphs import with_known_truths, without_copies
+from lyapnet.certification.linear_systems import LINEAR_SYSTEMS
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
 from lyapnet.policy import ValuePolicy
@@ -92,7 +94,7 @@ class BoundedFunction:
             raise UsageError(
                 f"Expected f, g, the cost and V in torch operations whose course does not depend on values, got {error}"
             ) from error
-        self._nodes = list(_without_copies(self._graph.graph).nodes)
+        self._nodes = list(with_known_truths(without_copies(self._graph.graph)).nodes)
         self._fold_constants()
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
         self.forms(lower[None], upper[None])  # an operator without a rule is found here
@@ -128,6 +130,11 @@ class BoundedFunction:
         """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where there are none."""
         return [form.interval() for form in self.forms(lower, upper)]
 
+    @property
+    def operators(self) -> set[Any]:
+        """Those that meet the point, and do not fold to constants."""
+        return {node.target for node in self._nodes if node.op == "call_function" and node not in self._constants}
+
     def _fold_constants(self) -> None:
         self._constants: dict[Node, Any] = {}
         for node in self._nodes:
@@ -139,29 +146,8 @@ class BoundedFunction:
                 self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
 
 
-def _without_copies(graph: Graph) -> Graph:
-    """The graph without nodes that hand on what they get, and without what is then computed twice."""
-    constants: dict[str, Node] = {}
-    for node in list(graph.nodes):
-        if node.op == "get_attr":  # which CSE leaves apart
-            node.replace_all_uses_with(constants.setdefault(str(node.target), node))
-        elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
-            node.replace_all_uses_with(node.args[0])
-            graph.erase_node(node)
-    graph = fx_graph_cse(graph)
-    graph.eliminate_dead_code()
-    return graph
-
-
-def _shape(node: Any) -> torch.Size | Node:
-    """Of the node's value; the node itself where that was not recorded."""
-    return node.meta["val"].shape if isinstance(node.meta.get("val"), Tensor) else node
-
-
-COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view.default, aten.reshape.default}
-
 Rule = Callable[..., Any]
-RULES: dict[Any, Rule] = {}
+RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS}
 """Operator ↦ its rule: the operator's arguments, some of them affine forms, ↦ an affine form, or a tensor."""
 
 
@@ -180,12 +166,17 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
     if not any(isinstance(values[source], AffineForm | list) for source in node.all_input_nodes):
         return node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
     found = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
-    if found is None:
+    if found is None or (found in (_add, _index_add) and _of_truths(node)):
         raise UsageError(
             f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
             "lyapnet.certification.bounds.RULES."
         )
     return found(*arguments, **keywords)
+
+
+def _of_truths(node: Node) -> bool:
+    """Whether torch reads 1 + 1 as true there."""
+    return getattr(node.meta.get("val"), "dtype", None) == torch.bool
 
 
 def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
@@ -254,7 +245,7 @@ def _power(x: AffineForm, exponent: float) -> AffineForm:
     return affine.square(half) if exponent % 2 == 0 else affine.multiply(affine.square(half), x)
 
 
-@rule(aten.mm.default, aten.matmul.default, aten.bmm.default)
+@rule(aten.mm.default, aten.bmm.default)
 def _matrix_product(x: Any, y: Any) -> AffineForm:
     """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
     if not isinstance(x, AffineForm):
@@ -269,6 +260,20 @@ def _matrix_product(x: Any, y: Any) -> AffineForm:
 def _matrix_vector_product(x: Any, y: Any) -> AffineForm:
     """xy of a matrix and a vector."""
     return ARRANGEMENTS[aten.squeeze.dim](_matrix_product(x, _unsqueezed(y, -1)), -1)
+
+
+@rule(aten.dot.default)
+def _dot(x: Any, y: Any) -> AffineForm:
+    """Σ_i x_i y_i."""
+    return _sum(_multiply(x, y))
+
+
+@rule(aten._to_copy.default)
+def _to_copy(x: AffineForm, dtype: Any = None, **keywords: Any) -> AffineForm:
+    """x: truths as numbers, in float64."""
+    if dtype not in (None, torch.float64):
+        raise UsageError(f"Expected float64 throughout, got {dtype} in between; leave the dtype to follow the input.")
+    return x
 
 
 @rule(aten.addmm.default)
@@ -288,25 +293,27 @@ def _negate(x: AffineForm) -> AffineForm:
 @rule(aten.sum.default, aten.sum.dim_IntList)
 def _sum(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
     """Σ x over some axes; remainders add."""
-    return _rearranged(lambda y: y.sum(dim or None, keepdim), x.rounded(x.radius[0].numel()))
+    return _rearranged(lambda y: y.sum(dim or None, keepdim), x.rounded(x.shape.numel()))
 
 
 @rule(aten.mean.default, aten.mean.dim)
 def _mean(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
     """Σ x over some axes, divided by their length."""
     total = _sum(x, dim, keepdim)
-    return _multiply(total, total.radius[0].numel() / x.radius[0].numel())
+    return _multiply(total, total.shape.numel() / x.shape.numel())
 
 
 # Functions of one number
 
 rule(aten.exp.default)(affine.exp)
+rule(aten.log.default)(affine.log)
 rule(aten.log1p.default)(affine.log1p)
 rule(aten.sqrt.default)(affine.sqrt)
 rule(aten.reciprocal.default)(affine.reciprocal)
 rule(aten.sigmoid.default)(affine.sigmoid)
 rule(aten.sin.default)(affine.sin)
 rule(aten.cos.default)(affine.cos)
+rule(aten.tan.default)(affine.tan)
 
 
 @rule(aten.rsqrt.default)
@@ -408,17 +415,16 @@ ARRANGEMENTS: dict[Any, Rule] = {
     **{
         operation: _arranging(operation)
         for operation in (
-            aten.reshape.default, aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
+            aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
             aten.unsqueeze.default, aten.squeeze.default, aten.squeeze.dim, aten.squeeze.dims, aten.select.int,
-            aten.slice.Tensor, aten.index.Tensor, aten.clone.default, aten.select_backward.default, aten.unbind.int,
+            aten.slice.Tensor, aten.index.Tensor, aten.select_backward.default, aten.unbind.int,
             aten.slice_backward.default, aten.split.Tensor, aten.flip.default,
+            aten.diagonal.default, aten.diag_embed.default,
         )
     },
     **{operation: _arranging(aten.reshape.default) for operation in (aten.view.default, aten._unsafe_view.default)},
-    aten.squeeze_.dim: _arranging(aten.squeeze.dim),
     aten.cat.default: _joining(aten.cat.default),
     aten.stack.default: _joining(aten.stack.default),
-    aten.alias.default: lambda x: x,
     operator.getitem: operator.getitem,
 }  # fmt: skip
 
@@ -457,7 +463,7 @@ def _unsqueezed(x: Any, axis: int) -> Any:
 
 
 def _tensor(number: Any) -> Tensor:
-    return number if isinstance(number, Tensor) else torch.tensor(number, dtype=torch.float64)
+    return torch.as_tensor(number).to(torch.float64)
 
 
 def _attribute(module: Any, path: str) -> Tensor:

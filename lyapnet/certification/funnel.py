@@ -8,16 +8,18 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lyapnet.certification.bounds import DecreaseCondition
+from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
 from lyapnet.certification.branch_and_bound import (
     Budget,
     Counterexample,
     Progress,
     faces,
+    find_counterexample,
     minimum,
     prove,
     share_below,
 )
+from lyapnet.certification.branches import JUMPS
 from lyapnet.certification.invariance import unseen_states
 from lyapnet.certification.statistical import Verdict
 from lyapnet.closed_loop import ClosedLoop
@@ -103,6 +105,7 @@ def sound_claim(
     left_out = unseen_states(condition.closed_loop)
     initial_states = _without(initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
+    _require_continuous(condition.V, x_low, x_high)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
     if states is None:
         states = enclosing_box(condition.height, initial_states, duration, wanted)
@@ -113,6 +116,10 @@ def sound_claim(
     rim = minimum(condition.height, *faces(*domain, axes), budget, enough=_just_above(needed))
     proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator, report, keep)
     rho = wanted if proof.level >= needed else proof.level
+    found = proof.counterexample
+    if found is None and rim <= needed:  # the proof was about less than what X₀ needs, and so was its search
+        bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
+        found = find_counterexample(condition, bounded, *domain, needed, generator)
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
@@ -121,7 +128,7 @@ def sound_claim(
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, inside, excess,
-        proof.counterexample, proof.boxes, proof.seconds, proof.remaining_volume, proof.undecided, left_out,
+        found, proof.boxes, proof.seconds, proof.remaining_volume, proof.undecided, left_out,
     )  # fmt: skip
 
 
@@ -154,6 +161,17 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
+
+
+def _require_continuous(V: Value, x_low: Tensor, x_high: Tensor) -> None:
+    """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
+    lower, upper = _at(0.0, x_low, x_high)
+    jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
+    if jumps:
+        raise UsageError(
+            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write it with "
+            "relu, abs, maximum, minimum or clamp."
+        )
 
 
 def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:

@@ -24,6 +24,7 @@ class AffineForm:
     """The set {c + Σ_k A_k ε_k + η : |ε_k| ≤ 1, |η| ≤ r} for each box and entry.
 
     ε_1 … ε_d run over the box and are shared by all its forms; η is anything, another one in each form and entry.
+    With d = 0 forms are intervals, and what is computed with them is interval arithmetic.
 
     Args:
         terms: c, A_1, …, A_d as (1 + d, boxes, *shape).
@@ -61,7 +62,8 @@ class AffineForm:
     def interval(self) -> tuple[Tensor, Tensor]:
         """(lower, upper) of c ± (Σ_k |A_k| + r), rounded outwards; infinite where nothing is known."""
         reach = self.spread + self.radius + len(self.terms) * EPSILON * self.magnitude + TINY
-        return (self.center - reach).nan_to_num(nan=-torch.inf), (self.center + reach).nan_to_num(nan=torch.inf)
+        lower, upper = self.center - reach, self.center + reach
+        return torch.where(lower.isnan(), -torch.inf, lower), torch.where(upper.isnan(), torch.inf, upper)
 
     def rounded(self, operations: int = 1) -> "AffineForm":
         """The form with room for so many rounded operations on each of its entries, in sequence or in one sum."""
@@ -84,6 +86,11 @@ def box_form(lower: Tensor, upper: Tensor) -> AffineForm:
     center, half = (lower + upper) / 2, (upper - lower) / 2
     coefficients = half.T[..., None] * torch.eye(lower.shape[-1], dtype=half.dtype)[:, None]
     return AffineForm(torch.cat([center[None], coefficients]), torch.zeros_like(center)).rounded(2)
+
+
+def interval_form(lower: Tensor, upper: Tensor) -> AffineForm:
+    """The boxes as intervals, which forget that they are functions of the same point: no ε, all remainder."""
+    return AffineForm(((lower + upper) / 2)[None], (upper - lower) / 2).rounded(2)
 
 
 def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
@@ -137,9 +144,11 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
         xy = cc' + cL' + c'L + LL' + (c + L)η' + (c' + L')η + ηη',
 
     where LL' = Σ_k A_k A'_k ε_k² + Σ_{j<k} (A_j A'_k + A_k A'_j) ε_j ε_k and ε_k² ∈ [0, 1], so that LL' lies within
-    ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k.
+    ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k. Of intervals, between products of their ends.
     """
     x, y = _aligned(x, y)
+    if not len(x.coefficients):
+        return _interval_product(x, y)
     (c, A, r), (d, B, s) = ((z.center, z.coefficients, z.radius) for z in (x, y))
     diagonal = A * B
     terms = torch.cat([(c * d + diagonal.sum(0) / 2)[None], c * B + d * A])
@@ -148,6 +157,15 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     remainder = (c.abs() + x.spread) * s + (d.abs() + y.spread) * r + r * s
     rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
     return AffineForm(terms, quadratic + remainder + rounding)
+
+
+def _interval_product(x: AffineForm, y: AffineForm) -> AffineForm:
+    (a, b), (c, d) = x.interval(), y.interval()
+    ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, which stays: nothing is known
+    low, high = ends.amin(0), ends.amax(0)
+    product = AffineForm(((low + high) / 2)[None], (high - low) / 2).rounded(4)
+    known = torch.isfinite(low) & torch.isfinite(high)
+    return AffineForm(torch.where(known, product.terms, 0.0), torch.where(known, product.radius, torch.inf))
 
 
 # Functions of one number
@@ -179,6 +197,7 @@ def linearised(
     f_l, f_u = function(lo), function(hi)
     wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # else the secant's slope is a quotient of rounding errors
     a = torch.where(wide, (f_u - f_l) / torch.where(wide, hi - lo, 1.0), derivative((lo + hi) / 2))
+    a = a if len(x.coefficients) else torch.zeros_like(a)  # of an interval: its image, b ± e
     points = torch.stack([torch.where(p.isnan(), lo, p).clamp(lo, hi) for p in stationary(a, lo, hi)])
     f_p = function(points)
     h = torch.cat([(f_l - a * lo)[None], (f_u - a * hi)[None], f_p - a * points])

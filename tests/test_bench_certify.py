@@ -147,10 +147,10 @@ def test_the_truth_of_the_chains(n):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_proves_what_is_true_and_refutes_its_twin(method):
-    proof = attempt(of_chain(2), method, 20)
+    proof = attempt(of_chain(2), method, 100)
     assert proof.verdict == "certified"
     assert proof.boxes >= 1
-    assert attempt(of_chain(2, holds=False), method, 20, holds=False).verdict == "falsified"
+    assert attempt(of_chain(2, holds=False), method, 100, holds=False).verdict == "falsified"
 
 
 def test_a_method_that_stays_unknown_goes_no_further():
@@ -160,7 +160,7 @@ def test_a_method_that_stays_unknown_goes_no_further():
 
 
 def test_interval_arithmetic_takes_more_boxes():
-    boxes = {method: attempt(of_chain(2), method, 20).boxes for method in ENCLOSURES}
+    boxes = {method: attempt(of_chain(2), method, 100).boxes for method in ENCLOSURES}
     assert boxes["affine"] < boxes[MEAN_VALUE] < boxes["interval"]
 
 
@@ -191,7 +191,7 @@ def test_a_gradient_without_rules_leaves_the_mean_value_form_out():
 
 # The command
 
-QUICK = ["--boxes", "3", "--repeats", "1", "--seconds", "5", "--dimensions", "1"]
+QUICK = ["--boxes", "3", "--repeats", "1", "--seconds", "100", "--dimensions", "1"]
 
 
 @pytest.fixture

@@ -18,38 +18,35 @@ Enclosure = Callable[[Tensor, Tensor], Sides]
 """Boxes (lower, upper) of (t, x), (boxes, 1 + n) each ↦ (lower, upper) bounds of c on them, (boxes,) each."""
 
 
-def affine(c: Value, sample: Sides) -> Enclosure:
+def affine(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
     """Affine forms, as the certifier has them: the excess is of second order in the box, and dependence is kept."""
-    bounded = BoundedFunction(lambda t, x: (c(t, x),), sample)
     return lambda lower, upper: bounded.bounds(lower, upper)[0]
 
 
-def interval(c: Value, sample: Sides) -> Enclosure:
+def interval(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
     """Plain interval arithmetic: exact images of single operations; the excess of the whole is of first order."""
-    bounded = BoundedFunction(lambda t, x: (c(t, x),), sample)
     return lambda lower, upper: bounded.image(interval_form(lower, upper))[0].interval()
 
 
-def mean_value(c: Value, sample: Sides) -> Enclosure:
+def mean_value(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
     """c(m) + Σ_k [∂c/∂y_k] (y_k − m_k), m the middle of the box, its gradient on the box by interval arithmetic.
 
     Of second order, with the interval excess of the gradient as its factor.
     """
-    value = BoundedFunction(lambda t, x: (c(t, x),), sample)
     slopes = BoundedFunction(lambda t, x: gradients(c, t, x), sample)
 
     def enclose(lower: Tensor, upper: Tensor) -> Sides:
         middle = (lower + upper) / 2
         reach = torch.maximum(upper - middle, middle - lower)
-        V_t, V_x = slopes.image(interval_form(lower, upper))
-        steepest = torch.cat([V_t.magnitude[:, None], V_x.magnitude], -1)
-        at = value.image(interval_form(middle, middle))[0]
+        c_t, c_x = slopes.image(interval_form(lower, upper))
+        steepest = torch.cat([c_t.magnitude[:, None], c_x.magnitude], -1)
+        at = bounded.image(interval_form(middle, middle))[0]
         return AffineForm(at.terms, at.radius + (steepest * reach).sum(-1)).rounded(len(lower[0]) + 2).interval()
 
     return enclose
 
 
-ENCLOSURES: dict[str, Callable[[Value, Sides], Enclosure]] = {
+ENCLOSURES: dict[str, Callable[[BoundedFunction, Value, Sides], Enclosure]] = {
     "affine": affine,
     "interval": interval,
     MEAN_VALUE: mean_value,
@@ -64,18 +61,23 @@ def enclosure(name: str, c: Value, sample: Sides) -> Enclosure:
     """
     if name not in ENCLOSURES:
         raise UsageError(f"Expected an enclosure among {', '.join(ENCLOSURES)}, got {name!r}; choose one of them.")
-    return ENCLOSURES[name](c, sample)
+    return ENCLOSURES[name](_traced(c, sample), c, sample)
 
 
 def enclosures_of(c: Value, sample: Sides, say: Callable[[str], Any]) -> dict[str, Enclosure]:
-    """All of them; `say` hears why the gradient of c, which training never needs, has no bounds.
+    """All of them, of c traced once; `say` hears why the gradient of c, which training never needs, has no bounds.
 
     Raises:
         UsageError: c itself has an operator without a rule.
     """
-    found = {name: enclosure(name, c, sample) for name in ENCLOSURES if name != MEAN_VALUE}
-    try:
-        return {**found, MEAN_VALUE: enclosure(MEAN_VALUE, c, sample)}
-    except UsageError as error:
-        say(f"{MEAN_VALUE} is left out, for the gradient of c: {error}")
-        return found
+    bounded, found = _traced(c, sample), {}
+    for name, build in ENCLOSURES.items():
+        try:
+            found[name] = build(bounded, c, sample)
+        except UsageError as error:
+            say(f"{name} is left out, for the gradient of c: {error}")
+    return found
+
+
+def _traced(c: Value, sample: Sides) -> BoundedFunction:
+    return BoundedFunction(lambda t, x: (c(t, x),), sample)

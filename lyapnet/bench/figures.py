@@ -52,10 +52,9 @@ def _draw_proofs(axes: Axes, rows: Sequence[Attempt]) -> None:
         tried = [row for row in rows if row.method == method and row.holds]
         n, seconds = [row.states for row in tried], [row.seconds for row in tried]
         label = f"{method}, by {'remainder' if method == CERTIFIER else 'widest axis'}"
-        axes.semilogy(n, seconds, line, color=color, label=label)
-        for row in tried:
-            fill = "white" if row.verdict == "unknown" else color
-            axes.plot(row.states, row.seconds, marker, color=color, markerfacecolor=fill, markersize=6)
+        axes.semilogy(n, seconds, line, color=color, marker=marker, markersize=5, label=label)
+        for row in (row for row in tried if row.verdict == "unknown"):
+            axes.plot(row.states, row.seconds, marker, color=color, markerfacecolor="white", markersize=5)
     twins = [row for row in rows if not row.holds and row.verdict == "falsified"]
     axes.plot(
         [row.states for row in twins], [row.seconds for row in twins], "x", color="black", label="twin, falsified"
@@ -64,5 +63,5 @@ def _draw_proofs(axes: Axes, rows: Sequence[Attempt]) -> None:
         axes.plot([], [], "o", color=GREY, markerfacecolor="white", label="budget spent: unknown")
     axes.set_xticks(sorted({row.states for row in rows}))
     axes.set_xlabel("integrators n", fontsize=9)
-    axes.set_ylabel("time to a verdict on c ≤ 0 (s)", fontsize=9)
+    axes.set_ylabel("time to a verdict on c ≤ 0, with tracing (s)", fontsize=9)
     axes.set_title("growth: Riccati V on chains of integrators", fontsize=9)

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,9 +10,9 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
+from lyapnet.bench import commands
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.tables import (
-    bench_table,
     certificate_table,
     evaluation_table,
     robustness_table,
@@ -25,7 +24,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Debug = commands.Debug
 Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run.", metavar="CKPT")]
 
 
@@ -218,72 +217,7 @@ def certify(
         Console(highlight=False).print(certificate_table(str(checkpoint), result))
 
 
-@app.command()
-def bench(
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="Changes to every task's config, as key.sub=value.")
-    ] = None,
-    task: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="NAME in conf/NAME.yaml, a YAML file, or chain:N for N integrators; double_integrator if none."
-        ),
-    ] = None,
-    batch: Annotated[list[str] | None, typer.Option(help="Numbers of initial states; 12,64,512 if none.")] = None,
-    routes: Annotated[list[str] | None, typer.Option(help="Some of the above; all that can run here if none.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
-    figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
-    debug: Debug = False,
-) -> None:
-    """Time the routes to the gradient of a training loss; measure their memory and error.
-
-    Routes, of which the starred ones appear twice, eager and compiled:
-
-    rollout *            the closed loop without a gradient: the floor
-    adjoint              odeint_adjoint, V_x by the network's formula
-    adjoint-autograd     odeint_adjoint, V_x by autograd
-    backprop             backpropagation through the steps
-    discrete *           the exact discrete adjoint
-    jax, jax-checkpoint  the same loss jitted in JAX, where it is installed
-    jax-rollout          and its closed loop alone
-
-    All routes of one task and batch are warmed up, then timed in turns.
-    Memory is the peak beyond the model; errors are relative, against
-    backprop in float64. Compiling takes about 45 s for each task and
-    batch, once for a machine; rollout.compile=off leaves it out.
-
-    lyapnet bench --task double_integrator,reacher --batch 12,64 --json
-    lyapnet bench --batch 1,8,64,512,4096 --routes rollout,discrete --figures out
-    lyapnet bench --task chain:2,chain:8,chain:32 --batch 64 --figures out
-    lyapnet bench network.name=fcn program.name=value training.precision=float32
-    """
-    from lyapnet import bench as benchmark
-    from lyapnet.compilation import has_compiler
-
-    benchmark.use_threads(threads)
-    cases = [benchmark.load_case(name, overrides or []) for name in _items(task) or ["double_integrator"]]
-    chosen = [(case, benchmark.routes_for(case, _items(routes))) for case in cases]
-    batches = [_batch(text) for text in _items(batch) or ["12", "64", "512"]]
-    if figures is not None:
-        figures.mkdir(parents=True, exist_ok=True)
-    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
-    say = partial(notes.print, soft_wrap=True)
-    if not has_compiler():
-        say("No C++ compiler ($CXX, g++ or clang++): compiled rows are left out.")
-    rows = []
-    for case, names in chosen:
-        for size in batches:
-            with notes.status(f"{case.name}, batch {size}: {', '.join(names)}"):
-                rows += benchmark.time_routes(case, size, names, repeats, say)
-        if not as_json:
-            console.print(bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
-    if as_json:
-        print(json.dumps([asdict(row) for row in rows]))
-    if figures is not None:
-        for path in _write_figures(figures, cases[0], rows):
-            say(f"wrote {path}")
+app.add_typer(commands.app, name="bench")
 
 
 @app.command()
@@ -330,38 +264,6 @@ def _load(checkpoint: Path, system: str | None, network: str | None) -> Any:
     controller = load(checkpoint, system=own, network=own_network)
     torch.set_num_threads(controller.config.training.threads)
     return controller
-
-
-def _items(values: list[str] | None) -> list[str]:
-    """The entries of a repeated option, each of which may hold several after commas."""
-    return list(dict.fromkeys(item.strip() for value in values or [] for item in value.split(",")))
-
-
-def _batch(text: str) -> int:
-    if not (text.isdecimal() and int(text) > 0):
-        raise UsageError(f"Expected --batch as numbers ≥ 1, got {text!r}; for example --batch 12,64.")
-    return int(text)
-
-
-def _write_figures(folder: Path, first: Any, rows: list[Any]) -> list[Path]:
-    """The figures that these rows fill, and the gradient errors of the first task."""
-    from lyapnet import figures
-    from lyapnet.bench import gradient_accuracy, is_chain
-
-    horizon = first.task.horizon
-    title = (
-        f"{first.name}: ∂J/∂θ of the mean trajectory cost over {horizon.duration:g} s, "
-        f"in {horizon.steps}/16 to {horizon.steps}/2 steps; dopri5 by its tolerance"
-    )
-    drawn = {"gradient_error": figures.gradient_error(gradient_accuracy(first), title)}
-    chains = [row for row in rows if is_chain(row.task)]
-    if others := [row for row in rows if row not in chains]:
-        drawn["gradient_time"] = figures.gradient_time(others)
-    if chains:
-        drawn["steps_per_second_against_n"] = figures.steps_per_second_against_n(chains)
-    for name, figure in drawn.items():
-        figure.savefig(folder / f"{name}.png", dpi=150)
-    return [folder / f"{name}.png" for name in drawn]
 
 
 def _write_optimality(folder: Path, measured: Any) -> str:

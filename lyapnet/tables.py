@@ -163,31 +163,6 @@ def _certified(key: str, value: Any) -> str:
     return f"{value:.3%}" if key.endswith(("share", "bound", "volume")) else f"{value:.4g}"
 
 
-def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
-    """What each route to one task's gradient costs, and what it gets wrong."""
-    from lyapnet.bench import BASELINE
-
-    parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.task.horizon
-    columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
-    table = Table("route", "com-\npiled", *columns)
-    table.title = (
-        f"{case.name}: one loss and its gradient\n{horizon.steps} steps, {parameters} parameters, "
-        f"{rows[0].dtype}, {threads} thread{'s' * (threads > 1)}, median of {repeats}"
-    )
-    table.caption = f"×: times faster than {BASELINE}; steps: of the environment; MB: peak"
-    baseline = {row.batch: row.seconds for row in rows if row.route == BASELINE}
-    for row, following in zip(rows, [*rows[1:], None], strict=True):
-        table.add_row(
-            row.route, "yes" if row.compiled else "no", str(row.batch), f"{row.seconds:.3g}",
-            f"{baseline[row.batch] / row.seconds:.2g}" if row.batch in baseline else "–",
-            f"{row.steps_per_second / 1e3:,.1f}",
-            "–" if row.peak_bytes is None else f"{row.peak_bytes / 1e6:.1f}",
-            "–" if row.relative_error is None else f"{row.relative_error:.0e}",
-            end_section=following is not None and following.batch != row.batch,
-        )  # fmt: skip
-    return table
-
-
 def _measured_or_not(key: str, value: float | None) -> str:
     return "–" if value is None else _measured(key, value)
 

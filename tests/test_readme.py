@@ -47,6 +47,8 @@ def brief(arguments: list[str]) -> list[str]:
         key, _, values = arguments[arguments.index("--vary") + 1].partition("=")
         value = "8" if key == "horizon.steps" else values.split(",")[0]
         return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]
+    if arguments[:2] == ["bench", "certify"]:
+        return [*arguments, "--dimensions", "1", "--boxes", "2", "--repeats", "1", "--seconds", "1"]
     if "--seconds" in arguments:
         at = arguments.index("--seconds")
         return [*arguments[: at + 1], "1", *arguments[at + 2 :]]

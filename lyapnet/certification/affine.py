@@ -29,6 +29,7 @@ class AffineForm:
     ε_1 … ε_d run over the box and are shared by all its forms; η is anything, another one in each form and entry. A
     form of first degree has no B: what is of second order in the size of the box is in r. With B, r is of third order,
     and what cancels in a sum of products (as V_xᵀf + q does against ¼ V_xᵀ g R⁻¹ gᵀ V_x) cancels in the bounds too.
+    With d = 0 forms are intervals, and what is computed with them is interval arithmetic.
 
     Args:
         terms: c, A_1, …, A_d and, in the order of `pairs`, B_jk; (1 + d or 1 + d + d(d + 1)/2, boxes, *shape).
@@ -142,6 +143,11 @@ def wide_axes(lower: Tensor, upper: Tensor) -> Tensor:
     return torch.nonzero((upper > lower).any(0)).flatten()
 
 
+def interval_form(lower: Tensor, upper: Tensor) -> AffineForm:
+    """The boxes as intervals, which forget that they are functions of the same point: no ε, all remainder."""
+    return AffineForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).rounded(2)
+
+
 def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
     """A value that is the same everywhere, beside the forms of `like`."""
     boxes = len(like.radius)
@@ -200,8 +206,11 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
 
     The last four go into the remainder, by Σ|A| and Σ|B| of each. In forms of first degree LL' does as well: since
     ε_k² ∈ [0, 1], it lies within ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k.
+    Intervals have the products of their ends.
     """
     x, y = aligned(x, y)
+    if not x.dimension:
+        return _interval_product(x, y)
     (c, A, B, r), (d, E, F, s) = ((z.center, z.coefficients, z.products, z.radius) for z in (x, y))
     remainder = (c.abs() + x.spread) * s + (d.abs() + y.spread) * r + r * s
     rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
@@ -216,6 +225,15 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     around = sum((ll.abs() / (1 + (j == k)) for (j, k), ll in zip(pairs, LL, strict=True)), torch.zeros_like(r + s))
     terms = torch.cat([(c * d + middle)[None], c * E + d * A])
     return x.with_parts(terms, around + remainder + rounding)
+
+
+def _interval_product(x: AffineForm, y: AffineForm) -> AffineForm:
+    (a, b), (c, d) = x.interval(), y.interval()
+    ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, which stays: nothing is known
+    low, high = ends.amin(0), ends.amax(0)
+    product = x.with_parts(((low + high) / 2)[None], (high - low) / 2).rounded(4)
+    known = torch.isfinite(low) & torch.isfinite(high)
+    return x.with_parts(torch.where(known, product.terms, 0.0), torch.where(known, product.radius, torch.inf))
 
 
 # Functions of one number
@@ -269,6 +287,7 @@ def _secant(
     f_l, f_u = function(lo), function(hi)
     wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # else the secant's slope is a quotient of rounding errors
     a = torch.where(wide, (f_u - f_l) / torch.where(wide, hi - lo, 1.0), derivative((lo + hi) / 2))
+    a = a if len(x.coefficients) else torch.zeros_like(a)  # of an interval: its image, b ± e
     points = torch.stack([torch.where(p.isnan(), lo, p).clamp(lo, hi) for p in stationary(a, lo, hi)])
     f_p = function(points)
     h = torch.cat([(f_l - a * lo)[None], (f_u - a * hi)[None], f_p - a * points])

@@ -101,7 +101,10 @@ class BoundedFunction:
 
     def forms(self, lower: Tensor, upper: Tensor) -> list[AffineForm]:
         """The results on boxes of (t, x), (boxes, 1 + n) each, as affine forms in the coordinates of the box."""
-        box = box_form(lower, upper, self.degree)
+        return self.image(box_form(lower, upper, self.degree))
+
+    def image(self, box: AffineForm) -> list[AffineForm]:
+        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""
         inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
         values: dict[Node, Any] = dict(self._constants)
         for node in self._nodes:
@@ -231,13 +234,15 @@ def _divide(x: Any, y: Any) -> AffineForm:
 
 
 @rule(aten.pow.Tensor_Scalar)
-def _power(x: AffineForm, exponent: float) -> AffineForm:
-    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal."""
+def _power(x: AffineForm, exponent: float) -> Any:
+    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal; x⁰ = 1."""
+    if exponent == 0:
+        return torch.ones_like(x.radius[0])
     if exponent < 0:
         return affine.reciprocal(_power(x, -exponent))
     if exponent == 0.5:
         return affine.sqrt(x)
-    if exponent != int(exponent) or exponent == 0:
+    if exponent != int(exponent):
         raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
     if exponent == 1:
         return x

@@ -114,7 +114,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
     pairs = [(0, min(1, dimension - 1))] if dimension <= 2 else list(combinations(_telling(initial_states), 2))
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
-    size = (5.6, 4.6) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
+    size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
     figure = Figure(figsize=size, layout="constrained")
     handles: dict[str, Artist] = {}
     for panel, pair in zip(figure.subplots(rows, columns, squeeze=False).flat, pairs, strict=True):
@@ -122,7 +122,13 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
             _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
         else:
             _draw_slice(panel, claim, V, initial_states, labels, pair, handles)
-    figure.legend(handles=[*handles.values()], loc="outside lower center", ncols=4, fontsize=7, frameon=False)
+    figure.legend(
+        handles=[*handles.values()],
+        loc="outside lower center",
+        ncols=2 if len(pairs) == 1 else 4,
+        fontsize=7,
+        frameon=False,
+    )
     share = f"{floored(claim.volume_share)} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
     figure.suptitle(f"{claim.verdict}: {share}, α = {claim.alpha:g}, δ = {claim.delta:.3g}", fontsize=9)
     return figure
@@ -163,7 +169,7 @@ def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
     proved = [(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s") for t, colour in at]
-    wanted = (0.0, claim.wanted, GREY, "V(0, ·) as on X₀, not proved")
+    wanted = (0.0, claim.wanted, GREY, "V(0, ·) ≤ its most on X₀, not proved")
     return (proved if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
 
 

@@ -67,7 +67,7 @@ class Compilation(Callback):
         self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        module = _trained_module(pl_module)
+        module = trained_module(pl_module)
         try:
             on_disk = module.compiled_before(self.batch_size)
             if on_disk or self.wanted:
@@ -112,7 +112,7 @@ class ValidationOptimum(Callback):
         self.cost = state_dict.get("cost")
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        module = _trained_module(pl_module)
+        module = trained_module(pl_module)
         if self.cost is None and module.config.evaluation.optimum:
             states = _data(trainer).validation_batch()
             found = self._solve(module.members[0], states) if trainer.is_global_zero else None
@@ -160,7 +160,7 @@ class Stopwatch(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        module = _trained_module(pl_module)
+        module = trained_module(pl_module)
         seconds = time.perf_counter() - self._started
         for member in module.members:
             steps = batch.shape[-2] * member.task.horizon.steps * trainer.world_size
@@ -172,8 +172,8 @@ class ScalarLogger(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            module = _trained_module(pl_module)
-            for member, curves in _with_writers(trainer, module):
+            module = trained_module(pl_module)
+            for member, curves in with_writers(trainer, module):
                 curves.add_custom_scalars(LAYOUT)
                 curves.add_text("config", textwrap.indent(to_yaml(member.config), "    "))
             with torch.no_grad():
@@ -184,7 +184,7 @@ class ScalarLogger(Callback):
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        for member, curves in _with_writers(trainer, _trained_module(pl_module)):
+        for member, curves in with_writers(trainer, trained_module(pl_module)):
             output = _shown(member.output)
             scalars = {
                 "loss/train": output.loss,
@@ -195,14 +195,14 @@ class ScalarLogger(Callback):
                 "learning_rate": trainer.optimizers[0].param_groups[0]["lr"],
                 "rollout_steps_per_second": member.steps_per_second,
             }
-            _log(trainer, curves, scalars)
+            log_scalars(trainer, curves, scalars)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._log_validation(trainer, _trained_module(pl_module))
+        self._log_validation(trainer, trained_module(pl_module))
 
     @staticmethod
     def _log_validation(trainer: Trainer, module: TrainedModule) -> None:
-        for member, curves in _with_writers(trainer, module):
+        for member, curves in with_writers(trainer, module):
             summary = _shown(member.validation).summary()
             names = {
                 "constraint_loss/val": summary["constraint_loss"],
@@ -215,7 +215,7 @@ class ScalarLogger(Callback):
                 "decreasing_fraction/val": summary["decreasing_fraction"],
                 "terminal_error/val": summary["terminal_error"],
             }
-            _log(trainer, curves, {name: value for name, value in names.items() if value is not None})
+            log_scalars(trainer, curves, {name: value for name, value in names.items() if value is not None})
 
 
 class FigureLogger(Callback):
@@ -230,17 +230,17 @@ class FigureLogger(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
-            self._draw(trainer, _trained_module(pl_module))
+            self._draw(trainer, trained_module(pl_module))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
         if step % self.every == 0 or step == trainer.max_epochs:
-            self._draw(trainer, _trained_module(pl_module))
+            self._draw(trainer, trained_module(pl_module))
 
     def _draw(self, trainer: Trainer, module: TrainedModule) -> None:
         if not trainer.is_global_zero:
             return
-        member, pictures = next(_with_writers(trainer, module))
+        member, pictures = next(with_writers(trainer, module))
         try:
             drawn = self._figures(member)
         except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
@@ -300,7 +300,7 @@ class Checkpoints(Checkpoint):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
         if step % self.every == 0 or step == trainer.max_epochs:
-            self._save_best(trainer, _trained_module(pl_module))
+            self._save_best(trainer, trained_module(pl_module))
             self._save_last(trainer)
         # every process stops if one of them was told to
         if trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
@@ -371,7 +371,7 @@ class TrainingProgress(ProgressBar):
     ) -> None:
         if self._progress is None or self._task is None:
             return
-        members = _trained_module(pl_module).members
+        members = trained_module(pl_module).members
         loss = fmean(float(_shown(member.output).loss) for member in members)
         cost = fmean(float(_shown(member.output).trajectory_cost) for member in members)
         speed = sum(member.steps_per_second for member in members)
@@ -381,7 +381,7 @@ class TrainingProgress(ProgressBar):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._progress is None:
             return
-        summaries = [_shown(member.validation).summary() for member in _trained_module(pl_module).members]
+        summaries = [_shown(member.validation).summary() for member in trained_module(pl_module).members]
         measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
         self._console.print(f"step {trainer.global_step}/{trainer.max_epochs}  {'  '.join(measures)}", soft_wrap=True)
 
@@ -406,7 +406,7 @@ def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) 
     return mean if len(values) == 1 else f"{mean} ({low} – {high})"
 
 
-def _with_writers(trainer: Trainer, module: TrainedModule) -> Iterator[tuple[ProgramModule, SummaryWriter]]:
+def with_writers(trainer: Trainer, module: TrainedModule) -> Iterator[tuple[ProgramModule, SummaryWriter]]:
     """Each member and TensorBoard's writer of its curves."""
     return zip(module.members, _writers(trainer), strict=True)
 
@@ -421,7 +421,8 @@ def _flush(trainer: Trainer) -> None:
         curves.flush()
 
 
-def _log(trainer: Trainer, curves: SummaryWriter, scalars: dict[str, Any]) -> None:
+def log_scalars(trainer: Trainer, curves: SummaryWriter, scalars: Mapping[str, Any]) -> None:
+    """Add a point to each curve, in the first process."""
     if trainer.is_global_zero:
         for name, value in scalars.items():
             curves.add_scalar(name, float(value), trainer.global_step)
@@ -441,7 +442,8 @@ def _data(trainer: Trainer) -> InitialStateDataModule:
     return data.datamodule
 
 
-def _trained_module(module: LightningModule) -> TrainedModule:
+def trained_module(module: LightningModule) -> TrainedModule:
+    """The module as what it is here."""
     assert isinstance(module, TrainedModule)
     return module
 

@@ -1,9 +1,10 @@
 """Certificates of a controller, as `lyapnet certify` prints them: one object for each kind of claim."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 import torch
 
@@ -23,17 +24,92 @@ from lyapnet.oracles import RiccatiOracle, optimal_cost
 from lyapnet.randomness import CERTIFICATION, stream
 from lyapnet.sets import Box
 
-KINDS = ("sampled", "statistical", "sound")
+OPTIONS: dict[str, dict[str, Any]] = {  # of each kind, with their defaults
+    "sampled": {"samples": 100, "radius": None, "seed": 0},
+    "statistical": {"samples": 10_000, "confidence": 1 - 1e-6, "share": 0.99, "radius": None, "seed": 0},
+    "sound": {"alpha": 0.95, "delta": None, "set": None, "seconds": 60.0, "seed": 0},
+}
+KINDS = tuple(OPTIONS)
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
 
 
-def default_tolerances(controller: Controller, radius: float | None = None, cost: float = 0.05) -> Tolerances:
+class Rule(NamedTuple):
+    """What an option may be, and what to do about one that is not."""
+
+    holds: Callable[[float], bool]
+    expected: str
+    remedy: str
+
+
+RULES = {
+    "confidence": Rule(lambda c: 0 < c < 1, "strictly between 0 and 1", "for example 0.999999"),
+    "share": Rule(lambda p: 0 < p <= 1, "in (0, 1]", "for example 0.99"),
+    "radius": Rule(lambda r: 0 <= r < math.inf, "≥ 0", "give it in the norm of x"),
+    "alpha": Rule(lambda a: 0 < a <= 1, "in (0, 1]", "V can pay for no more than the whole running cost"),
+    "delta": Rule(lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second"),
+    "seconds": Rule(lambda s: 0 < s < math.inf, "> 0", "a proof needs some"),
+}
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """A claim about a controller."""
+
+    controller: Controller
+    kind: str
+    options: Mapping[str, Any]  # all of its kind, as options_of has them
+    claim: SampledClaim | SoundClaim
+    result: dict[str, Any]  # what `lyapnet certify --json` prints: plain data, None where there is no finite number
+
+
+def options_of(kind: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of a kind: what is given, None aside, and the defaults of the others.
+
+    Raises:
+        UsageError: an unknown kind; an option of another kind; a value out of range.
+    """
+    if kind not in OPTIONS:
+        raise UsageError(f"Expected --kind as one of {', '.join(KINDS)}, got {kind!r}; choose one.")
+    chosen = {name: value for name, value in given.items() if value is not None}
+    for name, value in chosen.items():
+        if name not in OPTIONS[kind]:
+            kinds = " or ".join(k for k in KINDS if name in OPTIONS[k])
+            raise UsageError(f"Expected --{name} with --kind {kinds}, got --kind {kind}; leave it out.")
+        rule = RULES.get(name)
+        if rule is not None and not rule.holds(value):
+            raise UsageError(f"Expected --{name} {rule.expected}, got {value:g}; {rule.remedy}.")
+    if "set" in chosen:
+        parse_set(chosen["set"])
+    return {**OPTIONS[kind], **chosen}
+
+
+def command(checkpoint: str, kind: str, options: Mapping[str, Any], **user: str | None) -> str:
+    """The command line that makes a certificate again, defaults written out.
+
+    Args:
+        user: `system` and `network`, where they are the user's own.
+    """
+    named = {name: value for name, value in {**options, **user}.items() if value is not None}
+    return shlex.join(["lyapnet", "certify", checkpoint, f"--kind={kind}", *(f"--{n}={v}" for n, v in named.items())])
+
+
+def certify(controller: Controller, kind: str, options: Mapping[str, Any]) -> Certificate:
+    """The claim of a kind.
+
+    Args:
+        options: as options_of has them.
+    """
+    claim, result = {"sampled": _sampled, "statistical": _statistical, "sound": _sound}[kind](controller, **options)
+    return Certificate(controller, kind, options, claim, _plain({"kind": kind, **result, "seed": options["seed"]}))
+
+
+def default_tolerances(program: str, radius: float | None = None, cost: float = 0.05) -> Tolerances:
     """What success is by default.
 
-    J within 5 % of V(0, x₀); ‖x(T)‖ within a radius, if one is given; and the decrease within 1 % of V(0, x₀), where a
-    Lyapunov program promised it.
+    J within 5 % of V(0, x₀); ‖x(T)‖ within a radius, if one is given; and the decrease within 1 % of V(0, x₀), where
+    the program is the Lyapunov program, which promises it.
     """
-    return Tolerances(radius, 1e-2 if controller.config.program.name == "lyapunov" else None, cost)
+    return Tolerances(radius, 1e-2 if program == "lyapunov" else None, cost)
 
 
 def default_delta(controller: Controller) -> float:
@@ -42,52 +118,63 @@ def default_delta(controller: Controller) -> float:
     return 0.005 * float(controller.cost.running(x0, controller.policy(0.0, x0)).mean())
 
 
-def sampled(controller: Controller, tolerances: Tolerances, samples: int = 100, seed: int = 0) -> dict[str, Any]:
-    """The sampled claim on fresh states of X₀."""
-    claim = sampled_claim(
-        controller.rollout, controller.initial_states, tolerances, samples, stream(seed, CERTIFICATION)
-    )
-    return {"kind": "sampled", **_shares(claim), "seed": seed}
+def asked(tolerances: Tolerances) -> list[str]:
+    """The single events that success consists of."""
+    limits = {"decrease": tolerances.decrease, "terminal": tolerances.radius, "cost": tolerances.cost}
+    return [event for event, limit in limits.items() if limit is not None]
 
 
-def statistical(
-    controller: Controller,
-    tolerances: Tolerances,
-    samples: int = 10_000,
-    confidence: float = 1 - 1e-6,
-    share: float = 0.99,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """The statistical claim on fresh states of X₀."""
-    generator = stream(seed, CERTIFICATION)
+def lower_bounds(claim: StatisticalClaim) -> dict[str, float]:
+    """The bounds of a claim by the names they are printed under: of success, and of each event that is asked for."""
+    bounds = claim.lower_bounds
+    single = {f"{event}_lower_bound": bounds[event] for event in asked(claim.tolerances)}
+    return {"probability_lower_bound": bounds["all"], **single}
+
+
+def _sampled(
+    controller: Controller, samples: int, radius: float | None, seed: int
+) -> tuple[SampledClaim, dict[str, Any]]:
+    tolerances, generator = default_tolerances(controller.config.program.name, radius), stream(seed, CERTIFICATION)
+    claim = sampled_claim(controller.rollout, controller.initial_states, tolerances, samples, generator)
+    return claim, _shares(claim)
+
+
+def _statistical(
+    controller: Controller, samples: int, confidence: float, share: float, radius: float | None, seed: int
+) -> tuple[StatisticalClaim, dict[str, Any]]:
+    tolerances, generator = default_tolerances(controller.config.program.name, radius), stream(seed, CERTIFICATION)
     claim = statistical_claim(
         controller.rollout, controller.initial_states, tolerances, samples, confidence, share, generator
     )
-    bounds = {f"{e}_lower_bound": bound for e, bound in claim.lower_bounds.items() if e in _asked(claim.tolerances)}
-    return {
-        "kind": "statistical", **_shares(claim), "confidence": confidence, "required_share": share,
-        "probability_lower_bound": claim.probability_lower_bound, **bounds, "seed": seed,
-    }  # fmt: skip
+    return claim, {**_shares(claim), "confidence": confidence, "required_share": share, **lower_bounds(claim)}
 
 
-def sound(
-    controller: Controller, alpha: float = 0.95, delta: float | None = None, states: Box | None = None,
-    seconds: float = 60.0,
-) -> tuple[dict[str, Any], SoundClaim]:  # fmt: skip
-    """The sound claim, as one object and as it is."""
+def _sound(
+    controller: Controller, alpha: float, delta: float | None, set: str | None, seconds: float, seed: int
+) -> tuple[SoundClaim, dict[str, Any]]:  # fmt: skip
     claim = sound_claim(
         controller.closed_loop, controller.initial_states, controller.horizon.duration, alpha,
-        default_delta(controller) if delta is None else delta, states, Budget(seconds), stream(0, CERTIFICATION),
+        default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
+        Budget(seconds), stream(seed, CERTIFICATION),
     )  # fmt: skip
-    wanted = claim.wanted if math.isfinite(claim.wanted) else None
-    return {
-        "kind": "sound", "verdict": claim.verdict, "alpha": claim.alpha, "delta": claim.delta,
-        "rho": claim.rho if claim.volume_share else None, "rho_wanted": wanted,
+    return claim, {
+        "verdict": claim.verdict, "alpha": claim.alpha, "delta": claim.delta, "duration": claim.duration,
+        "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
         "set": [claim.states.lower.tolist(), claim.states.upper.tolist()], "volume_share": claim.volume_share,
+        "terminal_excess": claim.terminal_excess,
         "guaranteed_cost_ratio": _guaranteed_cost_ratio(controller, claim), "boxes": claim.boxes,
         "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
         "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
-    }, claim  # fmt: skip
+    }  # fmt: skip
+
+
+def _plain(value: Any) -> Any:
+    """The value with None for every number that JSON does not have: NaN and the infinities."""
+    if isinstance(value, Mapping):
+        return {key: _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def parse_set(text: str) -> Box:
@@ -109,18 +196,12 @@ def _pairs(text: str) -> Sequence[Sequence[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
-def _asked(tolerances: Tolerances) -> list[str]:
-    """The single events that success consists of."""
-    limits = {"decrease": tolerances.decrease, "terminal": tolerances.radius, "cost": tolerances.cost}
-    return [event for event, limit in limits.items() if limit is not None]
-
-
-def _shares(claim: SampledClaim | StatisticalClaim) -> dict[str, Any]:
+def _shares(claim: SampledClaim) -> dict[str, Any]:
     return {
         "verdict": claim.verdict, "samples": claim.samples,
-        **{f"{e}_share": share for e, share in claim.shares.items() if e in (*_asked(claim.tolerances), "all")},
+        **{f"{e}_share": share for e, share in claim.shares.items() if e in (*asked(claim.tolerances), "all")},
         "tolerances": asdict(claim.tolerances),
-        "failure": None if claim.failure is None else claim.failure.tolist(),
+        "failure": claim.failures[0].tolist() if len(claim.failures) else None,
     }  # fmt: skip
 
 

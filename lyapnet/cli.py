@@ -163,22 +163,27 @@ def certify(
     samples: Annotated[
         int | None, typer.Option(min=1, help="Initial states to draw; 100 for sampled, 10000 for statistical.")
     ] = None,
-    confidence: Annotated[float, typer.Option(help="Of the statistical bound.")] = 1 - 1e-6,
-    share: Annotated[float, typer.Option(help="Of X₀, about which the statistical verdict is.")] = 0.99,
+    confidence: Annotated[float | None, typer.Option(help="Statistical: of the bound; 1 − 1e-6 if none.")] = None,
+    share: Annotated[
+        float | None, typer.Option(help="Statistical: of X₀, about which the verdict is; 0.99 if none.")
+    ] = None,
     radius: Annotated[
         float | None, typer.Option(help="Of success at T, in the norm of x; not asked for if none.")
     ] = None,
-    alpha: Annotated[float, typer.Option(help="Sound: the share of ℓ that V pays for.")] = 0.95,
+    alpha: Annotated[float | None, typer.Option(help="Sound: the share of ℓ that V pays for; 0.95 if none.")] = None,
     delta: Annotated[
         float | None, typer.Option(help="Sound: slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.")
     ] = None,
     states: Annotated[
         str | None, typer.Option("--set", help="Sound: the set D, as lower:upper,…; found if none.")
     ] = None,
-    seconds: Annotated[float, typer.Option(min=0, help="Sound: when to stop undecided.")] = 60.0,
-    seed: Annotated[int, typer.Option(min=0, help="Of the draw.")] = 0,
+    seconds: Annotated[float | None, typer.Option(help="Sound: when to stop undecided; 60 if none.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the draw; 0 if none.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-    figure: Annotated[Path | None, typer.Option(help="Sound, 2 states: draw the funnel.", metavar="FILE")] = None,
+    figure: Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")] = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Write report.md, report.json and the figure there.", metavar="FOLDER")
+    ] = None,
     system: Annotated[str | None, typer.Option(help="module:Class of a system of your own.")] = None,
     network: Annotated[str | None, typer.Option(help="module:Class of a network of your own.")] = None,
     debug: Debug = False,
@@ -192,29 +197,27 @@ def certify(
     Verdicts: certified, falsified (with a state), unknown.
     """
     from lyapnet import certificates
+    from lyapnet.report import require_writable, write_outputs
 
-    if kind not in certificates.KINDS:
-        raise UsageError(f"Expected --kind as one of {', '.join(certificates.KINDS)}, got {kind!r}; choose one.")
-    domain = None if states is None else certificates.parse_set(states)
+    options = certificates.options_of(
+        kind,
+        {
+            "samples": samples, "confidence": confidence, "share": share, "radius": radius, "alpha": alpha,
+            "delta": delta, "set": states, "seconds": seconds, "seed": seed,
+        },
+    )  # fmt: skip
+    require_writable(figure, report)
     controller = _load(checkpoint, system, network)
-    with Console(stderr=True).status(f"certifying, {kind}"):
-        if kind == "sound":
-            result, claim = certificates.sound(controller, alpha, delta, domain, seconds)
-            if figure is not None:
-                from lyapnet.figures import funnel
-
-                funnel(claim, controller.V, controller.initial_states, controller.system).savefig(figure, dpi=150)
-        else:
-            tolerances = certificates.default_tolerances(controller, radius)
-            result = (
-                certificates.sampled(controller, tolerances, samples or 100, seed)
-                if kind == "sampled"
-                else certificates.statistical(controller, tolerances, samples or 10_000, confidence, share, seed)
-            )
+    notes = Console(stderr=True, highlight=False)
+    with notes.status(f"certifying, {kind}"):
+        certificate = certificates.certify(controller, kind, options)
     if as_json:
-        print(json.dumps(result))
+        print(json.dumps(certificate.result, allow_nan=False))
     else:
-        Console(highlight=False).print(certificate_table(str(checkpoint), result))
+        Console(highlight=False).print(certificate_table(str(checkpoint), certificate.result))
+    command = certificates.command(str(checkpoint), kind, options, system=system, network=network)
+    for path in write_outputs(certificate, checkpoint, command, figure, report):
+        notes.print(f"wrote {path}", soft_wrap=True)
 
 
 app.add_typer(commands.app, name="bench")

@@ -165,6 +165,9 @@ class EvaluationConfig:
     test_states: int = option(256, "States of the table at the end of training.", at_least=1)
     optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
     figures_every: int = option(5, "Validations between figures in TensorBoard; the last one always draws.", at_least=1)
+    certify_every: int = option(0, "Validations between statistical bounds in TensorBoard; 0 for none.", at_least=0)
+    certified_states: int = option(1000, "Fresh states of each such bound.", at_least=1)
+    confidence: float = option(1 - 1e-6, "Of each such bound by itself.", above=0, below=1)
 
 
 @dataclass

@@ -34,6 +34,7 @@ from lyapnet.callbacks import (
     ValidationOptimum,
     optimum_progress,
 )
+from lyapnet.certification_callback import CertifiedShare
 from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoint
 from lyapnet.config import Config, configs_of_seeds, differing_keys, label_of, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
@@ -50,7 +51,10 @@ TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",
     "deterministic", "benchmark", "detect_anomaly", "profiler",
 )  # fmt: skip
-CHANGEABLE_ON_RESUME = ("training.iterations", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum")
+CHANGEABLE_ON_RESUME = (
+    "training.iterations", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum",
+    "evaluation.certify_every", "evaluation.certified_states", "evaluation.confidence",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -215,6 +219,7 @@ def _trainer(plan: Plan, console: Console) -> L.Trainer:
             Stopwatch(),
             ScalarLogger(),
             FigureLogger(training.validate_every * config.evaluation.figures_every),
+            *_certified_share(config),
             TrainingProgress(console),
             Checkpoints(
                 run.last, {label: r.best for label, r in zip(labels, runs, strict=True)}, training.validate_every
@@ -223,6 +228,11 @@ def _trainer(plan: Plan, console: Console) -> L.Trainer:
         plugins=[AtomicCheckpointIO()],
         **_trainer_options(config),
     )
+
+
+def _certified_share(config: Config) -> list[CertifiedShare]:
+    options, every = config.evaluation, config.training.validate_every * config.evaluation.certify_every
+    return [CertifiedShare(every, options.certified_states, options.confidence)] if every else []
 
 
 def _prepare_folder(plan: Plan) -> None:

@@ -17,8 +17,6 @@ from matplotlib.ticker import NullLocator
 from torch import Tensor
 
 from lyapnet.bench import Accuracy, Row
-from lyapnet.certification import SoundClaim
-from lyapnet.errors import UsageError
 from lyapnet.evaluation import StateTable
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Rollout, Trajectory
@@ -49,9 +47,7 @@ class Slice(NamedTuple):
 
 def widest_slice(initial_states: Box, points: int) -> Slice:
     """The slice of X₀ through its centre along its two widest components, or its only one that is not fixed."""
-    widths = initial_states.widths
-    axes = [int(i) for i in widths.argsort(descending=True, stable=True)[:2] if widths[i] > 0]
-    axes = sorted(axes) or [0]
+    axes, widths = widest_axes(initial_states), initial_states.widths
     middles = (
         torch.arange(points).to(widths) + 0.5
     ) / points  # of equal cells, so that a share of cells is a share of X₀
@@ -60,6 +56,12 @@ def widest_slice(initial_states: Box, points: int) -> Slice:
     states = initial_states.center.repeat(mesh[0].numel(), 1)
     states[:, axes] = torch.stack([component.flatten() for component in mesh], -1)
     return Slice(axes, grid, states)
+
+
+def widest_axes(initial_states: Box) -> list[int]:
+    """The two widest components of X₀, or its only one that is not fixed; the first if all are."""
+    widths = initial_states.widths
+    return sorted(int(i) for i in widths.argsort(descending=True, stable=True)[:2] if widths[i] > 0) or [0]
 
 
 def certified_region(
@@ -100,18 +102,18 @@ def _draw_plane_region(
     V0: Tensor,
     trajectory: Trajectory,
 ) -> None:
-    first, second = (_numpy(g) for g in region.grid)
+    first, second = (numpy_of(g) for g in region.grid)
     shape = (len(first), len(second))
     levels = ["#F4C9A8", "#CFE6F3"]
     axes.pcolormesh(
-        first, second, _numpy(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
+        first, second, numpy_of(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
         shading="nearest", rasterized=True,
     )  # fmt: skip
-    contour = axes.contour(first, second, _numpy(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
+    contour = axes.contour(first, second, numpy_of(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
     axes.clabel(contour, fontsize=7, fmt="%.3g")
     i, j = region.axes
     corners = _spread(region)
-    paths = _numpy(trajectory.x[:, corners])
+    paths = numpy_of(trajectory.x[:, corners])
     axes.plot(paths[..., i], paths[..., j], color=BLUE, linewidth=1)
     axes.plot(paths[0, :, i], paths[0, :, j], "o", color=BLUE, markersize=3)
     axes.plot(0, 0, "*", color=VERMILION, markersize=10)
@@ -144,14 +146,14 @@ def _draw_line_region(
     V0: Tensor,
     tolerance: float,
 ) -> None:
-    x = _numpy(region.grid[0])
+    x = numpy_of(region.grid[0])
     relative = torch.where(V0 > 0, violation / V0, torch.inf)
-    axes.semilogy(x, np.clip(_numpy(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
+    axes.semilogy(x, np.clip(numpy_of(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
     axes.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1, label="tolerance")
     axes.set_xlabel(state_label(system, region.axes[0]))
     axes.set_ylabel("summed violation / V(0, x₀)", color=BLUE)
     twin = axes.twinx()
-    twin.plot(x, _numpy(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
+    twin.plot(x, numpy_of(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
     twin.set_ylabel("V(0, x₀) (cost)", color=ORANGE)
     figure.legend(loc="outside lower center", ncols=3, fontsize=7, frameon=False)
 
@@ -159,9 +161,9 @@ def _draw_line_region(
 def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
     """States, controls, and V with the cost still to come, over time, of a batch (b,) of closed loops."""
     to_go = trajectory.cost - trajectory.running_cost
-    t = _numpy(trajectory.t)
-    curves = [(state_label(system, i), _numpy(trajectory.x[..., i]), BLUE) for i in range(system.n)]
-    curves += [(control_label(system, i), _numpy(trajectory.u[..., i]), GREEN) for i in range(system.m)]
+    t = numpy_of(trajectory.t)
+    curves = [(state_label(system, i), numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
+    curves += [(control_label(system, i), numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
     columns = 1 if len(curves) < 4 else 2
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(4.8 * columns, 1.6 * rows + 0.4), layout="constrained")
@@ -176,7 +178,7 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
         ("cost to go", to_go, {"color": ORANGE}),
         ("V(t, x)", trajectory.require_value(), {"color": BLUE, "ls": "--"}),
     ):
-        lines = last.plot(t, _numpy(paths), linewidth=0.9, **style)
+        lines = last.plot(t, numpy_of(paths), linewidth=0.9, **style)
         lines[0].set_label(name)
     last.set_ylabel("cost", fontsize=8)
     last.legend(fontsize=7, frameon=False)
@@ -201,15 +203,15 @@ def value_slices(V: Value, system: ControlAffineSystem, initial_states: Box, dur
     if len(region.axes) == 1:
         axes = figure.subplots()
         for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN), strict=True):
-            axes.plot(_numpy(region.grid[0]), _numpy(value), color=color, label=f"t = {t:.2f} s")
+            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=f"t = {t:.2f} s")
         axes.set_xlabel(state_label(system, region.axes[0]))
         axes.set_ylabel("V(t, x) (cost)")
         axes.legend(frameon=False)
         return figure
-    first, second = (_numpy(g) for g in region.grid)
+    first, second = (numpy_of(g) for g in region.grid)
     panels = figure.subplots(1, 3, sharey=True)
     for panel, t, value in zip(panels, times, values, strict=True):
-        surface = _numpy(value).reshape(len(first), len(second)).T
+        surface = numpy_of(value).reshape(len(first), len(second)).T
         filled = panel.contourf(first, second, surface, levels=12, cmap="cividis")
         figure.colorbar(filled, ax=panel)
         panel.set_title(f"V(t, x) at t = {t:.2f} s", fontsize=9)
@@ -222,12 +224,12 @@ def optimality(table: StateTable) -> Figure:
     """Cost and V(0, x₀) of each initial state against its optimum; on the line, they are the optimum."""
     assert table.optimal_cost is not None
     known = torch.isfinite(table.optimal_cost)
-    optimal = _numpy(table.optimal_cost[known])
+    optimal = numpy_of(table.optimal_cost[known])
     figure = Figure(figsize=(8.6, 4.3), layout="constrained")
     panels = figure.subplots(1, 2)
     measured = (("J(x₀), closed loop (cost)", table.cost, BLUE, "o"), ("V(0, x₀) (cost)", table.value, VERMILION, "^"))
     for panel, (label, values, color, marker) in zip(panels, measured, strict=True):
-        y = _numpy(values[known])
+        y = numpy_of(values[known])
         ends = [min(optimal.min(), y.min()), max(optimal.max(), y.max())]
         panel.plot(ends, ends, color=GREY, linewidth=0.9, label="equal to the optimum")
         panel.plot(optimal, y, marker, color=color, markersize=3.5, alpha=0.6, label="an initial state")
@@ -405,48 +407,6 @@ def _free_components(box: Box) -> int:
     return int((box.widths > 0).sum())
 
 
-def _numpy(tensor: Tensor) -> np.ndarray:
+def numpy_of(tensor: Tensor) -> np.ndarray:
+    """A tensor for matplotlib."""
     return tensor.detach().cpu().numpy()
-
-
-def funnel(claim: SoundClaim, V: Value, initial_states: Box, system: ControlAffineSystem) -> Figure:
-    """The proved funnel {V(t, ·) ≤ ρ + δt} of two states at five times, with X₀, D and the counterexample.
-
-    Raises:
-        UsageError: there are not two states.
-    """
-    if system.n != 2:
-        raise UsageError(
-            f"Expected a system of 2 states for a figure of the funnel, got {system.n}; leave out --figure."
-        )
-    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
-    axes = figure.subplots()
-    lower, upper = claim.states.lower.tolist(), claim.states.upper.tolist()
-    grid = [torch.linspace(a, b, 201) for a, b in zip(lower, upper, strict=True)]
-    states = torch.stack(torch.meshgrid(*grid, indexing="ij"), -1).to(initial_states.lower)
-    handles: list[Artist] = []
-    for share, colour in zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True):
-        if not claim.volume_share:
-            break
-        t = share * claim.duration
-        with torch.no_grad():
-            values = V(states.new_tensor(t).expand(states.shape[:-1]), states)
-        level = claim.rho + claim.delta * t
-        axes.contour(*(axis.numpy() for axis in grid), values.T.numpy(), levels=[level], colors=[colour])
-        handles.append(Patch(color=colour, label=f"t = {t:.3g} s"))
-    (left, bottom), (width, height) = initial_states.lower.tolist(), initial_states.widths.tolist()
-    box = Rectangle((left, bottom), width, height, fill=False, linestyle="--", label="X₀")
-    handles.append(axes.add_patch(box))
-    if (found := claim.counterexample) is not None:
-        handles += axes.plot(*found.x, "x", color=VERMILION, label=f"fails, t = {found.t:.3g} s")
-    axes.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]))
-    for name, unit, label in zip(
-        system.state_names, system.state_units, (axes.set_xlabel, axes.set_ylabel), strict=True
-    ):
-        label(f"{name} ({unit})" if unit else name)
-    axes.set_title(
-        f"{claim.verdict}: {claim.volume_share:.1%} of X₀ in the funnel, α = {claim.alpha:g}, δ = {claim.delta:.3g}",
-        fontsize=8,
-    )
-    axes.legend(handles=handles, fontsize=7, loc="upper right")
-    return figure

@@ -1,5 +1,6 @@
 """What the command line shows in the terminal: one table for each kind of measurement."""
 
+import math
 from typing import Any
 
 from rich.box import SIMPLE
@@ -123,12 +124,13 @@ CERTIFICATE_ROWS = {
     "decrease_share": "condition holds along the closed loop",
     "terminal_share": "‖x(T)‖ within the radius",
     "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
-    "all_share": "all three",
+    "all_share": "all that is asked for",
     "confidence": "confidence",
     "decrease_lower_bound": "condition holds on at least",
     "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
     "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
-    "probability_lower_bound": "all three on at least",
+    "probability_lower_bound": "all that is asked for on at least",
+    "required_share": "share of X₀ that the verdict is about",
     "failure": "a state that fails",
     "alpha": "α",
     "delta": "δ, cost per second",
@@ -136,6 +138,7 @@ CERTIFICATE_ROWS = {
     "rho_wanted": "ρ for all of X₀",
     "rho": "largest ρ proved",
     "volume_share": "share of X₀ in that funnel, at least",
+    "terminal_excess": "κ, cost at T beyond V(T, ·)/α, at most",
     "guaranteed_cost_ratio": "guaranteed cost there / optimum, ratio of the means",
     "counterexample": "counterexample of lowest V − δt",
     "remaining_volume": "share of [0, T] × D undecided",
@@ -147,10 +150,15 @@ CERTIFICATE_ROWS = {
 def certificate_table(title: str, result: dict[str, Any]) -> Table:
     """A claim, its verdict and its figures."""
     table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
-    for key, label in CERTIFICATE_ROWS.items():
-        if result.get(key) is not None:
-            table.add_row(label, _certified(key, result[key]))
+    for label, value in certificate_rows(result):
+        table.add_row(label, value)
     return table
+
+
+def certificate_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
+    """What the figures of a claim are called, and the figures."""
+    known = {key: label for key, label in CERTIFICATE_ROWS.items() if result.get(key) is not None}
+    return [(label, _certified(key, result[key])) for key, label in known.items()]
 
 
 def _certified(key: str, value: Any) -> str:
@@ -160,7 +168,14 @@ def _certified(key: str, value: Any) -> str:
         return f"[{', '.join(_certified('', entry) for entry in value)}]"
     if key == "confidence":
         return f"1 − {1 - value:.2g}"
-    return f"{value:.3%}" if key.endswith(("share", "bound", "volume")) else f"{value:.4g}"
+    if key.endswith(("bound", "volume_share")):
+        return floored(value)
+    return f"{value:.3%}" if key.endswith(("share", "volume")) else f"{value:.4g}"
+
+
+def floored(share: float) -> str:
+    """A lower bound of a share in percent, rounded down so that it stays one."""
+    return f"{math.floor(1e5 * share) / 1e3:.3f}%"
 
 
 def _measured_or_not(key: str, value: float | None) -> str:

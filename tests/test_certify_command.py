@@ -1,18 +1,12 @@
-"""lyapnet certify: its JSON for every kind of claim, its table, its figure, and what it refuses."""
+"""lyapnet certify: its JSON for every kind of claim, its table, and what it refuses."""
 
 import json
 
 import pytest
-import torch
-from torch import nn
 
-from lyapnet import figures
-from lyapnet.certificates import parse_set
-from lyapnet.certification import Counterexample, SoundClaim
+from lyapnet.certificates import OPTIONS, RULES, command, options_of, parse_set
 from lyapnet.cli import main
 from lyapnet.errors import UsageError
-from lyapnet.sets import Box
-from lyapnet.systems import Cartpole, DoubleIntegrator
 
 TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4"]
 
@@ -61,8 +55,13 @@ def test_sound(checkpoint, capsys, tmp_path):
 
 
 def test_tables(checkpoint, capsys):
-    for kind, shown in (("sampled", "sampled"), ("statistical", "1 − 1e-06"), ("sound", "cost per second")):
-        assert main(["certify", checkpoint, "--kind", kind, "--samples", "20", "--seconds", "1"]) == 0
+    few = ["--samples", "20"]
+    for kind, options, shown in (
+        ("sampled", few, "sampled"),
+        ("statistical", few, "1 − 1e-06"),
+        ("sound", ["--seconds", "1"], "cost per second"),
+    ):
+        assert main(["certify", checkpoint, "--kind", kind, *options]) == 0
         assert shown in capsys.readouterr().out
 
 
@@ -73,15 +72,59 @@ def test_tables(checkpoint, capsys):
         (["--kind", "sound", "--set=1,2"], "Expected --set as lower:upper"),
         (["--kind", "sound", "--set=-0.5:0.5,-2:2"], "Expected a set around X₀"),
         (["--kind", "sound", "--set=-2:2"], "Expected a set of 2 states, got 1"),
-        (["--kind", "sound", "--alpha", "1.5"], "Expected 0 < alpha ≤ 1, got 1.5"),
-        (["--kind", "sound", "--delta=-1"], "Expected delta ≥ 0"),
-        (["--confidence", "1"], "Expected a confidence between 0 and 1"),
-        (["--radius=-1"], "Expected tolerance radius ≥ 0"),
+        (["--kind", "sound", "--alpha", "1.5"], "Expected --alpha in (0, 1], got 1.5"),
+        (["--kind", "sound", "--alpha", "0"], "Expected --alpha in (0, 1], got 0"),
+        (["--kind", "sound", "--delta=-1"], "Expected --delta ≥ 0, got -1"),
+        (["--kind", "sound", "--delta=nan"], "Expected --delta ≥ 0, got nan"),
+        (["--kind", "sound", "--seconds", "0"], "Expected --seconds > 0, got 0"),
+        (["--confidence", "1"], "Expected --confidence strictly between 0 and 1, got 1"),
+        (["--confidence", "0"], "Expected --confidence strictly between 0 and 1, got 0"),
+        (["--share", "0"], "Expected --share in (0, 1], got 0"),
+        (["--share", "1.1"], "Expected --share in (0, 1], got 1.1"),
+        (["--radius=-1"], "Expected --radius ≥ 0, got -1"),
+        (["--alpha", "0.9"], "Expected --alpha with --kind sound, got --kind statistical; leave it out."),
+        (["--kind", "sampled", "--share", "0.9"], "Expected --share with --kind statistical, got --kind sampled"),
+        (
+            ["--kind", "sound", "--radius", "1"],
+            "Expected --radius with --kind sampled or statistical, got --kind sound",
+        ),
+        (["--figure", "nowhere/claim.png"], "make 'nowhere' first"),
+        (["--figure", "claim.xyz"], "got 'claim.xyz'; for example claim.png"),
+        (["--report", "conf/reacher.yaml"], "Expected --report as a folder, got 'conf/reacher.yaml'"),
     ],
 )
 def test_what_does_not_fit_is_refused(checkpoint, arguments, message, capsys):
-    assert main(["certify", checkpoint, *arguments]) != 0
-    assert message in capsys.readouterr().err
+    assert main(["certify", checkpoint, *arguments]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert len(printed.err.splitlines()) == 1
+    assert not printed.out
+
+
+def test_options_are_refused_before_any_work(monkeypatch, capsys):
+    monkeypatch.setattr("lyapnet.cli._load", lambda *_: pytest.fail("Expected no work on a wrong request."))
+    for wrong in (
+        ["--alpha", "1"],
+        ["--share", "2"],
+        ["--figure", "nowhere/claim.png"],
+        ["--kind", "sound", "--set=1"],
+    ):
+        assert main(["certify", "any.ckpt", *wrong]) == 2
+        assert capsys.readouterr().err.startswith("error: Expected")
+
+
+@pytest.mark.parametrize("kind", OPTIONS)
+def test_defaults_are_what_the_rules_allow(kind):
+    options = options_of(kind, {name: value for name, value in OPTIONS[kind].items() if name != "seed"})
+    assert options == OPTIONS[kind]
+    assert RULES.keys() <= {name for names in OPTIONS.values() for name in names}
+
+
+def test_the_command_says_every_option():
+    options = options_of("sound", {"set": "-1:1,-2:2"})
+    line = command("my run/best.ckpt", "sound", options, system="pendulum:Pendulum")
+    assert line.startswith("lyapnet certify 'my run/best.ckpt' --kind=sound --alpha=0.95 --set=-1:1,-2:2")
+    assert line.endswith("--seed=0 --system=pendulum:Pendulum")
 
 
 def test_a_missing_checkpoint_is_refused(capsys):
@@ -96,28 +139,3 @@ def test_sets_are_read():
     for text in ("", "1", "2:1", "1:2:3", "a:b"):
         with pytest.raises(UsageError, match="--set"):
             parse_set(text)
-
-
-class Bowl(nn.Module):
-    def forward(self, t, x):
-        return (x**2).sum(-1)
-
-
-def claim(rho):
-    states = Box(torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]))
-    found = Counterexample(1.0, [0.5, 1.5], 0.1, 2.4)
-    share = 0.5 if rho > 0 else 0.0
-    return SoundClaim(0.9, 0.01, 4.0, states, rho, 2.0, share, 0.0, found, 10, 1.0, 0.0)
-
-
-def test_the_funnel_is_drawn_with_its_levels():
-    X0 = Box(torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0]))
-    (axes,) = figures.funnel(claim(1.0), Bowl(), X0, DoubleIntegrator()).axes
-    radii = [path.vertices for c in axes.collections for path in c.get_paths()]
-    assert radii
-    levels = [1.0 + 0.01 * t for t in (0, 1, 2, 3, 4)]
-    for vertices, level in zip(radii, levels, strict=True):
-        assert (vertices**2).sum(-1) == pytest.approx(level, rel=1e-2)
-    assert not figures.funnel(claim(-float("inf")), Bowl(), X0, DoubleIntegrator()).axes[0].collections
-    with pytest.raises(UsageError, match="2 states"):
-        figures.funnel(claim(1.0), Bowl(), X0, Cartpole())

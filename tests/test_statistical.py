@@ -73,14 +73,14 @@ def test_a_good_value_function_is_certified(scalar):
     assert claim.successes == {"decrease": 2000, "terminal": 2000, "cost": 2000, "all": 2000}
     assert claim.verdict == "certified"
     assert claim.probability_lower_bound == pytest.approx(1e-6 ** (1 / 2000))
-    assert claim.failure is None
+    assert len(claim.failures) == 0
 
 
 def test_a_value_below_the_cost_is_falsified(scalar):
     claim = statistical_claim(scalar(factor=0.5), X0(), Tolerances(radius=0.6), samples=2000)
     assert claim.verdict == "falsified"
     assert claim.successes["cost"] == 0
-    assert claim.failure is not None
+    assert torch.equal(claim.failures, claim.states)
 
 
 def test_a_radius_that_some_states_miss_gives_their_share(scalar):
@@ -91,6 +91,8 @@ def test_a_radius_that_some_states_miss_gives_their_share(scalar):
     assert share == pytest.approx(0.7, abs=0.05)
     assert claim.lower_bounds["terminal"] < 0.7 < 1 - lower_bound(2000 - int(2000 * share), 2000, 1 - 1e-6)
     assert claim.verdict == "falsified"
+    assert (claim.states[~claim.held[:, 1]].abs() > 0.65).all(), "those from far away miss it"
+    assert len(claim.failures) == 2000 - claim.successes["all"]
 
 
 def test_too_few_samples_leave_it_unknown(scalar):

@@ -50,15 +50,29 @@ class SampledClaim:
     The claim that every state of X₀ succeeds is falsified by one that fails, and else unknown.
     """
 
-    samples: int
-    successes: dict[str, int]  # for each of EVENTS
+    states: State  # the samples, (samples, n)
+    held: Bool[Tensor, "samples events"]  # which of EVENTS, from each of them
     tolerances: Tolerances
-    failure: State | None  # the first state that failed
+
+    @property
+    def samples(self) -> int:
+        """How many states were drawn."""
+        return len(self.states)
+
+    @property
+    def successes(self) -> dict[str, int]:
+        """The number of samples that succeeded, for each of EVENTS."""
+        return {event: int(count) for event, count in zip(EVENTS, self.held.sum(0), strict=True)}
+
+    @property
+    def failures(self) -> State:
+        """The states that failed in any event, (failures, n), in the order of the draw."""
+        return self.states[~self.held[:, -1]]
 
     @property
     def verdict(self) -> Verdict:
         """Of the claim that every state of X₀ succeeds."""
-        return "unknown" if self.failure is None else "falsified"
+        return "falsified" if len(self.failures) else "unknown"
 
     @property
     def shares(self) -> dict[str, float]:
@@ -92,7 +106,7 @@ class StatisticalClaim(SampledClaim):
         """Of the claim that at least `share` of X₀ succeeds, at this confidence either way."""
         if self.probability_lower_bound >= self.share:
             return "certified"
-        failures = self.samples - self.successes["all"]
+        failures = len(self.failures)
         return "falsified" if 1 - lower_bound(failures, self.samples, self.confidence) < self.share else "unknown"
 
 
@@ -135,10 +149,8 @@ def sampled_claim(
     if samples < 1 or batch < 1:
         raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
     x0 = initial_states.sample(samples, generator)
-    events = torch.cat([_events(rollout, part, tolerances) for part in x0.split(batch)])
-    failed = torch.nonzero(~events[:, -1]).flatten()
-    successes = {event: int(count) for event, count in zip(EVENTS, events.sum(0), strict=True)}
-    return SampledClaim(samples, successes, tolerances, x0[failed[0]] if len(failed) else None)
+    held = torch.cat([_events(rollout, part, tolerances) for part in x0.split(batch)])
+    return SampledClaim(x0.cpu(), held, tolerances)
 
 
 def statistical_claim(

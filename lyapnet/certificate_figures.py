@@ -105,13 +105,14 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
     """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D and the counterexample.
 
     Of one state over time; of two at five times; of more at t = 0 and t = T in slices through the goal, along the pairs
-    of the four widest states of X₀, all other states 0.
+    of the four widest states of X₀, all other states 0. States that the claim leaves out are not shown.
 
     Args:
         V, initial_states, labels: of the states that the claim is about.
     """
-    dimension = claim.states.dimension
-    pairs = [(0, min(1, dimension - 1))] if dimension <= 2 else list(combinations(_telling(initial_states), 2))
+    seen = [k for k in range(claim.states.dimension) if k not in claim.left_out]
+    dimension = len(seen)
+    pairs = [(seen[0], seen[-1])] if dimension <= 2 else list(combinations(_telling(initial_states, seen), 2))
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
     size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
@@ -140,7 +141,7 @@ def _draw_slice(
 ) -> None:  # fmt: skip
     """One slice; what is new in it is added to the handles of the legend."""
     i, j = pair
-    others = [k for k in range(len(labels)) if k not in pair]
+    others = [k for k in range(len(labels)) if k not in (*pair, *claim.left_out)]
     grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
     states = initial_states.lower.new_zeros(201, 201, len(labels))
     states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
@@ -211,9 +212,10 @@ def _mark(panel: Axes, found: Counterexample, states: Box, pair: tuple[int, int]
     handles.setdefault(name, point)
 
 
-def _telling(initial_states: Box) -> list[int]:
-    """The four widest states of X₀, in the order of the system."""
-    return sorted(int(i) for i in initial_states.widths.argsort(descending=True, stable=True)[:4])
+def _telling(initial_states: Box, seen: Sequence[int]) -> list[int]:
+    """The four widest states of X₀ among some, in their order."""
+    widest = initial_states.widths.argsort(descending=True, stable=True).tolist()
+    return sorted([i for i in widest if i in seen][:4])
 
 
 def _rectangle(box: Box, axes: Sequence[int], **style) -> Rectangle:

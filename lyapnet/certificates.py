@@ -4,12 +4,14 @@ import math
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
 from lyapnet.certification import (
     Budget,
+    Progress,
     SampledClaim,
     SoundClaim,
     StatisticalClaim,
@@ -19,18 +21,19 @@ from lyapnet.certification import (
     statistical_claim,
 )
 from lyapnet.controller import Controller
-from lyapnet.errors import UsageError
-from lyapnet.oracles import RiccatiOracle, optimal_cost
+from lyapnet.errors import OracleError, UsageError
+from lyapnet.oracles import RiccatiOracle, oracle_of
 from lyapnet.randomness import CERTIFICATION, stream
 from lyapnet.sets import Box
 
 OPTIONS: dict[str, dict[str, Any]] = {  # of each kind, with their defaults
     "sampled": {"samples": 100, "radius": None, "seed": 0},
     "statistical": {"samples": 10_000, "confidence": 1 - 1e-6, "share": 0.99, "radius": None, "seed": 0},
-    "sound": {"alpha": 0.95, "delta": None, "set": None, "seconds": 60.0, "seed": 0},
+    "sound": {"alpha": 0.95, "delta": None, "set": None, "seconds": 60.0, "workers": 1, "keep": None, "seed": 0},
 }
 KINDS = tuple(OPTIONS)
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
+SEARCHED = 64  # of them, where each optimum is a search
 
 
 class Rule(NamedTuple):
@@ -93,13 +96,19 @@ def command(checkpoint: str, kind: str, options: Mapping[str, Any], **user: str 
     return shlex.join(["lyapnet", "certify", checkpoint, f"--kind={kind}", *(f"--{n}={v}" for n, v in named.items())])
 
 
-def certify(controller: Controller, kind: str, options: Mapping[str, Any]) -> Certificate:
+def certify(
+    controller: Controller, kind: str, options: Mapping[str, Any], report: Callable[[Progress], None] | None = None
+) -> Certificate:
     """The claim of a kind.
 
     Args:
         options: as options_of has them.
+        report: hears how far a proof is.
     """
-    claim, result = {"sampled": _sampled, "statistical": _statistical, "sound": _sound}[kind](controller, **options)
+    if kind == "sound":
+        claim, result = _sound(controller, **options, report=report)
+    else:
+        claim, result = {"sampled": _sampled, "statistical": _statistical}[kind](controller, **options)
     return Certificate(controller, kind, options, claim, _plain({"kind": kind, **result, "seed": options["seed"]}))
 
 
@@ -150,17 +159,20 @@ def _statistical(
 
 
 def _sound(
-    controller: Controller, alpha: float, delta: float | None, set: str | None, seconds: float, seed: int
+    controller: Controller, alpha: float, delta: float | None, set: str | None, seconds: float, workers: int,
+    keep: str | None, seed: int, report: Callable[[Progress], None] | None,
 ) -> tuple[SoundClaim, dict[str, Any]]:  # fmt: skip
     claim = sound_claim(
         controller.closed_loop, controller.initial_states, controller.horizon.duration, alpha,
         default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
-        Budget(seconds), stream(seed, CERTIFICATION),
+        Budget(seconds, workers=workers), stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
     )  # fmt: skip
+    names = controller.system.state_names
     return claim, {
         "verdict": claim.verdict, "alpha": claim.alpha, "delta": claim.delta, "duration": claim.duration,
         "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
-        "set": [claim.states.lower.tolist(), claim.states.upper.tolist()], "volume_share": claim.volume_share,
+        "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
+        "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
         "terminal_excess": claim.terminal_excess,
         "guaranteed_cost_ratio": _guaranteed_cost_ratio(controller, claim), "boxes": claim.boxes,
         "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
@@ -208,12 +220,19 @@ def _shares(claim: SampledClaim) -> dict[str, Any]:
 def _guaranteed_cost_ratio(controller: Controller, claim: SoundClaim) -> float | None:
     """Mean guaranteed cost over the mean optimum of the discretised task, on states of X₀ inside the funnel.
 
-    None where either is not known at once: a search by IPOPT would take longer than the proof.
+    None where there is no funnel or no oracle. A search by IPOPT takes fewer states, and the controller's help.
     """
-    oracle = optimal_cost(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
     x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
     guaranteed = claim.guaranteed_cost(controller.value(0.0, x0).double())
-    inside = guaranteed.isfinite()
-    if not isinstance(oracle, RiccatiOracle) or not inside.any():
+    x0, guaranteed = x0[guaranteed.isfinite()], guaranteed[guaranteed.isfinite()]
+    if not len(x0):
         return None
-    return float(guaranteed[inside].mean() / oracle(x0[inside]).mean())
+    try:
+        oracle = oracle_of(controller.system, controller.cost, controller.horizon, controller.config.rollout.method)
+        if not isinstance(oracle, RiccatiOracle):
+            x0, guaranteed = x0[:SEARCHED], guaranteed[:SEARCHED]
+        optima = oracle.solve(x0, controller.rollout(x0).u)
+    except OracleError:
+        return None
+    found = optima.cost.isfinite()
+    return float(guaranteed[found].mean() / optima.cost[found].mean()) if found.any() else None

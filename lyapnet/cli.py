@@ -15,6 +15,7 @@ from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.tables import (
     certificate_table,
     evaluation_table,
+    proof_progress,
     robustness_table,
     sweep_table,
     table_over_seeds,
@@ -159,6 +160,9 @@ def sweep(
 @app.command()
 def certify(
     checkpoint: Checkpoint,
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
+    ] = None,
     kind: Annotated[str, typer.Option(help="sampled, statistical or sound.")] = "statistical",
     samples: Annotated[
         int | None, typer.Option(min=1, help="Initial states to draw; 100 for sampled, 10000 for statistical.")
@@ -178,6 +182,13 @@ def certify(
         str | None, typer.Option("--set", help="Sound: the set D, as lower:upper,…; found if none.")
     ] = None,
     seconds: Annotated[float | None, typer.Option(help="Sound: when to stop undecided; 60 if none.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Sound: threads; 1 if none.")] = None,
+    keep: Annotated[
+        str | None, typer.Option(help="Sound: keep an unfinished proof there, and go on from it.", metavar="FILE")
+    ] = None,
+    refine: Annotated[
+        int, typer.Option(min=0, help="Sound: train on with what failed, so many times at most.", metavar="ROUNDS")
+    ] = 0,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the draw; 0 if none.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     figure: Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")] = None,
@@ -203,18 +214,32 @@ def certify(
         kind,
         {
             "samples": samples, "confidence": confidence, "share": share, "radius": radius, "alpha": alpha,
-            "delta": delta, "set": states, "seconds": seconds, "seed": seed,
+            "delta": delta, "set": states, "seconds": seconds, "workers": workers, "keep": keep, "seed": seed,
         },
     )  # fmt: skip
+    if refine and kind != "sound":
+        raise UsageError(f"Expected --refine with --kind sound, got --kind {kind}; leave it out.")
+    if overrides and not refine:
+        raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
     require_writable(figure, report)
-    controller = _load(checkpoint, system, network)
     notes = Console(stderr=True, highlight=False)
-    with notes.status(f"certifying, {kind}"):
-        certificate = certificates.certify(controller, kind, options)
+
+    def certified(path: Path) -> certificates.Certificate:
+        controller = _load(path, system, network)
+        with proof_progress(notes, kind) as progress:
+            certificate = certificates.certify(controller, kind, options, progress)
+        if not as_json:
+            Console(highlight=False).print(certificate_table(str(path), certificate.result))
+        return certificate
+
+    if refine:
+        from lyapnet.refinement import refine as train_on
+
+        checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes)
+    else:
+        certificate = certified(checkpoint)
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))
-    else:
-        Console(highlight=False).print(certificate_table(str(checkpoint), certificate.result))
     command = certificates.command(str(checkpoint), kind, options, system=system, network=network)
     for path in write_outputs(certificate, checkpoint, command, figure, report):
         notes.print(f"wrote {path}", soft_wrap=True)

@@ -4,13 +4,13 @@ import csv
 import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch
 from rich.console import Console
 from torch import Tensor
 
 from lyapnet.atomic import write_atomically
+from lyapnet.certificates import Certificate
 from lyapnet.certification import DecreaseCondition, SoundClaim, violations
 from lyapnet.config import config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.controller import Controller
@@ -22,55 +22,45 @@ POINTS_FILE = "points.csv"
 FURTHER = 256  # counterexamples, and as many undecided points, of each round
 
 
-class Round(NamedTuple):
-    """One claim on the way."""
-
-    checkpoint: Path
-    result: dict[str, Any]
-    claim: SoundClaim
-
-
 def refine(
     checkpoint: Path,
-    load: Callable[[Path], Controller],
-    certify: Callable[[Controller], tuple[dict[str, Any], SoundClaim]],
+    certified: Callable[[Path], Certificate],
     rounds: int,
     overrides: Sequence[str],
     console: Console,
-    show: Callable[[Round], None],
-) -> Round:
-    """Certify; where that fails, train on with the points at which it failed, and certify again; the last round.
+) -> tuple[Path, Certificate]:
+    """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
 
-    Round k lives in refine_k/ beside the checkpoint's folder: the points (with those of the rounds before), the config
-    (that of the checkpoint with `pointwise.counterexamples`, a fifth of its learning rate, then `overrides`) and a run
-    that starts from the weights before. What is there already is taken as it is, so the same command goes on after
-    whatever stopped it.
+    Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
+    the checkpoint with `pointwise.counterexamples` and a fifth of its learning rate, then `overrides`) and a run that
+    starts from the weights before. What is there already is taken as it is, so the same command goes on after whatever
+    stopped it.
 
     Args:
-        load, certify: make a controller of a checkpoint, and a sound claim of a controller.
-        show: hears of each claim.
+        certified: the sound claim about the controller of a checkpoint.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM while it trains.
     """
     home = checkpoint.resolve().parent.parent
     for k in range(1, rounds + 1):
         folder = home / f"refine_{k}"
         run = _finished_run(folder)
         if run is None:
-            controller = load(checkpoint)
-            found = Round(checkpoint, *certify(controller))
-            show(found)
-            if found.claim.verdict == "certified":
-                return found
+            certificate = certified(checkpoint)
+            if certificate.claim.verdict == "certified":
+                return checkpoint, certificate
             if not (folder / CONFIG).exists():
-                _prepare(folder, controller, failing_points(controller, found.claim), overrides)
+                _prepare(folder, certificate.controller, failing_points(certificate), overrides)
             run = _train(folder, checkpoint, console)
         checkpoint = run.best
-    last = Round(checkpoint, *certify(load(checkpoint)))
-    show(last)
-    return last
+    return checkpoint, certified(checkpoint)
 
 
-def failing_points(controller: Controller, claim: SoundClaim) -> Tensor:
-    """Points (t, x) at which the condition of a claim fails or is undecided inside the funnel of X₀, (k, 1 + n)."""
+def failing_points(certificate: Certificate) -> Tensor:
+    """Points (t, x) at which a condition fails or is undecided inside the funnel that X₀ needs, (k, 1 + n)."""
+    controller, claim = certificate.controller, certificate.claim
+    assert isinstance(claim, SoundClaim)
     condition = DecreaseCondition(controller.closed_loop, claim.alpha, claim.delta)
     lower, upper = (
         torch.cat([side.new_tensor([time]), side])

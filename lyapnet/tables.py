@@ -1,9 +1,13 @@
 """What the command line shows in the terminal: one table for each kind of measurement."""
 
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.box import SIMPLE
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -135,6 +139,7 @@ CERTIFICATE_ROWS = {
     "alpha": "α",
     "delta": "δ, cost per second",
     "set": "D",
+    "states_left_out": "states that nothing depends on",
     "rho_wanted": "ρ for all of X₀",
     "rho": "largest ρ proved",
     "volume_share": "share of X₀ in that funnel, at least",
@@ -147,6 +152,20 @@ CERTIFICATE_ROWS = {
 }
 
 
+@contextmanager
+def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
+    """A bar in a terminal: how much of [0, T] × D a proof has decided. It hears of lyapnet.certification.Progress."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"certifying, {kind}", total=None, state="")
+
+        def report(progress: Any) -> None:
+            state = f"{progress.boxes} boxes, {progress.remaining:.2%} of [0, T] × D undecided"
+            bar.update(task, total=1.0, completed=1 - progress.remaining, state=state)
+
+        yield report
+
+
 def certificate_table(title: str, result: dict[str, Any]) -> Table:
     """A claim, its verdict and its figures."""
     table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
@@ -157,7 +176,7 @@ def certificate_table(title: str, result: dict[str, Any]) -> Table:
 
 def certificate_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     """What the figures of a claim are called, and the figures."""
-    known = {key: label for key, label in CERTIFICATE_ROWS.items() if result.get(key) is not None}
+    known = {key: label for key, label in CERTIFICATE_ROWS.items() if result.get(key) not in (None, [])}
     return [(label, _certified(key, result[key])) for key, label in known.items()]
 
 
@@ -166,6 +185,8 @@ def _certified(key: str, value: Any) -> str:
         return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items() if entry is not None)
     if isinstance(value, list):
         return f"[{', '.join(_certified('', entry) for entry in value)}]"
+    if isinstance(value, str):
+        return value
     if key == "confidence":
         return f"1 − {1 - value:.2g}"
     if key.endswith(("bound", "volume_share")):

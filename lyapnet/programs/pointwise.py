@@ -25,7 +25,7 @@ class PointwiseCondition:
 
     The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
     half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
-    ever denser towards T, where V moves fastest.
+    ever denser towards T, where V moves fastest; half are drawn together towards the goal, by a factor that is uniform.
 
     Args:
         closed_loop: with the law of V.
@@ -71,7 +71,8 @@ class PointwiseCondition:
     def _draw(self, generator: torch.Generator) -> tuple[Time, State]:
         """More points than a step uses."""
         x = self.region.sample(SURPLUS * self.points, generator)
-        share, late = torch.rand(2, len(x), generator=generator, dtype=torch.float64)
+        share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64)
+        x = x * torch.where(late < 0.5, 1.0, near)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)
         return self.duration * (1 - before_end), x
 

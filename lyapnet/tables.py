@@ -156,7 +156,7 @@ CERTIFICATE_ROWS = {
 def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
     """A bar in a terminal: how much of [0, T] × D a proof has decided. It hears of lyapnet.certification.Progress."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"certifying, {kind}", total=None, state="")
 
         def report(progress: Any) -> None:

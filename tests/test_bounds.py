@@ -1,5 +1,7 @@
 """Bounds on boxes: sound on random points, exact digits and whole conditions; tight to second order."""
 
+import math
+
 import mpmath
 import pytest
 import torch
@@ -81,10 +83,11 @@ def unit():
     return tuple(side.double() for side in UNIT)
 
 
+@pytest.mark.parametrize("degree", [1, 2])
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_values_lie_within_bounds(name):
+def test_values_lie_within_bounds(name, degree):
     function = several(FUNCTIONS[name])
-    bounded = BoundedFunction(function, unit())
+    bounded = BoundedFunction(function, unit(), degree)
     for width in (2.0, 0.5, 0.1, 1e-2, 1e-5, 0.0):
         lower, upper = box(width)
         assert violations(bounded, function, lower, upper) == 0
@@ -106,13 +109,13 @@ SMOOTH = ["power", "exp", "log1p", "sqrt", "reciprocal", "sigmoid", "tanh", "sof
 def test_functions_without_their_remainder_are_caught(name, monkeypatch):
     monkeypatch.setattr(affine, "linearised", without_remainder(affine.linearised))
     function = several(FUNCTIONS[name])
-    assert violations(BoundedFunction(function, unit()), function, *box(0.5)) > 0
+    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
 
 
 def test_products_without_their_remainder_are_caught(monkeypatch):
     monkeypatch.setattr(affine, "multiply", without_remainder(affine.multiply))
     function = several(FUNCTIONS["product"])
-    assert violations(BoundedFunction(function, unit()), function, *box(0.5)) > 0
+    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
 
 
 @pytest.mark.parametrize("name", ["exp", "sigmoid", "sin", "cos", "sqrt", "log1p", "reciprocal", "square", "softplus"])
@@ -131,6 +134,65 @@ def test_the_remainder_of_a_function_is_no_larger_than_needed(name):
     radius = form.radius[:, 0]
     torch.testing.assert_close(distance.amax(0), radius, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(distance.amin(0), -radius, rtol=1e-5, atol=1e-9)
+
+
+EXPANDED = {
+    "exp": torch.exp, "log": torch.log, "log1p": torch.log1p, "sqrt": torch.sqrt, "reciprocal": torch.reciprocal,
+    "sigmoid": torch.sigmoid, "softplus": torch.nn.functional.softplus, "sin": torch.sin, "cos": torch.cos,
+}  # fmt: skip
+
+
+def distances_from_parabolas(name, width):
+    """(of f from c + A ε + B ε² on [l, l + width], (points, l); r) for many l."""
+    lower = torch.linspace(0.3, 4, 200)[:, None]
+    if name in ("sigmoid", "softplus", "sin", "cos", "exp"):
+        lower = 2 * lower - 5
+    form = getattr(affine, name)(affine.box_form(lower, lower + width, degree=2))
+    y = torch.linspace(-1, 1, 2001)[:, None]
+    value = EXPANDED[name](lower[:, 0] + width / 2 * (y + 1))
+    parabola = form.center[:, 0] + form.coefficients[0, :, 0] * y + form.products[0, :, 0] * y**2
+    return (value - parabola).abs(), form.radius[:, 0]
+
+
+@pytest.mark.parametrize("width", [2.5, 0.5, 1e-2, 1e-5])
+@pytest.mark.parametrize("name", EXPANDED)
+def test_functions_lie_within_their_parabolas(name, width):
+    distance, radius = distances_from_parabolas(name, width)
+    assert (distance <= radius).all()
+
+
+@pytest.mark.parametrize("name", EXPANDED)
+def test_remainders_of_second_degree_are_of_third_order_and_not_idle(name):
+    """At least a half of them is needed somewhere; eight times less on half the width."""
+    distance, radius = distances_from_parabolas(name, 0.1)
+    _, smaller = distances_from_parabolas(name, 0.05)
+    assert (distance.amax(0) / radius).median() > 0.5
+    assert math.log2(radius.median() / smaller.median()) == pytest.approx(3, abs=0.3)
+
+
+def test_a_product_of_second_degree_is_exact_up_to_third_order():
+    """(ε₁ + ε₁ε₂)(ε₂ + ε₂²) over a box of points: no cancellation is lost below third order."""
+    x, y = (affine.box_form(*(torch.full((1, 2), side) for side in (-0.1, 0.1)), degree=2) for _ in range(2))
+    product = affine.multiply(x, y)
+    assert product.pairs == [(0, 0), (0, 1), (1, 1)]
+    torch.testing.assert_close(product.products[:, 0], torch.tensor([[0.01, 0.0], [0.0, 0.0], [0.0, 0.01]]))
+    assert float(product.radius.max()) < 1e-15
+    curved = affine.multiply(product, affine.add(x, product))
+    assert 0 < float(curved.radius.max()) < 3 * 0.1**3
+
+
+def test_bounds_of_a_parabola_know_its_vertex():
+    """−x² + x on [0, 1] is at most ¼, which lies in the middle; −(x² + y²) + xy is at most 0, where both meet."""
+    form = affine.box_form(torch.zeros(1, 1), torch.ones(1, 1), degree=2)
+    low, high = affine.add(form, affine.negate(affine.square(form))).interval()
+    assert (float(low), float(high)) == pytest.approx((0.0, 0.25), abs=1e-12)
+    x, y = (
+        form.with_parts(form.terms[..., k : k + 1], form.radius[..., k : k + 1])
+        for form in [affine.box_form(-torch.ones(1, 2), torch.ones(1, 2), degree=2)]
+        for k in range(2)
+    )
+    definite = affine.add(affine.multiply(x, y), affine.negate(affine.add(affine.square(x), affine.square(y))))
+    assert float(definite.interval()[1]) == pytest.approx(0, abs=1e-12)
 
 
 EXACT = {

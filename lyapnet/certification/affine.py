@@ -139,8 +139,9 @@ def box_form(lower: Tensor, upper: Tensor, degree: int = 1) -> AffineForm:
 
 
 def wide_axes(lower: Tensor, upper: Tensor) -> Tensor:
-    """The axes along which any of the boxes (boxes, axes) has a width."""
-    return torch.nonzero((upper > lower).any(0)).flatten()
+    """The axes along which any of the boxes (boxes, axes) has a width; of points the first, lest they be intervals."""
+    wide = torch.nonzero((upper > lower).any(0)).flatten()
+    return wide if len(wide) else torch.zeros(1, dtype=torch.long)
 
 
 def interval_form(lower: Tensor, upper: Tensor) -> AffineForm:

@@ -267,9 +267,10 @@ def _points_of(path: Path, n: int) -> Tensor:
     """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            points = torch.tensor([[float(entry) for entry in row] for row in list(csv.reader(file))[1:]])
+            rows = [[float(entry) for entry in row] for row in list(csv.reader(file))[1:]]
+        points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
         if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
-            raise ValueError(f"rows of {points.shape[-1:]} numbers")
+            raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")
     except (OSError, ValueError) as error:
         raise UsageError(
             f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "

@@ -1,5 +1,6 @@
 """Counterexamples back into training, until a sound claim is certified: `lyapnet certify --refine`."""
 
+import copy
 import csv
 import io
 from collections.abc import Callable, Sequence
@@ -61,7 +62,7 @@ def failing_points(certificate: Certificate) -> Tensor:
     """Points (t, x) at which a condition fails or is undecided inside the funnel that X₀ needs, (k, 1 + n)."""
     controller, claim = certificate.controller, certificate.claim
     assert isinstance(claim, SoundClaim)
-    condition = DecreaseCondition(controller.closed_loop, claim.alpha, claim.delta)
+    condition = DecreaseCondition(copy.deepcopy(controller.closed_loop).double(), claim.alpha, claim.delta)
     lower, upper = (
         torch.cat([side.new_tensor([time]), side])
         for time, side in ((0.0, claim.states.lower), (claim.duration, claim.states.upper))

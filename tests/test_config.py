@@ -167,6 +167,9 @@ OUT_OF_RANGE = {
     "horizon.dt=0": ("horizon.dt", "> 0"),
     "horizon.dt=.nan": ("horizon.dt", "nan"),
     "horizon.dt=.inf": ("horizon.dt", "inf"),
+    "pointwise.weight=-1": ("pointwise.weight", "-1"),
+    "pointwise.points=1": ("pointwise.points", "got 1"),
+    "pointwise.region=[0, 1]": ("pointwise.region", "> 0"),
     "horizon.steps=0": ("horizon.steps", "1", "got 0"),
     "horizon.steps=-3": ("horizon.steps", "-3"),
     "seed=-1": ("seed", "-1"),
@@ -234,6 +237,11 @@ IMPOSSIBLE = {
     "trainer.max_epochs=3": ("trainer.max_epochs", "lyapnet"),
     "trainer.callbacks=[]": ("trainer.callbacks", "lyapnet"),
     "trainer.nonsense=3": ("trainer.nonsense",),
+    "network.ignored_states=[speed]": ("network.ignored_states", "position, velocity", "'speed'"),
+    "network.ignored_states=[position, velocity]": ("network.ignored_states", "all"),
+    "network.ignored_states=[velocity] & network.terminal=exact": ("cost.Q_T", "ignored_states", "terminal=exact"),
+    "pointwise.weight=1 & pointwise.region=[1, 2, 3]": ("pointwise.region", "position, velocity", "3"),
+    "pointwise.weight=1 & pointwise.counterexamples=nowhere.csv": ("pointwise.counterexamples", "nowhere.csv"),
 }
 UNREADABLE = {
     "horizon.steps": ("key.sub=value", "'horizon.steps'"),
@@ -360,8 +368,13 @@ SWINGUP = {"cart_mass": 1, "pole_mass": 1, "length": 1, "cart_damping": 0, "pole
 DOUBLE_INTEGRATOR = (DoubleIntegrator, {"mass": 1}, 400, [10, 0.1], [10, 0.1], [0, 0], [1, 0.7])
 TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width of X₀
     "double_integrator": (LyapunovProgram, *DOUBLE_INTEGRATOR),
+    "double_integrator_certified": (LyapunovProgram, *DOUBLE_INTEGRATOR),
     "double_integrator_value": (ValueProgram, *DOUBLE_INTEGRATOR),
     "cartpole_balancing": (
+        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
+        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
+    ),
+    "cartpole_balancing_certified": (
         LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
         [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
     ),

@@ -12,7 +12,16 @@ from torch.testing import assert_close
 
 from lyapnet.calculus import gradients, state_gradient, value_and_state_gradient
 from lyapnet.cost import QuadraticCost
-from lyapnet.networks import ACTIVATIONS, FCN, ICNN, NETWORKS, PartiallyConvexNetwork, QuadraticForm, Scaling
+from lyapnet.networks import (
+    ACTIVATIONS,
+    FCN,
+    ICNN,
+    NETWORKS,
+    IgnoringStates,
+    PartiallyConvexNetwork,
+    QuadraticForm,
+    Scaling,
+)
 from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
 
 T = 2.0
@@ -24,9 +33,9 @@ CONVEX = [name for name, activation in ACTIVATIONS.items() if activation.convex]
 class WithoutFormula(nn.Module):
     """A user's network: its gradient is autograd's."""
 
-    def __init__(self):
+    def __init__(self, **changes):
         super().__init__()
-        self.network = FCN(**SMALL)
+        self.network = FCN(**SMALL | changes)
 
     def forward(self, t, x):
         return self.network(t, x)
@@ -38,6 +47,19 @@ def cost():
 
 def terminal(network):
     return TerminalAnchor(network, cost(), T)
+
+
+KEPT, TWO = (0, 2), Scaling(state=(1.0, 0.5), duration=T, value=30.0)
+
+
+def of_two(network):
+    return network(**SMALL | {"scaling": TWO})
+
+
+def ignoring():
+    """V of the first and the last state, which is φ of them at T."""
+    phi = QuadraticCost(torch.eye(2), [[1.0]], [[4.0, 0.5], [0.5, 6.0]])
+    return IgnoringStates(TerminalAnchor(GoalAnchor(of_two(PartiallyConvexNetwork)), phi, T), KEPT, 3)
 
 
 VALUES = {
@@ -53,6 +75,9 @@ VALUES = {
     "goal(user)": lambda: GoalAnchor(WithoutFormula()),
     "goal(fcn, angles)": lambda: GoalAnchor(FCN(**SMALL, embedded_angles=(0,))),
     "terminal(goal(icnn))": lambda: terminal(GoalAnchor(ICNN(**SMALL))),
+    "ignoring(fcn)": lambda: IgnoringStates(of_two(FCN), KEPT, 3),
+    "ignoring(terminal(goal(partially convex)))": lambda: ignoring(),
+    "ignoring(user)": lambda: IgnoringStates(WithoutFormula(scaling=TWO), KEPT, 3),
 }
 
 SHAPES = [
@@ -282,6 +307,29 @@ def test_terminal_anchor_ends_as_the_terminal_cost(inner):
     assert_close(V(end, x), phi(x))
     assert_close(state_gradient(V, end, x), gradients(lambda t, x: phi(x), end, x)[1])
     assert not torch.allclose(V(0.9 * end, x), phi(x), rtol=1e-3)
+
+
+# States that are ignored
+
+
+def test_V_is_the_same_whatever_an_ignored_state_is():
+    (t, x), V = draw(), ignoring()
+    elsewhere = x + torch.tensor([0.0, 5.0, 0.0])
+    assert torch.equal(V(t, elsewhere), V(t, x))
+    for slope in (value_and_state_gradient(V, t, x)[1], gradients(V, t, x)[1]):
+        assert (slope[:, 1] == 0).all()
+        assert (slope[:, [0, 2]] != 0).all()
+    assert_close(V(t, x), V.network(t, x[:, [0, 2]]))
+    assert not torch.allclose(terminal(FCN(**SMALL))(t, elsewhere), terminal(FCN(**SMALL))(t, x)), "one that is not"
+    assert not torch.allclose(V(t, x + torch.tensor([0.0, 0.0, 5.0])), V(t, x)), "one that is kept"
+
+
+def test_terminal_cost_of_the_kept_states_is_met():
+    (_, x), end = draw(), torch.tensor(T)
+    Q_T = torch.tensor([[4.0, 0.5], [0.5, 6.0]])
+    kept = x[:, [0, 2]]
+    assert_close(ignoring()(end, x), ((kept @ Q_T) * kept).sum(-1))
+    assert not torch.allclose(ignoring()(0.9 * end, x), ((kept @ Q_T) * kept).sum(-1), rtol=1e-3)
 
 
 # Scaling

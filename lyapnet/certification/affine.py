@@ -316,7 +316,7 @@ def _expanded(
     """
     m = (lo + hi) / 2
     w = (hi - lo) / 2 * (1 + 8 * EPSILON) + 4 * EPSILON * m.abs()
-    low, high = third(m - w, m + w)
+    low, high = third(lo, hi)  # not of m ± w, which may leave what f is defined on
     M = (low + high) / 2
     a, b, c = function(m), derivative(m) + M * w**2 / 8, second(m) / 2
     e = (M.abs() / 24 + (high - low) / 12) * w**3 * (1 + 1e-9)
@@ -424,7 +424,7 @@ def sin(x: AffineForm) -> AffineForm:
 
     return linearised(
         x, torch.sin, torch.cos, stationary, _two_periods,
-        lambda v: -torch.sin(v), lambda lo, hi: _around(-torch.cos((lo + hi) / 2), (hi - lo) / 2),
+        lambda v: -torch.sin(v), lambda lo, hi: _around(lambda v: -torch.cos(v), lo, hi),
     )  # fmt: skip
 
 
@@ -437,7 +437,7 @@ def cos(x: AffineForm) -> AffineForm:
 
     return linearised(
         x, torch.cos, lambda v: -torch.sin(v), stationary, _two_periods,
-        lambda v: -torch.cos(v), lambda lo, hi: _around(torch.sin((lo + hi) / 2), (hi - lo) / 2),
+        lambda v: -torch.cos(v), lambda lo, hi: _around(torch.sin, lo, hi),
     )  # fmt: skip
 
 
@@ -447,8 +447,9 @@ def _between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     return low - room, high + room
 
 
-def _around(middle: Tensor, reach: Tensor) -> tuple[Tensor, Tensor]:
-    """The range of a sine or cosine within a distance of a point: their slope is at most 1."""
+def _around(wave: Callable[[Tensor], Tensor], lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    """The range of a sine or cosine on [lo, hi], from its value in the middle: its slope is at most 1."""
+    middle, reach = wave((lo + hi) / 2), (hi - lo) / 2 + 2 * EPSILON * torch.maximum(-lo, hi)
     return _between((middle - reach).clamp_min(-1), (middle + reach).clamp_max(1))
 
 
@@ -484,12 +485,11 @@ def _logit(s: Tensor) -> Tensor:
 
 
 def _sigmoid_derivative(v: Tensor) -> Tensor:
-    s = torch.sigmoid(v)
-    return s * (1 - s)
+    return torch.sigmoid(v) * torch.sigmoid(-v)  # 1 − σ would lose all its digits where σ is close to 1
 
 
 def _sigmoid_curvature(v: Tensor) -> Tensor:
-    return _sigmoid_derivative(v) * (1 - 2 * torch.sigmoid(v))
+    return -_sigmoid_derivative(v) * torch.tanh(v / 2)
 
 
 def _softplus(v: Tensor) -> Tensor:

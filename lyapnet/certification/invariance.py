@@ -2,6 +2,7 @@
 
 import torch
 
+from lyapnet.certification.branches import JUMPS
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.policy import ValuePolicy
 from lyapnet.tracing import trace
@@ -10,10 +11,10 @@ from lyapnet.tracing import trace
 def unseen_states(closed_loop: ClosedLoop) -> list[int]:
     """The indices of states on which neither f, g, ℓ, φ nor V and u depend.
 
-    A state that is not a number makes nan of everything computed with it, so what stays finite does not see it. A
-    comparison would hide it: a closed loop with branches is taken to see every state.
+    A state that is not a number makes nan of everything computed with it, so what stays finite does not see it. A jump
+    would hide it, as nan > 0 is false and the sign of nan is 0: a closed loop with jumps is taken to see every state.
     """
-    if _has_branches(closed_loop):
+    if _has_jumps(closed_loop):
         return []
     return [i for i in range(closed_loop.system.n) if not _sees(closed_loop, i)]
 
@@ -21,19 +22,25 @@ def unseen_states(closed_loop: ClosedLoop) -> list[int]:
 def _sees(closed_loop: ClosedLoop, i: int) -> bool:
     cost = closed_loop.cost
     weighted = [*cost.Q[i], *cost.Q[:, i], *cost.Q_T[i], *cost.Q_T[:, i]]
-    x = torch.full((closed_loop.system.n,), 0.1, dtype=cost.Q.dtype)
+    t, x = _some_point(closed_loop)
     x[i] = torch.nan
-    return any(weighted) or any(bool(y.isnan().any()) for y in _ingredients(closed_loop, x.new_zeros(()), x))
+    return any(weighted) or any(bool(y.isnan().any()) for y in _ingredients(closed_loop, t, x))
 
 
-def _has_branches(closed_loop: ClosedLoop) -> bool:
-    x = torch.full((closed_loop.system.n,), 0.1, dtype=closed_loop.cost.Q.dtype)
+def _has_jumps(closed_loop: ClosedLoop) -> bool:
     try:
-        graph = trace(lambda t, x: _ingredients(closed_loop, t, x), (x.new_zeros(()), x)).graph
+        graph = trace(lambda t, x: _ingredients(closed_loop, t, x), _some_point(closed_loop)).graph
     except Exception:  # of any kind: what cannot be traced is refused where it is bounded, with the reason
         return True
     results = [node.meta.get("val") for node in graph.nodes]
-    return any(isinstance(value, torch.Tensor) and value.dtype == torch.bool for value in results)
+    truths = any(isinstance(value, torch.Tensor) and value.dtype == torch.bool for value in results)
+    return truths or any(node.target in JUMPS for node in graph.nodes)
+
+
+def _some_point(closed_loop: ClosedLoop) -> tuple[torch.Tensor, torch.Tensor]:
+    """A (t, x) at which nothing vanishes by chance: a zero might let a solver skip what stands beside it."""
+    x = 0.1 + 0.01 * torch.arange(closed_loop.system.n, dtype=closed_loop.cost.Q.dtype).sqrt()
+    return x.new_tensor(0.01), x
 
 
 def _ingredients(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, ...]:

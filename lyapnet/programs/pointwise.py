@@ -45,7 +45,7 @@ class PointwiseCondition:
         duration: float,
         points: int,
         margin: float | None,
-        further: Float[Tensor, "k 1+n"] | None = None,
+        further: Float[Tensor, "k columns"] | None = None,
     ):
         self.closed_loop, self.V, self.region, self.duration = closed_loop, V, region, duration
         self.points, self.margin, self.further = points, margin, further

@@ -59,7 +59,7 @@ def by_hand(x, P, margin, Q_T, ceiling=torch.inf):
         condition = (rate + (1 + (margin or 0.0)) * running) / (running + 0.01 * MEAN_COST / DURATION)
         end = (terminal - V) / (terminal + 0.01 * MEAN_COST)
         both = torch.stack([condition, end])
-        rows.append((both.square() if margin is None else both.clamp_min(0)) * (V <= ceiling))
+        rows.append((both.square() if margin is None else both.clamp_min(0)) * (ceiling >= V))
     return torch.stack(rows, -1)
 
 
@@ -242,10 +242,10 @@ def test_a_broken_file_of_counterexamples_is_refused(rows, tmp_path):
     path = tmp_path / "points.csv"
     with pytest.raises(UsageError, match=r"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_2, got"):
         built(write(path, rows))
-    with pytest.raises(UsageError, match="nowhere.csv"):
+    with pytest.raises(UsageError, match=r"nowhere\.csv"):
         built("pointwise.counterexamples=nowhere.csv")
     path.write_bytes(bytes(range(128, 256)))
-    with pytest.raises(UsageError, match="points.csv"):
+    with pytest.raises(UsageError, match=r"points\.csv"):
         built(f"pointwise.counterexamples={path}")
 
 

@@ -32,8 +32,8 @@ def refine(
 
     Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
     the checkpoint with `pointwise.counterexamples`, a weight and a region if it had none, and a fifth of its learning
-    rate; then `overrides`) and a run that starts from the weights before. What is there already is taken as it is, so the same command goes on after whatever
-    stopped it.
+    rate; then `overrides`) and a run that starts from the weights before. What is there already is taken as it is, so
+    the same command goes on after whatever stopped it.
 
     Args:
         certified: the sound claim about the controller of a checkpoint.

@@ -316,7 +316,7 @@ def _expanded(
     """
     m = (lo + hi) / 2
     w = (hi - lo) / 2 * (1 + 8 * EPSILON) + 4 * EPSILON * m.abs()
-    low, high = third(m - w, m + w)
+    low, high = third(lo, hi)
     M = (low + high) / 2
     a, b, c = function(m), derivative(m) + M * w**2 / 8, second(m) / 2
     e = (M.abs() / 24 + (high - low) / 12) * w**3 * (1 + 1e-9)

@@ -124,7 +124,7 @@ def sound_claim(
     if rho > -float("inf"):
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
         start_low, start_high = _at(0.0, x_low, x_high)
-        inside = share_below(condition.V, start_low[0], start_high[0], rho, finish)
+        inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, inside, excess,

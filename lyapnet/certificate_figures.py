@@ -102,7 +102,7 @@ def _headline(claim: SampledClaim) -> str:
 
 
 def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[str]) -> Figure:
-    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D and the counterexample.
+    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
 
     Of one state over time; of two at five times; of more at t = 0 and t = T in slices through the goal, along the pairs
     of the four widest states of X₀, all other states 0. States that the claim leaves out are not shown.
@@ -156,6 +156,11 @@ def _draw_slice(
     name = "X₀" if through else "X₀, projected"
     box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
     handles.setdefault(name, box)
+    if len(claim.undecided):
+        name = "undecided, some of it" + (" (projected onto the slice)" if others else "")
+        x, y = (numpy_of(claim.undecided[:, 1 + k]) for k in pair)
+        (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
+        handles.setdefault(name, points)
     if claim.counterexample is not None:
         _mark(panel, claim.counterexample, claim.states, pair, handles)
     goal = panel.plot(0, 0, "*", color=GREEN, markersize=6, label="goal", linestyle="none")
@@ -170,7 +175,7 @@ def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
     proved = [(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s") for t, colour in at]
-    wanted = (0.0, claim.wanted, GREY, "V(0, ·) ≤ its most on X₀, not proved")
+    wanted = (0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved")
     return (proved if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
 
 

@@ -14,7 +14,6 @@ from lyapnet.atomic import write_atomically
 from lyapnet.certificates import Certificate
 from lyapnet.certification import DecreaseCondition, SoundClaim, violations
 from lyapnet.config import config_from_plain, load_config, to_plain, to_yaml
-from lyapnet.controller import Controller
 from lyapnet.experiment import fit, plan_run
 from lyapnet.randomness import CERTIFICATION, stream
 from lyapnet.run import CONFIG, LAST, Run, runs_of
@@ -33,9 +32,9 @@ def refine(
     """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
 
     Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
-    the checkpoint with `pointwise.counterexamples` and a fifth of its learning rate, then `overrides`) and a run that
-    starts from the weights before. What is there already is taken as it is, so the same command goes on after whatever
-    stopped it.
+    the checkpoint with `pointwise.counterexamples`, a weight and a region if it had none, and a fifth of its learning
+    rate; then `overrides`) and a run that starts from the weights before. What is there already is taken as it is, so
+    the same command goes on after whatever stopped it.
 
     Args:
         certified: the sound claim about the controller of a checkpoint.
@@ -52,7 +51,7 @@ def refine(
             if certificate.claim.verdict == "certified":
                 return checkpoint, certificate
             if not (folder / CONFIG).exists():
-                _prepare(folder, certificate.controller, failing_points(certificate), overrides)
+                _prepare(folder, certificate, overrides)
             run = _train(folder, checkpoint, console)
         checkpoint = run.best
     return checkpoint, certified(checkpoint)
@@ -73,18 +72,26 @@ def failing_points(certificate: Certificate) -> Tensor:
     return torch.cat([failing, claim.undecided[chosen]])
 
 
+def _extent(certificate: Certificate) -> list[float]:
+    """A bound of each |x_i| in D; of states that the claim leaves out, 1."""
+    claim = certificate.claim
+    assert isinstance(claim, SoundClaim)
+    return [bound if bound > 0 else 1.0 for bound in claim.states.magnitude.tolist()]
+
+
 def _finished_run(folder: Path) -> Run | None:
     """The training of a round, if it came to its end."""
     runs = runs_of(load_config(folder / CONFIG)) if (folder / CONFIG).exists() else []
     return runs[-1] if runs and runs[-1].finished else None
 
 
-def _prepare(folder: Path, controller: Controller, points: Tensor, overrides: Sequence[str]) -> None:
+def _prepare(folder: Path, certificate: Certificate, overrides: Sequence[str]) -> None:
     """Write what a round trains on, and its config last."""
     folder.mkdir(parents=True, exist_ok=True)
+    controller = certificate.controller
     config = to_plain(controller.config)
-    earlier = config["pointwise"]["counterexamples"]
-    rows = [["t", *controller.system.state_names], *points.tolist()]
+    pointwise, earlier = config["pointwise"], config["pointwise"]["counterexamples"]
+    rows = [["t", *controller.system.state_names], *failing_points(certificate).tolist()]
     if earlier is not None:
         with Path(earlier).open(encoding="utf-8", newline="") as file:
             rows += list(csv.reader(file))[1:]
@@ -92,8 +99,9 @@ def _prepare(folder: Path, controller: Controller, points: Tensor, overrides: Se
     csv.writer(text).writerows(rows)
     write_atomically(folder / POINTS_FILE, text.getvalue().encode())
     config["logs"], config["experiment"] = str(folder.parent), folder.name
-    config["pointwise"]["counterexamples"] = str(folder / POINTS_FILE)
-    config["pointwise"]["weight"] = config["pointwise"]["weight"] or config["program"]["constraint"]
+    pointwise["counterexamples"] = str(folder / POINTS_FILE)
+    pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
+    pointwise["region"] = pointwise["region"] or _extent(certificate)
     config["training"]["learning_rate"] /= 5
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())
 

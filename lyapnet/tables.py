@@ -183,10 +183,10 @@ def certificate_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
 def _certified(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items() if entry is not None)
+    if key == "states_left_out":
+        return ", ".join(value)
     if isinstance(value, list):
         return f"[{', '.join(_certified('', entry) for entry in value)}]"
-    if isinstance(value, str):
-        return value
     if key == "confidence":
         return f"1 − {1 - value:.2g}"
     if key.endswith(("bound", "volume_share")):

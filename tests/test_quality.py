@@ -40,6 +40,37 @@ def test_lyapunov_program_on_balancing(tmp_path, capsys):
     assert result["value_to_cost"] <= 1.25
 
 
+def certificate(folder, name, capsys, *options):
+    """`lyapnet certify --kind sound --json` of a run."""
+    path = f"{folder}/{name}/version_0/checkpoints/best.ckpt"
+    assert main(["certify", path, "--kind", "sound", "--json", *options]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_funnel_that_holds_all_initial_states_of_the_double_integrator(tmp_path, capsys):
+    name = "double_integrator_certified"
+    assert trained(name, tmp_path, capsys)["cost_ratio"] <= 1.02
+    result = certificate(tmp_path, name, capsys, "--alpha", "0.97", "--delta", "0.015", "--seconds", "200")
+    assert result["verdict"] == "certified"
+    assert result["volume_share"] == 1
+    assert 1 <= result["guaranteed_cost_ratio"] <= 1.1
+
+
+def test_without_points_off_the_closed_loops_it_is_falsified(tmp_path, capsys):
+    """The twin."""
+    name = "double_integrator_certified"
+    trained(name, tmp_path, capsys, "pointwise.weight=0")
+    assert certificate(tmp_path, name, capsys, "--alpha", "0.97", "--delta", "0.015")["verdict"] == "falsified"
+
+
+def test_a_funnel_that_holds_half_of_balancing(tmp_path, capsys):
+    name = "cartpole_balancing_certified"
+    assert trained(name, tmp_path, capsys)["cost_mean"] <= 1.05 * 16.16
+    result = certificate(tmp_path, name, capsys, "--alpha", "0.8", "--seconds", "1800", "--workers", "2")
+    assert result["volume_share"] >= 0.5
+    assert result["states_left_out"] == ["cart position"]
+
+
 def test_value_program_on_the_double_integrator(tmp_path, capsys):
     result = trained("double_integrator_value", tmp_path, capsys)
     assert 1 <= result["cost_ratio"] <= 1.02

@@ -40,7 +40,7 @@ def train(arguments: list[str]) -> int:
 
 
 def brief(arguments: list[str]) -> list[str]:
-    """Few states and steps, one value of a sweep, one second for a certificate; any other command as it is."""
+    """Few states and steps, one value of a sweep, a second for a certificate; any other command as it is."""
     if arguments[0] == "sweep":
         if "--vary" not in arguments:
             return [*arguments[:3], *SHORT]
@@ -51,7 +51,8 @@ def brief(arguments: list[str]) -> list[str]:
         return [*arguments, "--dimensions", "1", "--boxes", "2", "--repeats", "1", "--seconds", "1"]
     if "--seconds" in arguments:
         at = arguments.index("--seconds")
-        return [*arguments[: at + 1], "1", *arguments[at + 2 :]]
+        short = SHORT if "--refine" in arguments else []
+        return [*arguments[: at + 1], "1", *arguments[at + 2 :], *short]
     if arguments[0] != "bench":
         return arguments
     at = arguments.index("--batch") if "--batch" in arguments else len(arguments)

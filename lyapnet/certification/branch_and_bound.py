@@ -267,7 +267,7 @@ def _undecided(bounded: BoundedFunction, chunk: Boxes, level: float) -> tuple[Bo
     return chunk[chosen], axis_to_cut(bounded, c, chunk, chosen)
 
 
-PROBES = 32  # boxes of a chunk that are cut along every axis
+PROBES = 12  # boxes of a chunk that are cut along every axis
 
 
 def axis_to_cut(bounded: BoundedFunction, form: AffineForm, boxes: Boxes, chosen: Tensor) -> Tensor:

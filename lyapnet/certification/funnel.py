@@ -124,7 +124,7 @@ def sound_claim(
     if rho > -float("inf"):
         finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
         start_low, start_high = _at(0.0, x_low, x_high)
-        inside = share_below(condition.V, start_low[0], start_high[0], rho, finish)
+        inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, inside, excess,
@@ -136,18 +136,18 @@ def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) 
     """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
 
     Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
-    of what the first gave. No ray is followed further than 8 times the largest component of X₀.
+    of what the first gave. No ray is followed further than 30 times the largest component of X₀.
     """
     generator = torch.Generator().manual_seed(0)
     inner = initial_states.magnitude.double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
     times = torch.linspace(0, duration, 9, dtype=torch.float64)
-    radii = torch.logspace(-2, 1, 61, dtype=torch.float64)
+    radii = torch.logspace(-2, 1.5, 71, dtype=torch.float64)
     for _ in range(2):
         rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-        points = (radii[:, None, None] * rays).clamp(-8 * largest, 8 * largest)
+        points = (radii[:, None, None] * rays).clamp(-30 * largest, 30 * largest)
         with torch.no_grad():
             above = torch.stack([W(t.expand(points.shape[:-1]), points) > level for t in times])
         below = above.cumsum(1) == 0  # from the goal to the first crossing

@@ -219,6 +219,8 @@ def certify(
     )  # fmt: skip
     if refine and kind != "sound":
         raise UsageError(f"Expected --refine with --kind sound, got --kind {kind}; leave it out.")
+    if refine and keep is not None:
+        raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
     require_writable(figure, report)

@@ -26,13 +26,17 @@ from lyapnet.sets import Box
 
 SEED, SEEDS, STEPS = 3, 3, 6
 DISCRETE = {"gradient": "discrete", "compile": "off"}
+POINTWISE = {"weight": 1.0, "points": 8}  # its points are draws as well: of the seed, and again after an interruption
 TRAINING = {**SMALL["training"], "iterations": STEPS, "validate_every": 3}
 FOLDERS = [f"seed_{SEED + k}" for k in range(SEEDS)]
 
 
 def desk_of(folder, **changes):
     folder.mkdir(exist_ok=True)
-    return Desk(folder, **{"seed": SEED, "seeds": SEEDS, "rollout": DISCRETE, "training": TRAINING, **changes})
+    return Desk(
+        folder,
+        **{"seed": SEED, "seeds": SEEDS, "rollout": DISCRETE, "training": TRAINING, "pointwise": POINTWISE, **changes},
+    )
 
 
 def config_of(tmp_path, *overrides):
@@ -105,7 +109,14 @@ def test_curves_of_a_member_are_those_of_its_run(ensemble, single):
     pictures = {tag for tag in logged(ensemble.run / "seed_3") if tag not in member}
     assert pictures == {"first seed"}
     assert member.keys() == alone.keys()
-    for tag in ("loss/train", "gradient_norm", "trajectory_cost/val", "optimality_gap/val", "hp/cost_mean"):
+    for tag in (
+        "loss/train",
+        "term/pointwise",
+        "gradient_norm",
+        "trajectory_cost/val",
+        "optimality_gap/val",
+        "hp/cost_mean",
+    ):
         curve, other = values(ensemble.run / "seed_4", tag), values(single.run, tag)
         assert curve == pytest.approx(other, rel=1e-6)
         assert values(ensemble.run / "seed_3", tag) != pytest.approx(other, rel=1e-6), "another seed, another curve"

@@ -5,7 +5,7 @@ import pickle
 
 import pytest
 import torch
-from test_certification import Planted, domain, loop, riccati, true_with_a_dip
+from test_certification import Planted, domain, loop, riccati
 
 from lyapnet.certification import Budget, DecreaseCondition, branch_and_bound, prove, violations
 from lyapnet.errors import UsageError
@@ -20,71 +20,71 @@ def P():
 def kept(P, tmp_path):
     """The file of a proof that was stopped early."""
     path = tmp_path / "proof.pt"
-    assert go_on(true_with_a_dip(P), path, boxes=100).verdict == "unknown"
+    assert go_on(dipped(P), path, boxes=60).verdict == "unknown"
     return path
 
 
+def dipped(P, alpha=0.9, delta=0.05):
+    """A condition that holds, with a dip, which takes some boxes."""
+    return Planted(loop(P), alpha, delta).plant(torch.tensor([1.1, 0.1, 0.2]), 0.8, -3.0)
+
+
 def violated(P):
-    return Planted(loop(P), 0.9, 0.05).plant(torch.tensor([1.0, 0.5, 0.2]), 0.2, 0.3)
+    return Planted(loop(P), 0.9, 0.05).plant(torch.tensor([1.0, 0.6, 0.3]), 0.15, 0.3)
 
 
-def go_on(condition, path, boxes=100_000, wanted=12.0, box=None, **options):
+def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     return prove(
-        condition, box or domain(), wanted, Budget(60, boxes=boxes, chunk=16, workers=options.pop("workers", 1)), False,
+        condition, box or domain(), wanted, Budget(60, boxes=boxes, chunk=64, workers=options.pop("workers", 1)), False,
         torch.Generator().manual_seed(0), keep=path, **options,
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("condition", [true_with_a_dip, violated])
-def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, tmp_path):
+@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), (violated, 6.0)])
+def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):
     condition, path = condition(P), tmp_path / "proof.pt"
-    whole = go_on(condition, None)
-    stopped = [go_on(condition, path, boxes) for boxes in (60, 200)]
-    assert [proof.verdict for proof in stopped] == ["unknown", "unknown"] or whole.verdict == "falsified"
+    whole = go_on(condition, None, wanted=wanted)
+    stopped = [go_on(condition, path, boxes, wanted) for boxes in (60, 120)]
+    assert all(proof.level < whole.level for proof in stopped)
     heard = []
-    proof = go_on(condition, path, report=heard.append)
+    proof = go_on(condition, path, wanted=wanted, report=heard.append)
     assert (proof.verdict, proof.level, proof.boxes) == (whole.verdict, whole.level, whole.boxes)
     assert proof.counterexample == whole.counterexample
     assert proof.remaining_volume == whole.remaining_volume == 0
     assert whole.boxes > stopped[1].boxes > stopped[0].boxes
-    assert heard[0].boxes == stopped[1].boxes + 16, "it starts where it stood"
+    assert heard[0].boxes == stopped[1].boxes + 64, "it starts where it stood"
     assert heard[0].seconds > stopped[1].seconds
     assert [one.boxes for one in heard] == sorted(one.boxes for one in heard)
     assert heard[-1].remaining == 0
 
 
-def others(P):
-    """Proofs of something else."""
-    return {
-        "V": lambda path: go_on(
-            Planted(loop(0.999 * P), 0.9, 0.05).plant(torch.tensor([1.1, 0.3, 0.4]), 0.3, -5.0), path
-        ),
-        "α": lambda path: go_on(Planted(loop(P), 0.901, 0.05).plant(torch.tensor([1.1, 0.3, 0.4]), 0.3, -5.0), path),
-        "δ": lambda path: go_on(Planted(loop(P), 0.9, 0.0501).plant(torch.tensor([1.1, 0.3, 0.4]), 0.3, -5.0), path),
-        "level": lambda path: go_on(true_with_a_dip(P), path, wanted=12.1),
-        "set": lambda path: go_on(true_with_a_dip(P), path, box=(domain()[0], domain()[1] + 1e-9)),
-    }
+OTHERS = {  # proofs of something else
+    "V": lambda P, path: go_on(dipped(0.999 * P), path),
+    "α": lambda P, path: go_on(dipped(P, alpha=0.901), path),
+    "δ": lambda P, path: go_on(dipped(P, delta=0.0501), path),
+    "level": lambda P, path: go_on(dipped(P), path, wanted=2.01),
+    "set": lambda P, path: go_on(dipped(P), path, box=(domain()[0], domain()[1] + 1e-9)),
+}
 
 
-@pytest.mark.parametrize("other", others(0 * riccati()))
+@pytest.mark.parametrize("other", OTHERS)
 def test_the_proof_of_something_else_is_refused(other, P, kept):
     before = kept.read_bytes()
     with pytest.raises(UsageError, match=r"got that of another; give each its own file\.$"):
-        others(P)[other](kept)
+        OTHERS[other](P, kept)
     assert kept.read_bytes() == before
-    assert go_on(true_with_a_dip(P), kept).verdict == "certified"
+    assert go_on(dipped(P), kept).verdict == "certified"
 
 
 def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
     """A violation where the other proof was done; the twin."""
     monkeypatch.setattr(branch_and_bound, "_identity", lambda *_: [])
-    go_on(true_with_a_dip(P), kept, boxes=0)  # nothing but to write it again, without an identity
     kept.unlink()
-    go_on(true_with_a_dip(P), kept, boxes=400)
+    go_on(dipped(P), kept, boxes=200)
     lower, upper, _ = torch.load(kept, weights_only=True)["frontier"]
     corners = torch.cartesian_prod(*(torch.linspace(0.1, 0.9, 9) for _ in range(3)))
     points = domain()[0] + (domain()[1] - domain()[0]) * corners
-    points = points[(loop(P).policy.V(points[:, 0], points[:, 1:]) < 10)]
+    points = points[(loop(P).policy.V(points[:, 0], points[:, 1:]) < 1.5)]
     done = points[~((points[:, None] >= lower) & (points[:, None] <= upper)).all(-1).any(1)]
     bad = Planted(loop(P), 0.9, 0.05).plant(done[0], 0.02, 0.1)
     assert go_on(bad, kept).verdict == "certified"
@@ -109,13 +109,13 @@ def test_a_broken_file_is_refused(kind, P, kept):
     with pytest.raises(
         UsageError, match=r"^Expected a proof in .*proof.pt', got another or a broken file; remove it\.$"
     ):
-        go_on(true_with_a_dip(P), kept)
+        go_on(dipped(P), kept)
 
 
 def test_a_kept_proof_is_plain_data(kept):
     content = torch.load(kept, weights_only=True)
     assert content.keys() == {"of", "frontier", "worst", "level", "boxes", "seconds", "given_up"}
-    assert content["boxes"] >= 100
+    assert content["boxes"] >= 60
     assert all(isinstance(side, torch.Tensor) for side in content["frontier"])
 
 
@@ -123,14 +123,12 @@ def test_a_kept_proof_is_plain_data(kept):
 
 
 def test_threads_come_to_the_same_verdict_and_level(P):
-    true, bad = true_with_a_dip(P), violated(P)
+    true = dipped(P)
     one, two = (go_on(true, None, workers=workers) for workers in (1, 2))
     assert one.verdict == two.verdict == "certified"
-    assert one.level == two.level == 12.0
+    assert one.level == two.level == 2.0
     assert min(one.boxes, two.boxes) > 100
-    one, two = (go_on(bad, None, workers=workers) for workers in (1, 2))
-    assert one.verdict == two.verdict == "falsified"
-    assert two.level == pytest.approx(one.level, rel=0.02)
+    assert go_on(violated(P), None, 200, 6.0, workers=2).verdict == "falsified"
 
 
 # Where a condition fails
@@ -138,12 +136,12 @@ def test_threads_come_to_the_same_verdict_and_level(P):
 
 def test_violations_are_the_worst_points_found(P):
     condition = violated(P)
-    points = violations(condition, domain(), 12.0, 40, torch.Generator().manual_seed(0))
+    points = violations(condition, domain(), 6.0, 40, torch.Generator().manual_seed(0))
     with torch.no_grad():
         c, W = condition(points[:, 0], points[:, 1:]), condition.height(points[:, 0], points[:, 1:])
     assert len(points) == 40
     assert (c > 0).all()
-    assert (W <= 12.0).all()
+    assert (W <= 6.0).all()
     assert c.max() > 0.25, "of 0.3 at the top"
     assert (c.diff() <= 0).all()
     low = float(condition.height(condition.point[0], condition.point[1:])) * 0.2

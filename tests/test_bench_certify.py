@@ -213,7 +213,7 @@ def test_json_and_figure(run, tmp_path):
     assert [row["enclosure"] for row in result["tightness"]] == list(ENCLOSURES)
     assert [row["method"] for row in result["proofs"]] == [*METHODS, "certifier"]
     assert all(len(row["factors"]) == len(row["sides"]) for row in result["tightness"])
-    assert [row["verdict"] for row in result["proofs"]] == ["certified"] * 4 + ["falsified"]
+    assert [row["verdict"] for row in result["proofs"]] == ["certified"] * len(METHODS) + ["falsified"]
     assert (tmp_path / "new" / "certify_bench.png").stat().st_size > 0
 
 
@@ -225,8 +225,7 @@ def test_a_checkpoint_and_its_tables(run, tmp_path):
     status, out, err = run(str(checkpoint))
     assert status == 0, err
     assert "double_integrator" in out
-    assert "mean value is left out" in " ".join(err.split())
-    for word in ("quadratic", "affine", "interval", "order", "certified", "falsified"):
+    for word in ("quadratic", "affine", "mean value", "interval", "order", "certified", "falsified"):
         assert word in out
 
 

@@ -342,3 +342,22 @@ def test_float32_weights_are_taken_as_they_are():
     V = FCN(Scaling([1.0, 1.0], 1.0, 3.0), hidden=(8,)).float().requires_grad_(False).double()
     bounded = BoundedFunction(several(V), unit())
     assert violations(bounded, several(V), *box(0.1)) == 0
+
+
+@pytest.mark.parametrize(
+    "function", [affine.log, affine.log1p, affine.sqrt, affine.reciprocal], ids=lambda f: f.__name__
+)
+def test_close_to_where_a_function_ends_nothing_is_lost(function):
+    """An interval of ratio 1e15 and more: its third derivative is that on it, and not a rounding error outside it."""
+    box = affine.box_form(torch.tensor([[-1.0]]), torch.tensor([[1.0]]), 2)
+    plain = {affine.log: torch.log, affine.log1p: torch.log1p, affine.sqrt: torch.sqrt}.get(function, torch.reciprocal)
+    offset = 1.0 if function is affine.log1p else 0.0
+    known = 0
+    for least in torch.logspace(-15.5, -13, 80):
+        form = function(affine.shift(affine.multiply(box, box), least - offset))
+        low, high = form.interval()
+        values = plain(torch.stack([least, 0.25 + least, 1 + least]) - offset)
+        assert (low <= values.min()).all()
+        assert (values.max() <= high).all()
+        known += int(high.isfinite().all())
+    assert known > 20

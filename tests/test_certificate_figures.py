@@ -24,22 +24,9 @@ def cube(side, dimension):
 
 def claim(rho, dimension=2, wanted=2.0, found=None):
     share = 0.5 if rho > 0 else 0.0
-    return SoundClaim(
-        0.9,
-        0.01,
-        4.0,
-        cube(2.0, dimension),
-        rho,
-        wanted,
-        share,
-        0.0,
-        found,
-        10,
-        1.0,
-        0.0,
-        torch.empty(0, 1 + dimension),
-        [],
-    )
+    undecided = torch.empty(0, 1 + dimension)
+    D = cube(2.0, dimension)
+    return SoundClaim(0.9, 0.01, 4.0, D, rho, wanted, share, 0.0, found, 10, 1.0, 0.0, undecided, [])
 
 
 def draw(figure):

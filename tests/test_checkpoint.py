@@ -312,3 +312,19 @@ def test_weights_that_do_not_fit_are_named(changes, named, tmp_path, content):
     is_one_line_that_names(path, raised.value)
     for name in named:
         assert name in str(raised.value)
+
+
+def test_states_that_are_ignored_are_so_after_loading(tmp_path):
+    names = ["network.ignored_states=[cart position]", "network.name=anchored", *SMALL]
+    content = content_of(load_config(CONF / "cartpole_balancing.yaml", names))
+    path, x = tmp_path / "ignoring.ckpt", torch.randn(5, 4)
+    write_checkpoint(content, path)
+    V = lyapnet.load(path).V.double()
+    assert torch.equal(V(torch.tensor(0.1), x), V(torch.tensor(0.1), x + torch.tensor([9.0, 0.0, 0.0, 0.0])))
+    assert not torch.allclose(V(torch.tensor(0.1), x), V(torch.tensor(0.1), x + torch.tensor([0.0, 9.0, 0.0, 0.0])))
+    weights = {f"V.{name}": weight for name, weight in V.state_dict().items()}
+    assert all(torch.equal(weights[name], weight.double()) for name, weight in content["state_dict"].items())
+    content[KEY]["config"]["network"]["ignored_states"] = []
+    write_checkpoint(content, path)
+    with pytest.raises(CheckpointError, match="only in the config"):
+        lyapnet.load(path)

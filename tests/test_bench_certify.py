@@ -13,7 +13,7 @@ from lyapnet.bench.conditions import of_chain, of_network
 from lyapnet.bench.enclosures import ENCLOSURES, MEAN_VALUE, enclosure, enclosures_of
 from lyapnet.bench.proofs import METHODS, attempt, growth
 from lyapnet.bench.tightness import order, random_boxes, range_widths, tightness
-from lyapnet.certification import affine
+from lyapnet.certification import taylor
 from lyapnet.certification.bounds import RULES, BoundedFunction
 from lyapnet.errors import UsageError
 
@@ -26,7 +26,7 @@ def sample():
 def interval_violations(function, lower, upper):
     """How many values at points of the boxes lie outside their intervals."""
     bounded = BoundedFunction(lambda t, x: (function(t, x),), sample())
-    (image,) = bounded.image(affine.interval_form(lower, upper))
+    (image,) = bounded.image(taylor.interval_form(lower, upper))
     low, high = image.interval()
     values = torch.func.vmap(torch.func.vmap(lambda p: function(p[0], p[1:])))(points_in(lower, upper))
     return int(((values < low[:, None]) | (values > high[:, None]) | low[:, None].isnan()).sum())
@@ -41,7 +41,7 @@ def test_values_lie_within_intervals(name):
 @pytest.mark.parametrize("name", [*SMOOTH, "product"])
 def test_intervals_without_their_remainder_are_caught(name, monkeypatch):
     for rule in ("linearised", "_interval_product"):
-        monkeypatch.setattr(affine, rule, without_remainder(getattr(affine, rule)))
+        monkeypatch.setattr(taylor, rule, without_remainder(getattr(taylor, rule)))
     assert interval_violations(FUNCTIONS[name], *box(0.5)) > 0
 
 
@@ -50,7 +50,7 @@ def test_the_interval_of_a_function_is_its_image(name):
     lower = torch.linspace(0.3, 4, 50)[:, None]
     if name not in ("sqrt", "log1p", "reciprocal"):
         lower = lower - 3
-    low, high = getattr(affine, name)(affine.interval_form(lower, lower + 2.5)).interval()
+    low, high = getattr(taylor, name)(taylor.interval_form(lower, lower + 2.5)).interval()
     x = lower + 2.5 * torch.linspace(0, 1, 20_001)
     value = (torch.nn.functional.softplus if name == "softplus" else getattr(torch, name))(x)
     torch.testing.assert_close(high[:, 0], value.amax(1), rtol=1e-6, atol=1e-6)
@@ -59,12 +59,12 @@ def test_the_interval_of_a_function_is_its_image(name):
 
 def test_the_interval_of_a_product_lies_between_products_of_ends():
     x, y = (
-        affine.interval_form(*torch.tensor([[[1.0]], [[2.0]]])),
-        affine.interval_form(*torch.tensor([[[-1.0]], [[3.0]]])),
+        taylor.interval_form(*torch.tensor([[[1.0]], [[2.0]]])),
+        taylor.interval_form(*torch.tensor([[[-1.0]], [[3.0]]])),
     )
-    low, high = affine.multiply(x, y).interval()
+    low, high = taylor.multiply(x, y).interval()
     assert (float(low), float(high)) == (pytest.approx(-2), pytest.approx(6))
-    unknown = affine.multiply(x, affine.reciprocal(y)).interval()  # 1/y has a pole
+    unknown = taylor.multiply(x, taylor.reciprocal(y)).interval()  # 1/y has a pole
     assert [float(side) for side in unknown] == [-math.inf, math.inf]
 
 
@@ -97,7 +97,7 @@ def test_a_mean_value_form_with_the_gradient_of_the_middle_alone_is_caught(case,
     """The twin: sound only because the gradient is bounded on the whole box."""
 
     def at_middle(lower, upper):
-        return affine.interval_form((lower + upper) / 2, (lower + upper) / 2)
+        return taylor.interval_form((lower + upper) / 2, (lower + upper) / 2)
 
     monkeypatch.setattr(enclosures, "interval_form", at_middle)
     wrong = enclosure(MEAN_VALUE, case.condition, (case.lower, case.upper))

@@ -6,7 +6,7 @@ import mpmath
 import pytest
 import torch
 
-from lyapnet.certification import affine
+from lyapnet.certification import taylor
 from lyapnet.certification.bounds import ARRANGEMENTS, RULES, BoundedFunction, DecreaseCondition
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.cost import QuadraticCost
@@ -107,13 +107,13 @@ SMOOTH = ["power", "exp", "log1p", "sqrt", "reciprocal", "sigmoid", "tanh", "sof
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_functions_without_their_remainder_are_caught(name, monkeypatch):
-    monkeypatch.setattr(affine, "linearised", without_remainder(affine.linearised))
+    monkeypatch.setattr(taylor, "linearised", without_remainder(taylor.linearised))
     function = several(FUNCTIONS[name])
     assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
 
 
 def test_products_without_their_remainder_are_caught(monkeypatch):
-    monkeypatch.setattr(affine, "multiply", without_remainder(affine.multiply))
+    monkeypatch.setattr(taylor, "multiply", without_remainder(taylor.multiply))
     function = several(FUNCTIONS["product"])
     assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
 
@@ -121,11 +121,11 @@ def test_products_without_their_remainder_are_caught(monkeypatch):
 @pytest.mark.parametrize("name", ["exp", "sigmoid", "sin", "cos", "sqrt", "log1p", "reciprocal", "square", "softplus"])
 def test_the_remainder_of_a_function_is_no_larger_than_needed(name):
     """On wide intervals too: the band a x + b ± e touches the graph of f on both sides."""
-    function = getattr(affine, name)
+    function = getattr(taylor, name)
     lower = torch.linspace(0.3, 4, 50)[:, None]
     if name not in ("sqrt", "log1p", "reciprocal"):
         lower = lower - 3
-    form = function(affine.box_form(lower, lower + 2.5))
+    form = function(taylor.box_form(lower, lower + 2.5))
     y = torch.linspace(-1, 1, 20_001)[:, None]
     value = {
         "square": lambda x: x**2, "reciprocal": lambda x: 1 / x, "softplus": torch.nn.functional.softplus,
@@ -147,7 +147,7 @@ def distances_from_parabolas(name, width):
     lower = torch.linspace(0.3, 4, 200)[:, None]
     if name in ("sigmoid", "softplus", "sin", "cos", "exp"):
         lower = 2 * lower - 5
-    form = getattr(affine, name)(affine.box_form(lower, lower + width, degree=2))
+    form = getattr(taylor, name)(taylor.box_form(lower, lower + width, degree=2))
     y = torch.linspace(-1, 1, 2001)[:, None]
     value = EXPANDED[name](lower[:, 0] + width / 2 * (y + 1))
     parabola = form.center[:, 0] + form.coefficients[0, :, 0] * y + form.products[0, :, 0] * y**2
@@ -172,26 +172,26 @@ def test_remainders_of_second_degree_are_of_third_order_and_not_idle(name):
 
 def test_a_product_of_second_degree_is_exact_up_to_third_order():
     """(ε₁ + ε₁ε₂)(ε₂ + ε₂²) over a box of points: no cancellation is lost below third order."""
-    x, y = (affine.box_form(*(torch.full((1, 2), side) for side in (-0.1, 0.1)), degree=2) for _ in range(2))
-    product = affine.multiply(x, y)
+    x, y = (taylor.box_form(*(torch.full((1, 2), side) for side in (-0.1, 0.1)), degree=2) for _ in range(2))
+    product = taylor.multiply(x, y)
     assert product.pairs == [(0, 0), (0, 1), (1, 1)]
     torch.testing.assert_close(product.products[:, 0], torch.tensor([[0.01, 0.0], [0.0, 0.0], [0.0, 0.01]]))
     assert float(product.radius.max()) < 1e-15
-    curved = affine.multiply(product, affine.add(x, product))
+    curved = taylor.multiply(product, taylor.add(x, product))
     assert 0 < float(curved.radius.max()) < 3 * 0.1**3
 
 
 def test_bounds_of_a_parabola_know_its_vertex():
     """−x² + x on [0, 1] is at most ¼, which lies in the middle; −(x² + y²) + xy is at most 0, where both meet."""
-    form = affine.box_form(torch.zeros(1, 1), torch.ones(1, 1), degree=2)
-    low, high = affine.add(form, affine.negate(affine.square(form))).interval()
+    form = taylor.box_form(torch.zeros(1, 1), torch.ones(1, 1), degree=2)
+    low, high = taylor.add(form, taylor.negate(taylor.square(form))).interval()
     assert (float(low), float(high)) == pytest.approx((0.0, 0.25), abs=1e-12)
     x, y = (
         form.with_parts(form.terms[..., k : k + 1], form.radius[..., k : k + 1])
-        for form in [affine.box_form(-torch.ones(1, 2), torch.ones(1, 2), degree=2)]
+        for form in [taylor.box_form(-torch.ones(1, 2), torch.ones(1, 2), degree=2)]
         for k in range(2)
     )
-    definite = affine.add(affine.multiply(x, y), affine.negate(affine.add(affine.square(x), affine.square(y))))
+    definite = taylor.add(taylor.multiply(x, y), taylor.negate(taylor.add(taylor.square(x), taylor.square(y))))
     assert float(definite.interval()[1]) == pytest.approx(0, abs=1e-12)
 
 
@@ -232,7 +232,7 @@ def test_rounding_is_covered(name):
 
 @pytest.mark.parametrize("name", ["affine", "cubes", "exp"])
 def test_without_a_margin_rounding_is_not_covered(name, monkeypatch):
-    monkeypatch.setattr(affine, "EPSILON", 0.0)
+    monkeypatch.setattr(taylor, "EPSILON", 0.0)
     assert digits_outside(name) > 0
 
 
@@ -345,16 +345,16 @@ def test_float32_weights_are_taken_as_they_are():
 
 
 @pytest.mark.parametrize(
-    "function", [affine.log, affine.log1p, affine.sqrt, affine.reciprocal], ids=lambda f: f.__name__
+    "function", [taylor.log, taylor.log1p, taylor.sqrt, taylor.reciprocal], ids=lambda f: f.__name__
 )
 def test_close_to_where_a_function_ends_nothing_is_lost(function):
     """An interval of ratio 1e15 and more: its third derivative is that on it, and not a rounding error outside it."""
-    box = affine.box_form(torch.tensor([[-1.0]]), torch.tensor([[1.0]]), 2)
-    plain = {affine.log: torch.log, affine.log1p: torch.log1p, affine.sqrt: torch.sqrt}.get(function, torch.reciprocal)
-    offset = 1.0 if function is affine.log1p else 0.0
+    box = taylor.box_form(torch.tensor([[-1.0]]), torch.tensor([[1.0]]), 2)
+    plain = {taylor.log: torch.log, taylor.log1p: torch.log1p, taylor.sqrt: torch.sqrt}.get(function, torch.reciprocal)
+    offset = 1.0 if function is taylor.log1p else 0.0
     known = 0
     for least in torch.logspace(-15.5, -13, 80):
-        form = function(affine.shift(affine.multiply(box, box), least - offset))
+        form = function(taylor.shift(taylor.multiply(box, box), least - offset))
         low, high = form.interval()
         values = plain(torch.stack([least, 0.25 + least, 1 + least]) - offset)
         assert (low <= values.min()).all()

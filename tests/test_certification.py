@@ -12,11 +12,11 @@ from lyapnet.certification import (
     BoundedFunction,
     Budget,
     DecreaseCondition,
-    affine,
     branch_and_bound,
     enclosing_box,
     prove,
     sound_claim,
+    taylor,
 )
 from lyapnet.certification.branch_and_bound import faces, minimum, share_below
 from lyapnet.closed_loop import ClosedLoop
@@ -184,7 +184,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
         return wrong
 
     for name in ("linearised", "multiply"):
-        monkeypatch.setattr(affine, name, without_remainder(getattr(affine, name)))
+        monkeypatch.setattr(taylor, name, without_remainder(getattr(taylor, name)))
     monkeypatch.setattr(branch_and_bound, "BoundedFunction", partial(BoundedFunction, degree=1))  # all in remainders
     assert proof_without_search(monkeypatch, P).verdict == "certified"
 

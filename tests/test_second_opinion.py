@@ -8,7 +8,7 @@ import pytest
 import torch
 from mpmath import iv, mpf
 
-from lyapnet.certification import affine
+from lyapnet.certification import taylor
 from lyapnet.certification.bounds import RULES, BoundedFunction, DecreaseCondition
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.cost import QuadraticCost
@@ -133,13 +133,13 @@ def mutilated(rule, change):
 def test_a_mutilated_rule_is_caught_at_points(monkeypatch):
     """By one part in 10¹²."""
     sigmoid = torch.ops.aten.sigmoid.default
-    monkeypatch.setitem(RULES, sigmoid, mutilated(affine.sigmoid, lambda terms: terms * (1 + 1e-12)))
+    monkeypatch.setitem(RULES, sigmoid, mutilated(taylor.sigmoid, lambda terms: terms * (1 + 1e-12)))
     assert points_outside(20)[0] > 0
 
 
 def test_a_forgotten_remainder_is_caught_on_boxes(monkeypatch):
-    monkeypatch.setattr(affine, "linearised", without_remainder(affine.linearised))
-    monkeypatch.setattr(affine, "multiply", without_remainder(affine.multiply))
+    monkeypatch.setattr(taylor, "linearised", without_remainder(taylor.linearised))
+    monkeypatch.setattr(taylor, "multiply", without_remainder(taylor.multiply))
     assert boxes_outside(0.3)[1] > 0
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lyapnet.calculus import gradients
 from lyapnet.certification import BoundedFunction
-from lyapnet.certification.affine import box_form, interval_form
+from lyapnet.certification.taylor import box_form, interval_form
 from lyapnet.errors import UsageError
 from lyapnet.types import Value
 

@@ -1,8 +1,8 @@
-"""Bounds of a function on boxes: its operator graph, interpreted with affine forms.
+"""Bounds of a function on boxes: its operator graph, interpreted with Taylor forms.
 
 The function is the one that training and control use, traced at one point (t, x). What a rule does with an operator is
 in RULES; an operator without one is refused by name. The arithmetic of forms, and what is covered of rounding, is in
-lyapnet.certification.affine. Numbers that do not depend on the point (weights, W → softplus(W), a constant mass matrix)
+lyapnet.certification.taylor. Numbers that do not depend on the point (weights, W → softplus(W), a constant mass matrix)
 are computed once, in float64: bounds are those of the function with these numbers.
 """
 
@@ -18,11 +18,11 @@ from torch.fx import Node
 from torch.utils._pytree import tree_flatten, tree_map, tree_unflatten
 
 from lyapnet.calculus import gradients, state_gradient
-from lyapnet.certification import affine
-from lyapnet.certification.affine import AffineForm, box_form
+from lyapnet.certification import taylor
 from lyapnet.certification.branches import CHOICES, JUMPS, KINKS
 from lyapnet.certification.graphs import with_known_truths, without_copies
 from lyapnet.certification.linear_systems import LINEAR_SYSTEMS
+from lyapnet.certification.taylor import TaylorForm, box_form
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
 from lyapnet.policy import ValuePolicy
@@ -99,11 +99,11 @@ class BoundedFunction:
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
         self.forms(lower[None], upper[None])  # an operator without a rule is found here
 
-    def forms(self, lower: Tensor, upper: Tensor) -> list[AffineForm]:
-        """The results on boxes of (t, x), (boxes, 1 + n) each, as affine forms in the coordinates of the box."""
+    def forms(self, lower: Tensor, upper: Tensor) -> list[TaylorForm]:
+        """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box."""
         return self.image(box_form(lower, upper, self.degree))
 
-    def image(self, box: AffineForm) -> list[AffineForm]:
+    def image(self, box: TaylorForm) -> list[TaylorForm]:
         """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""
         inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
         values: dict[Node, Any] = dict(self._constants)
@@ -112,7 +112,7 @@ class BoundedFunction:
                 values[node] = next(inputs)
             elif node.op == "output":
                 results = tree_map(values.__getitem__, node.args[0], is_leaf=lambda leaf: isinstance(leaf, Node))
-                return [y if isinstance(y, AffineForm) else affine.constant_form(y, box) for y in results]
+                return [y if isinstance(y, TaylorForm) else taylor.constant_form(y, box) for y in results]
             elif node not in values:
                 values[node] = _apply(node, values)
             for source in node.all_input_nodes:
@@ -151,7 +151,7 @@ class BoundedFunction:
 
 Rule = Callable[..., Any]
 RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS}
-"""Operator ↦ its rule: the operator's arguments, some of them affine forms, ↦ an affine form, or a tensor."""
+"""Operator ↦ its rule: the operator's arguments, some of them Taylor forms, ↦ a Taylor form, or a tensor."""
 
 
 def rule(*operators: Any) -> Callable[[Rule], Rule]:
@@ -166,7 +166,7 @@ def rule(*operators: Any) -> Callable[[Rule], Rule]:
 
 def _apply(node: Node, values: dict[Node, Any]) -> Any:
     arguments, keywords = _values(node, values)
-    if not any(isinstance(values[source], AffineForm | list) for source in node.all_input_nodes):
+    if not any(isinstance(values[source], TaylorForm | list) for source in node.all_input_nodes):
         return node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
     found = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
     if found is None or (found in (_add, _index_add) and _of_truths(node)):
@@ -194,87 +194,87 @@ def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
 
 
 @rule(aten.add.Tensor, aten.add.Scalar)
-def _add(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+def _add(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     """x + αy."""
     if alpha != 1:
-        y = _multiply(y, alpha) if isinstance(y, AffineForm) else y * alpha
-    if isinstance(x, AffineForm) and isinstance(y, AffineForm):
-        return affine.add(x, y)
-    return affine.shift(x, _tensor(y)) if isinstance(x, AffineForm) else affine.shift(y, _tensor(x))
+        y = _multiply(y, alpha) if isinstance(y, TaylorForm) else y * alpha
+    if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
+        return taylor.add(x, y)
+    return taylor.shift(x, _tensor(y)) if isinstance(x, TaylorForm) else taylor.shift(y, _tensor(x))
 
 
 @rule(aten.sub.Tensor, aten.sub.Scalar)
-def _subtract(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+def _subtract(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     """x − αy."""
-    return _add(x, affine.negate(y) if isinstance(y, AffineForm) else -y, alpha)
+    return _add(x, taylor.negate(y) if isinstance(y, TaylorForm) else -y, alpha)
 
 
 @rule(aten.rsub.Scalar, aten.rsub.Tensor)
-def _subtract_from(x: Any, y: Any, alpha: float = 1) -> AffineForm:
+def _subtract_from(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     """y − αx."""
     return _subtract(y, x, alpha)
 
 
 @rule(aten.mul.Tensor, aten.mul.Scalar)
-def _multiply(x: Any, y: Any) -> AffineForm:
+def _multiply(x: Any, y: Any) -> TaylorForm:
     """x · y; a square where both are one value."""
     if x is y:
-        return affine.square(x)
-    if isinstance(x, AffineForm) and isinstance(y, AffineForm):
-        return affine.multiply(x, y)
-    return affine.scale(x, _tensor(y)) if isinstance(x, AffineForm) else affine.scale(y, _tensor(x))
+        return taylor.square(x)
+    if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
+        return taylor.multiply(x, y)
+    return taylor.scale(x, _tensor(y)) if isinstance(x, TaylorForm) else taylor.scale(y, _tensor(x))
 
 
 @rule(aten.div.Tensor, aten.div.Scalar)
-def _divide(x: Any, y: Any) -> AffineForm:
+def _divide(x: Any, y: Any) -> TaylorForm:
     """x · (1/y)."""
-    if isinstance(y, AffineForm):
-        return _multiply(x, affine.reciprocal(y))
-    return affine.scale(x, 1 / _tensor(y)).rounded()
+    if isinstance(y, TaylorForm):
+        return _multiply(x, taylor.reciprocal(y))
+    return taylor.scale(x, 1 / _tensor(y)).rounded()
 
 
 @rule(aten.pow.Tensor_Scalar)
-def _power(x: AffineForm, exponent: float) -> Any:
+def _power(x: TaylorForm, exponent: float) -> Any:
     """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal; x⁰ = 1."""
     if exponent == 0:
         return torch.ones_like(x.radius[0])
     if exponent < 0:
-        return affine.reciprocal(_power(x, -exponent))
+        return taylor.reciprocal(_power(x, -exponent))
     if exponent == 0.5:
-        return affine.sqrt(x)
+        return taylor.sqrt(x)
     if exponent != int(exponent):
         raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
     if exponent == 1:
         return x
     half = _power(x, exponent // 2)
-    return affine.square(half) if exponent % 2 == 0 else affine.multiply(affine.square(half), x)
+    return taylor.square(half) if exponent % 2 == 0 else taylor.multiply(taylor.square(half), x)
 
 
 @rule(aten.mm.default, aten.bmm.default)
-def _matrix_product(x: Any, y: Any) -> AffineForm:
+def _matrix_product(x: Any, y: Any) -> TaylorForm:
     """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
-    if not isinstance(x, AffineForm):
+    if not isinstance(x, TaylorForm):
         return _transposed(_matrix_product(_transposed(y), x.mT))
-    if not isinstance(y, AffineForm) and y.ndim == 2:
-        return affine.matrix_product(x, y)
+    if not isinstance(y, TaylorForm) and y.ndim == 2:
+        return taylor.matrix_product(x, y)
     left, right = ARRANGEMENTS[aten.unsqueeze.default](x, -1), _unsqueezed(y, -3)
     return _sum(_multiply(left, right), [-2])
 
 
 @rule(aten.mv.default)
-def _matrix_vector_product(x: Any, y: Any) -> AffineForm:
+def _matrix_vector_product(x: Any, y: Any) -> TaylorForm:
     """xy of a matrix and a vector."""
     return ARRANGEMENTS[aten.squeeze.dim](_matrix_product(x, _unsqueezed(y, -1)), -1)
 
 
 @rule(aten.dot.default)
-def _dot(x: Any, y: Any) -> AffineForm:
+def _dot(x: Any, y: Any) -> TaylorForm:
     """Σ_i x_i y_i."""
     return _sum(_multiply(x, y))
 
 
 @rule(aten._to_copy.default)
-def _to_copy(x: AffineForm, dtype: Any = None, **keywords: Any) -> AffineForm:
+def _to_copy(x: TaylorForm, dtype: Any = None, **keywords: Any) -> TaylorForm:
     """x: truths as numbers, in float64."""
     if dtype not in (None, torch.float64):
         raise UsageError(f"Expected float64 throughout, got {dtype} in between; leave the dtype to follow the input.")
@@ -282,7 +282,7 @@ def _to_copy(x: AffineForm, dtype: Any = None, **keywords: Any) -> AffineForm:
 
 
 @rule(aten.addmm.default)
-def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> AffineForm:
+def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> TaylorForm:
     """β · offset + α · xy."""
     product = _matrix_product(x, y)
     product = product if alpha == 1 else _multiply(product, alpha)
@@ -290,19 +290,19 @@ def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: flo
 
 
 @rule(aten.neg.default)
-def _negate(x: AffineForm) -> AffineForm:
+def _negate(x: TaylorForm) -> TaylorForm:
     """−x."""
-    return affine.negate(x)
+    return taylor.negate(x)
 
 
 @rule(aten.sum.default, aten.sum.dim_IntList)
-def _sum(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
+def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
     """Σ x over some axes; remainders add."""
     return _rearranged(lambda y: y.sum(dim or None, keepdim), x.rounded(x.shape.numel()))
 
 
 @rule(aten.mean.default, aten.mean.dim)
-def _mean(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> AffineForm:
+def _mean(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
     """Σ x over some axes, divided by their length."""
     total = _sum(x, dim, keepdim)
     return _multiply(total, total.shape.numel() / x.shape.numel())
@@ -310,70 +310,70 @@ def _mean(x: AffineForm, dim: Sequence[int] | None = None, keepdim: bool = False
 
 # Functions of one number
 
-rule(aten.exp.default)(affine.exp)
-rule(aten.log.default)(affine.log)
-rule(aten.log1p.default)(affine.log1p)
-rule(aten.sqrt.default)(affine.sqrt)
-rule(aten.reciprocal.default)(affine.reciprocal)
-rule(aten.sigmoid.default)(affine.sigmoid)
-rule(aten.sin.default)(affine.sin)
-rule(aten.cos.default)(affine.cos)
-rule(aten.tan.default)(affine.tan)
+rule(aten.exp.default)(taylor.exp)
+rule(aten.log.default)(taylor.log)
+rule(aten.log1p.default)(taylor.log1p)
+rule(aten.sqrt.default)(taylor.sqrt)
+rule(aten.reciprocal.default)(taylor.reciprocal)
+rule(aten.sigmoid.default)(taylor.sigmoid)
+rule(aten.sin.default)(taylor.sin)
+rule(aten.cos.default)(taylor.cos)
+rule(aten.tan.default)(taylor.tan)
 
 
 @rule(aten.rsqrt.default)
-def _rsqrt(x: AffineForm) -> AffineForm:
+def _rsqrt(x: TaylorForm) -> TaylorForm:
     """1/√x."""
-    return affine.reciprocal(affine.sqrt(x))
+    return taylor.reciprocal(taylor.sqrt(x))
 
 
 @rule(aten.tanh.default)
-def _tanh(x: AffineForm) -> AffineForm:
+def _tanh(x: TaylorForm) -> TaylorForm:
     """tanh x = 2σ(2x) − 1; with powers of two no rounding is added."""
     double = x.with_parts(2 * x.terms, 2 * x.radius)
-    return _subtract(_multiply(affine.sigmoid(double), 2.0), 1.0)
+    return _subtract(_multiply(taylor.sigmoid(double), 2.0), 1.0)
 
 
 @rule(aten.softplus.default)
-def _softplus(x: AffineForm, beta: float = 1, threshold: float = 20) -> AffineForm:
+def _softplus(x: TaylorForm, beta: float = 1, threshold: float = 20) -> TaylorForm:
     """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is lower by at most e^{−threshold}/β."""
-    smooth = _divide(affine.softplus(_multiply(x, beta) if beta != 1 else x), beta)
+    smooth = _divide(taylor.softplus(_multiply(x, beta) if beta != 1 else x), beta)
     return _loosened_above(smooth, x, beta, threshold, 1 / beta)
 
 
 @rule(aten.softplus_backward.default)
-def _softplus_backward(gradient: Any, x: AffineForm, beta: float, threshold: float) -> AffineForm:
+def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: float) -> TaylorForm:
     """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
-    slope = affine.sigmoid(_multiply(x, beta) if beta != 1 else x)
+    slope = taylor.sigmoid(_multiply(x, beta) if beta != 1 else x)
     return _multiply(gradient, _loosened_above(slope, x, beta, threshold, 1.0))
 
 
 @rule(aten.silu.default)
-def _silu(x: AffineForm) -> AffineForm:
+def _silu(x: TaylorForm) -> TaylorForm:
     """x σ(x)."""
-    return affine.multiply(x, affine.sigmoid(x))
+    return taylor.multiply(x, taylor.sigmoid(x))
 
 
 @rule(aten.silu_backward.default)
-def _silu_backward(gradient: Any, x: AffineForm) -> AffineForm:
+def _silu_backward(gradient: Any, x: TaylorForm) -> TaylorForm:
     """gradient · σ(1 + x(1 − σ))."""
-    s = affine.sigmoid(x)
+    s = taylor.sigmoid(x)
     return _multiply(gradient, _multiply(s, _add(_multiply(x, _subtract(1.0, s)), 1.0)))
 
 
 @rule(aten.sigmoid_backward.default)
-def _sigmoid_backward(gradient: Any, s: AffineForm) -> AffineForm:
+def _sigmoid_backward(gradient: Any, s: TaylorForm) -> TaylorForm:
     """gradient · s(1 − s)."""
-    return _multiply(gradient, _subtract(s, affine.square(s)))
+    return _multiply(gradient, _subtract(s, taylor.square(s)))
 
 
 @rule(aten.tanh_backward.default)
-def _tanh_backward(gradient: Any, y: AffineForm) -> AffineForm:
+def _tanh_backward(gradient: Any, y: TaylorForm) -> TaylorForm:
     """gradient · (1 − y²)."""
-    return _multiply(gradient, _subtract(1.0, affine.square(y)))
+    return _multiply(gradient, _subtract(1.0, taylor.square(y)))
 
 
-def _loosened_above(y: AffineForm, x: AffineForm, beta: float, threshold: float, factor: float) -> AffineForm:
+def _loosened_above(y: TaylorForm, x: TaylorForm, beta: float, threshold: float, factor: float) -> TaylorForm:
     above = x.interval()[1] * beta > threshold
     return y.with_parts(y.terms, y.radius + above * (factor * torch.exp(torch.tensor(-threshold, dtype=torch.float64))))
 
@@ -388,13 +388,13 @@ def _arranging(function: Callable[..., Any]) -> Rule:
 
 def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
     """The operator on c and on each A_k of its arguments, in one call, and on their r."""
-    leaves, structure = tree_flatten((arguments, keywords), is_leaf=lambda leaf: isinstance(leaf, AffineForm))
-    forms = [leaf for leaf in leaves if isinstance(leaf, AffineForm)]
+    leaves, structure = tree_flatten((arguments, keywords), is_leaf=lambda leaf: isinstance(leaf, TaylorForm))
+    forms = [leaf for leaf in leaves if isinstance(leaf, TaylorForm)]
 
     def call(*tensors: Tensor) -> Any:
         filled = iter(tensors)
         arguments, keywords = tree_unflatten(
-            [next(filled) if isinstance(leaf, AffineForm) else leaf for leaf in leaves], structure
+            [next(filled) if isinstance(leaf, TaylorForm) else leaf for leaf in leaves], structure
         )
         return function(*arguments, **keywords)
 
@@ -408,9 +408,9 @@ def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) 
 def _joining(function: Callable[..., Any]) -> Rule:
     """As _arranging, of a list in which constants stand beside forms."""
 
-    def join(items: Sequence[Any], dim: int = 0) -> AffineForm:
-        like = next(item for item in items if isinstance(item, AffineForm))
-        forms = [item if isinstance(item, AffineForm) else affine.constant_form(item, like) for item in items]
+    def join(items: Sequence[Any], dim: int = 0) -> TaylorForm:
+        like = next(item for item in items if isinstance(item, TaylorForm))
+        forms = [item if isinstance(item, TaylorForm) else taylor.constant_form(item, like) for item in items]
         return _rearranged(function, forms, dim)
 
     return join
@@ -435,12 +435,12 @@ ARRANGEMENTS: dict[Any, Rule] = {
 
 
 @rule(aten.index_add.default)
-def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> AffineForm:
+def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
     """x with source_i added to its entry index_i: a sum of two arrangements."""
-    like = x if isinstance(x, AffineForm) else source
-    x, source = (y if isinstance(y, AffineForm) else affine.constant_form(y, like) for y in (x, source))
+    like = x if isinstance(x, TaylorForm) else source
+    x, source = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, source))
     moved = _rearranged(lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.rounded(len(index)))
-    return affine.add(x, moved)
+    return taylor.add(x, moved)
 
 
 def _of_shape(operation: Any) -> Rule:
@@ -455,16 +455,16 @@ for _operation in (
     rule(_operation)(_of_shape(_operation))
 
 
-def _rows(form: AffineForm, rows: int | slice) -> AffineForm:
+def _rows(form: TaylorForm, rows: int | slice) -> TaylorForm:
     return form.with_parts(form.terms[:, :, rows], form.radius[:, rows])
 
 
-def _transposed(x: AffineForm) -> AffineForm:
+def _transposed(x: TaylorForm) -> TaylorForm:
     return x.with_parts(x.terms.mT, x.radius.mT)
 
 
 def _unsqueezed(x: Any, axis: int) -> Any:
-    return ARRANGEMENTS[aten.unsqueeze.default](x, axis) if isinstance(x, AffineForm) else x.unsqueeze(axis)
+    return ARRANGEMENTS[aten.unsqueeze.default](x, axis) if isinstance(x, TaylorForm) else x.unsqueeze(axis)
 
 
 def _tensor(number: Any) -> Tensor:

@@ -1,7 +1,7 @@
 """Inequalities proved on boxes by bisection: where W = V − δt is low, and least values over boxes.
 
 Every box of (t, x) is (1 + n,) long, time first. What is proved is proved by bounds that are sound up to what
-lyapnet.certification.affine says of rounding; plain evaluations serve to find counterexamples and to guess well.
+lyapnet.certification.taylor says of rounding; plain evaluations serve to find counterexamples and to guess well.
 """
 
 import io
@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 
 from lyapnet.atomic import write_atomically
-from lyapnet.certification.affine import AffineForm, wide_axes
 from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
 from lyapnet.certification.statistical import Verdict
+from lyapnet.certification.taylor import TaylorForm, wide_axes
 from lyapnet.errors import UsageError
 
 
@@ -270,7 +270,7 @@ def _undecided(bounded: BoundedFunction, chunk: Boxes, level: float) -> tuple[Bo
 PROBES = 12  # boxes of a chunk that are cut along every axis
 
 
-def axis_to_cut(bounded: BoundedFunction, form: AffineForm, boxes: Boxes, chosen: Tensor) -> Tensor:
+def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor) -> Tensor:
     """For each chosen box, the axis along which a cut lowers the excess of its first result most.
 
     A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, what the

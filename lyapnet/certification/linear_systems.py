@@ -5,14 +5,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.certification import affine
-from lyapnet.certification.affine import AffineForm
+from lyapnet.certification import taylor
+from lyapnet.certification.taylor import TaylorForm
 from lyapnet.errors import UsageError
 
 aten = torch.ops.aten
 
 
-def solve(A: AffineForm, B: AffineForm) -> AffineForm:
+def solve(A: TaylorForm, B: TaylorForm) -> TaylorForm:
     """A⁻¹B for A of shape (n, n) and B of shape (n, k).
 
     With K close to the inverse of A in the middle of the box, KA stays close to the identity, and KA y = KB is solved
@@ -23,21 +23,21 @@ def solve(A: AffineForm, B: AffineForm) -> AffineForm:
     system = _from_left(K, A.with_parts(torch.cat([A.terms, B.terms], -1), torch.cat([A.radius, B.radius], -1)))
     rows = [system.with_parts(system.terms[..., i, :], system.radius[..., i, :]) for i in range(A.shape[0])]
     for i in range(len(rows)):
-        rows[i] = affine.multiply(rows[i], affine.reciprocal(_columns(rows[i], slice(i, i + 1))))
+        rows[i] = taylor.multiply(rows[i], taylor.reciprocal(_columns(rows[i], slice(i, i + 1))))
         for j in (j for j in range(len(rows)) if j != i):
-            eliminated = affine.multiply(_columns(rows[j], slice(i, i + 1)), affine.negate(rows[i]))
-            rows[j] = affine.add(rows[j], eliminated)
+            eliminated = taylor.multiply(_columns(rows[j], slice(i, i + 1)), taylor.negate(rows[i]))
+            rows[j] = taylor.add(rows[j], eliminated)
     solution = [_columns(row, slice(len(rows), None)) for row in rows]
     return A.with_parts(torch.stack([y.terms for y in solution], -2), torch.stack([y.radius for y in solution], -2))
 
 
-def _from_left(K: Tensor, x: AffineForm) -> AffineForm:
+def _from_left(K: Tensor, x: TaylorForm) -> TaylorForm:
     """K x with a matrix K for each box, (boxes, n, n)."""
-    x = x.rounded(2 * K.shape[-1])  # as in affine.matrix_product
+    x = x.rounded(2 * K.shape[-1])  # as in taylor.matrix_product
     return x.with_parts(K @ x.terms, K.abs() @ x.radius)
 
 
-def _columns(x: AffineForm, columns: slice) -> AffineForm:
+def _columns(x: TaylorForm, columns: slice) -> TaylorForm:
     return x.with_parts(x.terms[..., columns], x.radius[..., columns])
 
 
@@ -54,15 +54,15 @@ def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) ->
     return [solution, None, None, NO_ERROR]
 
 
-def inverse_rule(A: AffineForm, check_errors: bool = False) -> list[Any]:
+def inverse_rule(A: TaylorForm, check_errors: bool = False) -> list[Any]:
     """A⁻¹."""
-    identity = affine.constant_form(torch.eye(A.shape[0]).to(A.radius), A)
+    identity = taylor.constant_form(torch.eye(A.shape[0]).to(A.radius), A)
     return [solve(A, identity), NO_ERROR]
 
 
-def _forms(A: Any, B: Any) -> tuple[AffineForm, AffineForm]:
-    like = A if isinstance(A, AffineForm) else B
-    A, B = (value if isinstance(value, AffineForm) else affine.constant_form(value, like) for value in (A, B))
+def _forms(A: Any, B: Any) -> tuple[TaylorForm, TaylorForm]:
+    like = A if isinstance(A, TaylorForm) else B
+    A, B = (value if isinstance(value, TaylorForm) else taylor.constant_form(value, like) for value in (A, B))
     return A, B
 
 

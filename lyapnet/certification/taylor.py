@@ -1,13 +1,14 @@
-"""Affine arithmetic on batches of boxes: sets of values as first-order forms with a rigorous remainder.
+"""Arithmetic of Taylor forms on batches of boxes: sets of values as polynomials with a rigorous remainder.
 
 Rounding. Forms enclose the values of real arithmetic on the given float64 numbers. Every operation here adds to its
 remainder a bound of its own rounding errors: a multiple of ε = 2⁻⁵² times the magnitudes that entered it, at least
 twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. Two things are taken on
-trust: that torch's elementary functions err by at most 8 ε (the largest that tests have seen, on a CPU, is 1.2 ε),
-and that nothing underflows by more than TINY.
+trust: that torch's elementary functions err by at most 8 ε (1.2 ε is the most that was seen, against mpmath), and that
+nothing underflows by more than TINY.
 
-Source: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004; the remainder
-here is one number for each entry, instead of a new noise symbol for each operation.
+Sources: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004, for the first
+degree; Neumaier, "Taylor forms: use and limits", Reliable Computing 2003, for higher ones. The remainder here is one
+number for each entry, instead of a new noise symbol for each operation.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
-class AffineForm:
+class TaylorForm:
     """The set {c + Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k + η : |ε_k| ≤ 1, |η| ≤ r} for each box and entry.
 
     ε_1 … ε_d run over the box and are shared by all its forms; η is anything, another one in each form and entry. A
@@ -107,15 +108,15 @@ class AffineForm:
         lower, upper = self.interval()
         return (upper - lower) / 2 - _absolute_sum(self.coefficients)
 
-    def rounded(self, operations: int = 1) -> "AffineForm":
+    def rounded(self, operations: int = 1) -> "TaylorForm":
         """The form with room for so many rounded operations on each of its entries, in sequence or in one sum."""
         return self.with_parts(self.terms, self.radius + (2 * operations * EPSILON) * self.magnitude + TINY)
 
-    def with_parts(self, terms: Tensor, radius: Tensor) -> "AffineForm":
+    def with_parts(self, terms: Tensor, radius: Tensor) -> "TaylorForm":
         """Another form of the same box."""
-        return AffineForm(terms, radius, self.dimension)
+        return TaylorForm(terms, radius, self.dimension)
 
-    def as_rank(self, rank: int) -> "AffineForm":
+    def as_rank(self, rank: int) -> "TaylorForm":
         """The same value with leading axes of length 1, as broadcasting reads it."""
         ones = (1,) * (rank - len(self.shape))
         boxes = self.radius.shape[:1]
@@ -123,7 +124,7 @@ class AffineForm:
         return self.with_parts(terms, self.radius.reshape(*boxes, *ones, *self.shape))
 
 
-def box_form(lower: Tensor, upper: Tensor, degree: int = 1) -> AffineForm:
+def box_form(lower: Tensor, upper: Tensor, degree: int = 1) -> TaylorForm:
     """The boxes {lower ≤ y ≤ upper} themselves, one number an axis: y_k = middle_k + ½ width_k · ε_k.
 
     Args:
@@ -135,7 +136,7 @@ def box_form(lower: Tensor, upper: Tensor, degree: int = 1) -> AffineForm:
     d = len(wide)
     coefficients = (half.T[..., None] * torch.eye(lower.shape[-1], dtype=half.dtype)[:, None])[wide]
     products = center.new_zeros(d * (d + 1) // 2 if degree == 2 else 0, *center.shape)
-    return AffineForm(torch.cat([center[None], coefficients, products]), torch.zeros_like(center), d).rounded(2)
+    return TaylorForm(torch.cat([center[None], coefficients, products]), torch.zeros_like(center), d).rounded(2)
 
 
 def wide_axes(lower: Tensor, upper: Tensor) -> Tensor:
@@ -144,12 +145,12 @@ def wide_axes(lower: Tensor, upper: Tensor) -> Tensor:
     return wide if len(wide) else torch.zeros(1, dtype=torch.long)
 
 
-def interval_form(lower: Tensor, upper: Tensor) -> AffineForm:
+def interval_form(lower: Tensor, upper: Tensor) -> TaylorForm:
     """The boxes as intervals, which forget that they are functions of the same point: no ε, all remainder."""
-    return AffineForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).rounded(2)
+    return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).rounded(2)
 
 
-def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
+def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
     """A value that is the same everywhere, beside the forms of `like`."""
     boxes = len(like.radius)
     center = value.expand(boxes, *value.shape)
@@ -157,7 +158,7 @@ def constant_form(value: Tensor, like: AffineForm) -> AffineForm:
     return like.with_parts(torch.cat([center[None], coefficients]), torch.zeros_like(center))
 
 
-def aligned(*forms: AffineForm) -> list[AffineForm]:
+def aligned(*forms: TaylorForm) -> list[TaylorForm]:
     """The forms with as many axes each, as broadcasting reads them."""
     rank = max(len(form.shape) for form in forms)
     return [form.as_rank(rank) for form in forms]
@@ -166,13 +167,13 @@ def aligned(*forms: AffineForm) -> list[AffineForm]:
 # Affine operations
 
 
-def add(x: AffineForm, y: AffineForm) -> AffineForm:
+def add(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     """x + y: coefficients add, with their signs, and so do remainders."""
     x, y = aligned(x, y)
     return x.with_parts(x.terms + y.terms, x.radius + y.radius).rounded()
 
 
-def shift(x: AffineForm, offset: Tensor) -> AffineForm:
+def shift(x: TaylorForm, offset: Tensor) -> TaylorForm:
     """x + offset."""
     x = x.as_rank(max(len(x.shape), offset.ndim))
     center = x.center + offset
@@ -180,18 +181,18 @@ def shift(x: AffineForm, offset: Tensor) -> AffineForm:
     return x.with_parts(terms, x.radius.expand_as(center)).rounded()
 
 
-def scale(x: AffineForm, factor: Tensor) -> AffineForm:
+def scale(x: TaylorForm, factor: Tensor) -> TaylorForm:
     """factor · x, entry by entry; the remainder takes |factor|."""
     x = x.as_rank(max(len(x.shape), factor.ndim))
     return x.with_parts(x.terms * factor, x.radius * factor.abs()).rounded()
 
 
-def negate(x: AffineForm) -> AffineForm:
+def negate(x: TaylorForm) -> TaylorForm:
     """−x, exactly."""
     return x.with_parts(-x.terms, x.radius)
 
 
-def matrix_product(x: AffineForm, weight: Tensor) -> AffineForm:
+def matrix_product(x: TaylorForm, weight: Tensor) -> TaylorForm:
     """x @ W: c and A_k take W, the remainder |W|, since |Σ_i η_i W_ij| ≤ Σ_i r_i |W_ij|."""
     x = x.rounded(2 * len(weight))  # γ_k Σ_i |x_i||W_ij| bounds the error of each sum, of c, A and r alike
     return x.with_parts(x.terms @ weight, x.radius @ weight.abs())
@@ -200,7 +201,7 @@ def matrix_product(x: AffineForm, weight: Tensor) -> AffineForm:
 # Products
 
 
-def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
+def multiply(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     """x · y: with x = c + L + Q + η and y = c' + L' + Q' + η', L of first and Q of second degree in ε,
 
         xy = cc' + (cL' + c'L) + (cQ' + c'Q + LL') + (LQ' + QL' + QQ') + (c + L + Q)η' + (c' + L' + Q')η + ηη'.
@@ -228,7 +229,7 @@ def multiply(x: AffineForm, y: AffineForm) -> AffineForm:
     return x.with_parts(terms, around + remainder + rounding)
 
 
-def _interval_product(x: AffineForm, y: AffineForm) -> AffineForm:
+def _interval_product(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     (a, b), (c, d) = x.interval(), y.interval()
     ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, which stays: nothing is known
     low, high = ends.amin(0), ends.amax(0)
@@ -244,14 +245,14 @@ Range = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def linearised(
-    x: AffineForm,
+    x: TaylorForm,
     function: Callable[[Tensor], Tensor],
     derivative: Callable[[Tensor], Tensor],
     stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
     defined: Callable[[Tensor, Tensor], Tensor] | None = None,
     second: Callable[[Tensor], Tensor] | None = None,
     third: Range | None = None,
-) -> AffineForm:
+) -> TaylorForm:
     """f(x) = a x + b ± e, a being the secant's slope over the interval [l, u] of x; for second degree see _expanded.
 
     h(x) = f(x) − a x takes its extremes on [l, u] at l, at u, or where f'(x) = a: b is their middle, e half their
@@ -278,13 +279,13 @@ def linearised(
 
 
 def _secant(
-    x: AffineForm,
+    x: TaylorForm,
     lo: Tensor,
     hi: Tensor,
     function: Callable[[Tensor], Tensor],
     derivative: Callable[[Tensor], Tensor],
     stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
-) -> AffineForm:
+) -> TaylorForm:
     f_l, f_u = function(lo), function(hi)
     wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # else the secant's slope is a quotient of rounding errors
     a = torch.where(wide, (f_u - f_l) / torch.where(wide, hi - lo, 1.0), derivative((lo + hi) / 2))
@@ -300,14 +301,14 @@ def _secant(
 
 
 def _expanded(
-    x: AffineForm,
+    x: TaylorForm,
     lo: Tensor,
     hi: Tensor,
     function: Callable[[Tensor], Tensor],
     derivative: Callable[[Tensor], Tensor],
     second: Callable[[Tensor], Tensor],
     third: Range,
-) -> AffineForm:
+) -> TaylorForm:
     """f(x) by Taylor's formula in y = x − m about the middle m of [l, u], with M₋ ≤ f‴ ≤ M₊ there and |y| ≤ w:
 
         f(x) = f(m) + (f'(m) + M w²/8) y + ½ f''(m) y² ± (|M| w³/24 + (M₊ − M₋) w³/12),   M = ½ (M₋ + M₊),
@@ -327,14 +328,14 @@ def _expanded(
     return x.with_parts(torch.cat([(terms[0] + a)[None], terms[1:]]), radius + e).rounded(4)
 
 
-def square(x: AffineForm) -> AffineForm:
+def square(x: TaylorForm) -> TaylorForm:
     """x²; 2x = a."""
     if len(x.products):
         return multiply(x, x)
     return linearised(x, lambda v: v * v, lambda v: 2 * v, lambda a, lo, hi: [a / 2])
 
 
-def exp(x: AffineForm) -> AffineForm:
+def exp(x: TaylorForm) -> TaylorForm:
     """eˣ; eˣ = a."""
     return linearised(
         x, torch.exp, torch.exp, lambda a, lo, hi: [torch.log(a)],
@@ -342,7 +343,7 @@ def exp(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def log(x: AffineForm) -> AffineForm:
+def log(x: TaylorForm) -> TaylorForm:
     """log x for x > 0; 1/x = a."""
     return linearised(
         x, torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], lambda lo, hi: lo > 0,
@@ -350,7 +351,7 @@ def log(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def log1p(x: AffineForm) -> AffineForm:
+def log1p(x: TaylorForm) -> TaylorForm:
     """log(1 + x) for x > −1; 1/(1 + x) = a."""
     return linearised(
         x, torch.log1p, lambda v: 1 / (1 + v), lambda a, lo, hi: [1 / a - 1], lambda lo, hi: lo > -1,
@@ -358,7 +359,7 @@ def log1p(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def sqrt(x: AffineForm) -> AffineForm:
+def sqrt(x: TaylorForm) -> TaylorForm:
     """√x for x > 0; 1/(2√x) = a."""
     return linearised(
         x, torch.sqrt, lambda v: 0.5 / v.sqrt(), lambda a, lo, hi: [1 / (4 * a * a)], lambda lo, hi: lo > 0,
@@ -366,7 +367,7 @@ def sqrt(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def reciprocal(x: AffineForm) -> AffineForm:
+def reciprocal(x: TaylorForm) -> TaylorForm:
     """1/x for x of one sign; −1/x² = a."""
 
     def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
@@ -382,7 +383,7 @@ def reciprocal(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def sigmoid(x: AffineForm) -> AffineForm:
+def sigmoid(x: TaylorForm) -> TaylorForm:
     """σ(x) = 1/(1 + e⁻ˣ); σ(1 − σ) = a at x = ±(log s − log(1 − s)), s = 2a/(1 + √(1 − 4a))."""
 
     def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
@@ -401,7 +402,7 @@ def sigmoid(x: AffineForm) -> AffineForm:
     return linearised(x, torch.sigmoid, _sigmoid_derivative, stationary, None, _sigmoid_curvature, third)
 
 
-def softplus(x: AffineForm) -> AffineForm:
+def softplus(x: TaylorForm) -> TaylorForm:
     """log(1 + eˣ); σ(x) = a."""
 
     def third(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
@@ -416,7 +417,7 @@ def softplus(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def sin(x: AffineForm) -> AffineForm:
+def sin(x: TaylorForm) -> TaylorForm:
     """sin x on at most two periods; cos x = a at x = ±arccos a + 2πk."""
 
     def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
@@ -428,7 +429,7 @@ def sin(x: AffineForm) -> AffineForm:
     )  # fmt: skip
 
 
-def cos(x: AffineForm) -> AffineForm:
+def cos(x: TaylorForm) -> TaylorForm:
     """cos x on at most two periods; −sin x = a at x = −π/2 ± arccos a + 2πk."""
 
     def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
@@ -453,7 +454,7 @@ def _around(wave: Callable[[Tensor], Tensor], lo: Tensor, hi: Tensor) -> tuple[T
     return _between((middle - reach).clamp_min(-1), (middle + reach).clamp_max(1))
 
 
-def tan(x: AffineForm) -> AffineForm:
+def tan(x: TaylorForm) -> TaylorForm:
     """tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
 
     def branch(lo: Tensor, hi: Tensor) -> Tensor:

@@ -4,6 +4,7 @@ Every box of (t, x) is (1 + n,) long, time first. What is proved is proved by bo
 lyapnet.certification.taylor says of rounding; plain evaluations serve to find counterexamples and to guess well.
 """
 
+import hashlib
 import io
 import time
 from collections.abc import Callable, Iterable
@@ -211,7 +212,7 @@ class Search:
     def advance(
         self, condition: DecreaseCondition, bounded: BoundedFunction, budget: Budget, run: Callable[..., Any]
     ) -> None:
-        """Bound the boxes of lowest W, a chunk for each worker."""
+        """Bound the boxes of lowest W, a chunk for each worker; the level they read can only fall meanwhile."""
         lowest, rest = self.frontier.first(budget.chunk * budget.workers)
         self.boxes += len(lowest.key)
         chunks = [lowest[part] for part in torch.arange(len(lowest.key)).split(budget.chunk)]
@@ -236,7 +237,9 @@ class Search:
 
 
 def _identity(fingerprint: str, lower: Tensor, upper: Tensor, wanted: float) -> list[Any]:
-    return [fingerprint, lower.tolist(), upper.tolist(), wanted]
+    """What a kept proof is about, and the rules that it was made by: others might not have dropped what it dropped."""
+    rules = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
+    return [fingerprint, rules.hexdigest(), lower.tolist(), upper.tolist(), wanted]
 
 
 def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Tensor, wanted: float) -> Search | None:
@@ -253,7 +256,7 @@ def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Ten
         raise UsageError(f"Expected a proof in {str(path)!r}, got another or a broken file; remove it.") from error
     if not same:
         raise UsageError(
-            f"Expected the proof of this V, α, δ and set in {str(path)!r}, got that of another; give each its own file."
+            f"Expected the proof of this V, α, δ and set by this version in {str(path)!r}, got another; give it a new file."
         )
     return search
 

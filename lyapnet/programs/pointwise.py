@@ -25,7 +25,7 @@ class PointwiseCondition:
 
     The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
     half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
-    ever denser towards T, where V moves fastest; half are drawn together towards the goal, by a factor that is uniform.
+    ever denser towards T, where V moves fastest; another half is drawn towards the goal, by a factor that is uniform.
 
     Args:
         closed_loop: with the law of V.

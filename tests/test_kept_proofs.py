@@ -70,7 +70,7 @@ OTHERS = {  # proofs of something else
 @pytest.mark.parametrize("other", OTHERS)
 def test_the_proof_of_something_else_is_refused(other, P, kept):
     before = kept.read_bytes()
-    with pytest.raises(UsageError, match=r"got another; give it a new file\.$"):
+    with pytest.raises(UsageError, match=r"got another; take a new file\.$"):
         OTHERS[other](P, kept)
     assert kept.read_bytes() == before
     assert go_on(dipped(P), kept).verdict == "certified"

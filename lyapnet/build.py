@@ -267,7 +267,10 @@ def _points_of(path: Path, n: int) -> Tensor:
     """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            rows = [[float(entry) for entry in row] for row in list(csv.reader(file))[1:]]
+            heading, *lines = csv.reader(file)
+        if heading[:1] != ["t"]:
+            raise ValueError("no heading t, …")
+        rows = [[float(entry) for entry in row] for row in lines]
         points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
         if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
             raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")

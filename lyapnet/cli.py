@@ -223,7 +223,7 @@ def certify(
         raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
-    require_writable(figure, report)
+    require_writable(figure, report, keep)
     notes = Console(stderr=True, highlight=False)
 
     def certified(path: Path) -> certificates.Certificate:

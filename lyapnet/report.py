@@ -25,12 +25,16 @@ from lyapnet.tables import certificate_rows, floored
 NAMES = {"sampled": "states.png", "statistical": "states.png", "sound": "funnel.png"}  # of each kind's figure
 
 
-def require_writable(figure: Path | None, folder: Path | None) -> None:
+def require_writable(figure: Path | None, folder: Path | None, keep: str | None = None) -> None:
     """Refuse what could not be written after the work; make the report's folder.
 
     Raises:
-        UsageError: no folder for the figure, a format that cannot be drawn, or no folder for the report.
+        UsageError: no folder for the figure or the kept proof, a format that cannot be drawn, or no report folder.
     """
+    if keep is not None and not Path(keep).parent.is_dir():
+        raise UsageError(
+            f"Expected --keep in a folder that exists, got {keep!r}; make {str(Path(keep).parent)!r} first."
+        )
     if figure is not None:
         formats = Figure().canvas.get_supported_filetypes()
         if figure.suffix.removeprefix(".") not in formats:

@@ -89,6 +89,7 @@ def test_tables(checkpoint, capsys):
             "Expected --radius with --kind sampled or statistical, got --kind sound",
         ),
         (["--figure", "nowhere/claim.png"], "make 'nowhere' first"),
+        (["--kind", "sound", "--keep", "nowhere/kept"], "make 'nowhere' first"),
         (["--figure", "claim.xyz"], "got 'claim.xyz'; for example claim.png"),
         (["--report", "conf/reacher.yaml"], "Expected --report as a folder, got 'conf/reacher.yaml'"),
     ],

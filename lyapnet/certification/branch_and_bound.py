@@ -256,7 +256,7 @@ def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Ten
         raise UsageError(f"Expected a proof in {str(path)!r}, got another or a broken file; remove it.") from error
     if not same:
         raise UsageError(
-            f"Expected the proof of this V, α, δ and set by this version in {str(path)!r}, got another; take a new file."
+            f"Expected the proof of this V, α, δ, set and version in {str(path)!r}, got another; take a new file."
         )
     return search
 

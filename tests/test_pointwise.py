@@ -235,8 +235,10 @@ def test_counterexamples_are_read_to_the_last_digit(tmp_path):
         [["t", "x", "v"], [0.1, 0.2, "far"]],
         [["t", "x", "v"], [0.1, 0.2, "nan"]],
         [["t", "x", "v"], [0.1, 0.2, 0.3], [0.1]],
+        [[0.1, 0.2, 0.3], [0.1, 0.2, 0.3]],
+        [],
     ],
-    ids=["two columns", "words", "nan", "ragged"],
+    ids=["two columns", "words", "nan", "ragged", "no heading", "empty"],
 )
 def test_a_broken_file_of_counterexamples_is_refused(rows, tmp_path):
     path = tmp_path / "points.csv"

@@ -130,7 +130,8 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
         fontsize=7,
         frameon=False,
     )
-    share = f"{floored(claim.volume_share)} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
+    amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
+    share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
     figure.suptitle(f"{claim.verdict}: {share}, α = {claim.alpha:g}, δ = {claim.delta:.3g}", fontsize=9)
     return figure
 

@@ -173,7 +173,7 @@ def _sound(
         "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
         "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
         "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
-        "terminal_excess": claim.terminal_excess,
+        "terminal_excess": claim.terminal_excess if claim.volume_share else None, "reason": claim.reason,
         "guaranteed_cost_ratio": _guaranteed_cost_ratio(controller, claim), "boxes": claim.boxes,
         "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
         "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),

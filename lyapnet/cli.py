@@ -356,7 +356,8 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any]) -> None:
         ("run", plan.run.folder),
         ("watch", f"tensorboard --logdir {plan.config.logs}"),
         ("measure", f"lyapnet evaluate {best}"),
+        ("certify", f"lyapnet certify {best}"),
         ("fine-tune", f"{plan.command} --finetune {best}"),
         ("use", f'lyapnet.load("{best}")'),
     ):
-        console.print(f"{what:<10}{command}", soft_wrap=True)
+        console.print(f"{what:<10}{command}", soft_wrap=True, markup=False)

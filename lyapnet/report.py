@@ -144,7 +144,7 @@ def _sound_in_words(result: dict[str, Any]) -> str:
     if result["rho"] is None:
         return "No level ρ was proved: nothing is claimed. The conditions below were sought."
     return (
-        f"{{V(0, ·) ≤ ρ}} with ρ = {result['rho']:.6g} is the mouth of a funnel, proved in continuous time for this "
+        f"{{V(0, ·) ≤ ρ}} with ρ = {result['rho']!r} is the mouth of a funnel, proved in continuous time for this "
         f"model: no closed loop that starts in it leaves the funnel, or D, up to T = {result['duration']:g} s, and its "
         f"cost is bounded as below. It holds at least {floored(result['volume_share'])} of X₀ by volume."
     )
@@ -168,9 +168,10 @@ def in_formulas(result: dict[str, Any]) -> list[str]:
 
 
 def _sound_in_formulas(result: dict[str, Any]) -> list[str]:
-    alpha, delta, T = (f"{result[key]:.6g}" for key in ("alpha", "delta", "duration"))
-    rho = "ρ" if result["rho"] is None else f"{result['rho']:.6g}"
-    kappa = "κ" if result["terminal_excess"] is None else f"{result['terminal_excess']:.6g}"
+    # unrounded, as proved
+    alpha, delta, T = (f"{result[key]!r}".removesuffix(".0") for key in ("alpha", "delta", "duration"))
+    rho = "ρ" if result["rho"] is None else repr(result["rho"])
+    kappa = "κ" if result["terminal_excess"] is None else repr(result["terminal_excess"])
     return [
         f"V_t + V_xᵀ(f + g u) + {alpha} ℓ(x, u) ≤ {delta}  "
         f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t",
@@ -230,7 +231,7 @@ def markdown(report: dict[str, Any]) -> str:
         f"**{report['verdict'].capitalize()}.** {claim['verdict']}",
         f"![The claim, drawn]({report['figure']})",
         "## Numbers",
-        "Rounded, bounds downwards; in full in [report.json](report.json).",
+        "Rounded to nearest, shares downwards; in full in [report.json](report.json).",
         _table(("", ""), certificate_rows(result)),
         "## States",
         _table(*_boxes(report)),
@@ -249,7 +250,7 @@ def _boxes(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     if D is not None and len(D[0]) == len(report["states"]):
         boxes["D"] = D
     rows = [
-        [label, *(f"[{lower[i]:.6g}, {upper[i]:.6g}]" for lower, upper in boxes.values())]
+        [label, *(f"[{lower[i]!r}, {upper[i]!r}]" for lower, upper in boxes.values())]
         for i, label in enumerate(report["states"])
     ]
     return ["state", *boxes], rows

@@ -136,6 +136,7 @@ CERTIFICATE_ROWS = {
     "probability_lower_bound": "all that is asked for on at least",
     "required_share": "share of X₀ that the verdict is about",
     "failure": "a state that fails",
+    "reason": "why",
     "alpha": "α",
     "delta": "δ, cost per second",
     "set": "D",
@@ -183,8 +184,12 @@ def certificate_rows(result: dict[str, Any]) -> list[tuple[str, str]]:
 def _certified(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_certified('', entry)}" for name, entry in value.items() if entry is not None)
+    if isinstance(value, str):
+        return value
     if key == "states_left_out":
         return ", ".join(value)
+    if isinstance(value, int):
+        return f"{value:,}"
     if isinstance(value, list):
         return f"[{', '.join(_certified('', entry) for entry in value)}]"
     if key == "confidence":

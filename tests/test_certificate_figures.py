@@ -26,7 +26,7 @@ def claim(rho, dimension=2, wanted=2.0, found=None):
     share = 0.5 if rho > 0 else 0.0
     undecided = torch.empty(0, 1 + dimension)
     D = cube(2.0, dimension)
-    return SoundClaim(0.9, 0.01, 4.0, D, rho, wanted, share, 0.0, found, 10, 1.0, 0.0, undecided, [])
+    return SoundClaim(0.9, 0.01, 4.0, D, rho, wanted, wanted, share, 0.0, found, 10, 1.0, 0.0, undecided, [])
 
 
 def draw(figure):

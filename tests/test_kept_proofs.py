@@ -106,9 +106,7 @@ def broken(path):
 @pytest.mark.parametrize("kind", ["empty", "truncated", "words", "of something", "with code"])
 def test_a_broken_file_is_refused(kind, P, kept):
     kept.write_bytes(broken(kept)[kind])
-    with pytest.raises(
-        UsageError, match=r"^Expected a proof in .*proof.pt', got another or a broken file; remove it\.$"
-    ):
+    with pytest.raises(UsageError, match=r"^Expected a proof in .*proof.pt', got another file; name a new one\.$"):
         go_on(dipped(P), kept)
 
 

@@ -66,7 +66,7 @@ def claimed(checkpoint, rho=-float("inf"), undecided=((0.01, 0.2, -0.3), (0.02, 
     controller = lyapnet.load(checkpoint)
     D, centers = Box([-1.6, -2.6], [1.6, 2.6]), torch.tensor(undecided).reshape(-1, 3)
     duration = controller.horizon.duration
-    claim = SoundClaim(ALPHA, DELTA, duration, D, rho, level, 0.0, 0.0, None, 9, 1.0, 0.5, centers, [])
+    claim = SoundClaim(ALPHA, DELTA, duration, D, rho, level, level, 0.0, 0.0, None, 9, 1.0, 0.5, centers, [])
     return Certificate(controller, "sound", {}, claim, {})
 
 

@@ -253,7 +253,7 @@ def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Ten
         frontier = Boxes(*content.pop("frontier"))
         search = Search(frontier=frontier, worst=None if found is None else Counterexample(**found), **content)
     except Exception as error:
-        raise UsageError(f"Expected a proof in {str(path)!r}, got another or a broken file; remove it.") from error
+        raise UsageError(f"Expected a proof in {str(path)!r}, got another file; name a new one.") from error
     if not same:
         raise UsageError(
             f"Expected the proof of this V, α, δ, set and version in {str(path)!r}, got another; take a new file."

@@ -1,8 +1,9 @@
 """The sound claim: a funnel that closed loops do not leave, and the cost that it guarantees."""
 
 import copy
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -26,6 +27,8 @@ from lyapnet.closed_loop import ClosedLoop
 from lyapnet.errors import UsageError
 from lyapnet.sets import Box
 from lyapnet.types import PerState, Value
+
+LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class SoundClaim:
     states: Box  # D
     rho: float  # the largest level proved; −∞ where there is none
     wanted: float  # max V(0, ·) on X₀, or up to 0.1 % more: the ρ that does for all of it
+    least: float  # the largest V(0, ·) that was seen on X₀: no lower ρ does
     volume_share: float  # of X₀ with V(0, ·) ≤ ρ; a lower bound
     terminal_excess: float  # κ; an upper bound
     counterexample: Counterexample | None
@@ -69,7 +73,18 @@ class SoundClaim:
         if self.rho >= self.wanted:
             return "certified"
         found = self.counterexample
-        return "falsified" if found is not None and found.height <= self.wanted else "unknown"
+        return "falsified" if found is not None and found.height <= self.least else "unknown"
+
+    @property
+    def reason(self) -> str | None:
+        """Why the verdict is unknown, and what may help."""
+        if self.verdict != "unknown":
+            return None
+        if self.remaining_volume > 0:
+            return "seconds spent: allow more, or go on with a kept proof"
+        if self.counterexample is not None:
+            return "the condition fails close to what X₀ needs"
+        return "the funnel meets the boundary of D: choose a larger set"
 
     def guaranteed_cost(self, value: PerState) -> PerState:
         """The bound of J(x₀) from V(0, x₀), (*batch,); infinite outside the funnel."""
@@ -100,20 +115,23 @@ def sound_claim(
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
     """
-    budget = budget or Budget()
+    started, budget = time.monotonic(), budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
     left_out = unseen_states(condition.closed_loop)
     initial_states = _without(initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     _require_continuous(condition.V, x_low, x_high)
-    wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), budget)
+    levels = Budget(LEVELS, chunk=budget.chunk)  # of its own: what is proved must not depend on how long it may take
+    wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
     if states is None:
         states = enclosing_box(condition.height, initial_states, duration, wanted)
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
     needed = _just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
-    rim = minimum(condition.height, *faces(*domain, axes), budget, enough=_just_above(needed))
+    rim = minimum(condition.height, *faces(*domain, axes), levels, enough=_just_above(needed))
+    set_up = time.monotonic() - started
+    budget = replace(budget, started=time.monotonic())
     proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator, report, keep)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
@@ -127,8 +145,8 @@ def sound_claim(
         inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
-        alpha, delta, duration, states, rho, wanted, inside, excess,
-        found, proof.boxes, proof.seconds, proof.remaining_volume, proof.undecided, left_out,
+        alpha, delta, duration, states, rho, wanted, _largest_seen(condition.V, initial_states), inside, excess,
+        found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
     )  # fmt: skip
 
 
@@ -154,6 +172,18 @@ def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) 
         reach = torch.where(below.any(0)[..., None], points.abs(), 0.0).amax((0, 1)).clamp_min(1e-6 * float(largest))
     reach = 1.15 * torch.maximum(reach, inner)
     return Box(-reach, reach)
+
+
+def _largest_seen(V: Value, initial_states: Box) -> float:
+    """The largest V(0, ·) among the corners of X₀ and 10 000 of its states."""
+    free = torch.nonzero(initial_states.widths > 0).flatten()[:12]  # as many corners as 4096
+    corners = initial_states.center.repeat(2 ** len(free), 1)
+    for k, i in enumerate(free):
+        upper = torch.arange(len(corners)).bitwise_right_shift(k) % 2 == 1
+        corners[:, i] = torch.where(upper, initial_states.upper[i], initial_states.lower[i])
+    states = torch.cat([corners, initial_states.sample(10_000, torch.Generator().manual_seed(0))])
+    with torch.no_grad():
+        return float(V(states.new_zeros(len(states)), states).max())
 
 
 def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:

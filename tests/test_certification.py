@@ -1,6 +1,7 @@
 """Sound claims against known truths: Riccati solutions, planted violations, dense grids and accurate rollouts."""
 
 import math
+from dataclasses import replace
 from functools import cache, partial
 
 import pytest
@@ -11,6 +12,7 @@ from torch import nn
 from lyapnet.certification import (
     BoundedFunction,
     Budget,
+    Counterexample,
     DecreaseCondition,
     branch_and_bound,
     enclosing_box,
@@ -276,3 +278,26 @@ def test_the_enclosing_box_reaches_around_the_level_set(P):
     extent = (10.0 * torch.linalg.inv(torch.as_tensor(P)).diagonal()).sqrt()
     assert (box.upper > extent).all()
     assert (box.upper < 1.3 * torch.maximum(extent, X0().upper)).all()
+
+
+def test_a_tiny_budget_proves_nothing_and_falsifies_nothing(P):
+    claim = certify(loop(P), budget=Budget(1e-6))
+    assert claim.verdict == "unknown"
+    assert claim.reason.startswith("seconds spent")
+    assert claim.wanted == riccati_claim().wanted
+    assert claim.states.upper.tolist() == riccati_claim().states.upper.tolist()
+
+
+def test_what_fails_above_the_least_level_that_X0_needs_falsifies_nothing():
+    claim = riccati_claim()
+    assert claim.least <= claim.wanted <= 1.002 * claim.least
+    between = Counterexample(1.0, [1.0, 1.0], 0.1, (claim.least + claim.wanted) / 2)
+    undecided = replace(claim, rho=0.0, counterexample=between)
+    assert undecided.verdict == "unknown"
+    assert "close to" in undecided.reason
+    assert replace(undecided, counterexample=between._replace(height=claim.least)).verdict == "falsified"
+
+
+def test_a_set_that_cuts_the_funnel_is_named(P):
+    small = Box(torch.tensor([-1.1, -0.8]), torch.tensor([1.1, 0.8]))
+    assert "boundary of D" in certify(loop(P), states=small).reason

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from test_certification import Planted
 from torch import nn
 
 from lyapnet.certification import Budget, DecreaseCondition, prove, sound_claim
@@ -34,20 +35,6 @@ class Bowl(nn.Module):
         point, side, height = self.bump
         distance = (t - point[0]) ** 2 + ((x - point[1:]) ** 2).sum(-1)
         return value + height * torch.exp(-distance / side**2)
-
-
-class Planted(DecreaseCondition):
-    """c with a bump added that lifts it to `height` at one point, and above 0 within about `side` of it."""
-
-    def plant(self, point, side, height):
-        self.point, self.side = point, side
-        with torch.no_grad():
-            self.lift = height - float(super().forward(point[0], point[1:]))
-        return self
-
-    def forward(self, t, x):
-        distance = (t - self.point[0]) ** 2 + ((x - self.point[1:]) ** 2).sum(-1)
-        return super().forward(t, x) + self.lift * torch.exp(-distance / self.side**2)
 
 
 def loop(V, A=STABLE, law=HJBPolicy, gain=1.0):

@@ -184,11 +184,10 @@ def prove(
                 break
             search.advance(condition, bounded, budget, pool.map)
             if report is not None:
-                remaining = float(search.frontier.volumes(lower, upper).sum())
-                report(Progress(search.boxes, remaining, search.seconds))
+                report(Progress(search.boxes, search.remaining(lower, upper), search.seconds))
     stopped = search.worst is not None and stop_at_counterexample
     proved = -torch.inf if stopped else min(search.level, _just_below(min(search.frontier.least, search.given_up)))
-    remaining = float(search.frontier.volumes(lower, upper).sum())
+    remaining = search.remaining(lower, upper)
     return Proof(
         proved, wanted, search.worst, search.boxes, earlier + budget.elapsed, remaining, search.frontier.center[:KEPT]
     )
@@ -208,6 +207,10 @@ class Search:
     boxes: int = 0
     seconds: float = 0.0
     given_up: float = float("inf")  # the least W among boxes for which there was no room
+
+    def remaining(self, lower: Tensor, upper: Tensor) -> float:
+        """The share of the domain that is undecided."""
+        return float(self.frontier.volumes(lower, upper).sum())
 
     def advance(
         self, condition: DecreaseCondition, bounded: BoundedFunction, budget: Budget, run: Callable[..., Any]
@@ -305,11 +308,9 @@ def find_counterexample(
     upper: Tensor,
     level: float,
     generator: torch.Generator | None = None,
-    samples: int = 20_000,
-    steps: int = 40,
 ) -> Counterexample | None:
     """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64."""
-    points = _likely_violations(condition, lower, upper, level, generator, samples, steps)
+    points = _likely_violations(condition, lower, upper, level, generator)
     return _lowest_violation(condition, bounded, points, level)
 
 
@@ -321,7 +322,7 @@ def violations(
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """The worst points (t, x) found with c > 0 and W ≤ level, in plain arithmetic; (k, 1 + n), k ≤ count."""
-    points = _likely_violations(condition, *domain, level, generator, 20_000, 40)
+    points = _likely_violations(condition, *domain, level, generator)
     c, W = _values(condition, points)
     worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
     return points[worst.indices[worst.values > 0]]
@@ -333,8 +334,8 @@ def _likely_violations(
     upper: Tensor,
     level: float,
     generator: torch.Generator | None,
-    samples: int,
-    steps: int,
+    samples: int = 20_000,
+    steps: int = 40,
 ) -> Tensor:
     """Samples of the box, and what ascent from the worst 64 of them with W ≤ level passes."""
     points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)

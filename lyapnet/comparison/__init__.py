@@ -1,0 +1,1 @@
+"""Ours against reinforcement learning: the same tasks, the same states, one evaluator."""

@@ -60,10 +60,10 @@ class Compilation(Callback):
         console: where it is said.
         batch_size: initial states in a training batch.
         wanted: whether to compile in any case; else only what is on disk already.
-        record: hears that the run is compiled.
+        record: hears that the run is compiled, and in how many seconds.
     """
 
-    def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[[], None]):
+    def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[..., None]):
         self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -82,10 +82,10 @@ class Compilation(Callback):
             self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
         started = time.perf_counter()
         module.compile_for(self.batch_size)
-        verb = "loaded" if on_disk else "compiled"
-        self._say(trainer, f"{verb} machine code in {time.perf_counter() - started:.0f} s, kept in {cache_folder()}")
+        verb, seconds = "loaded" if on_disk else "compiled", time.perf_counter() - started
+        self._say(trainer, f"{verb} machine code in {seconds:.0f} s, kept in {cache_folder()}")
         if trainer.is_global_zero:
-            self.record()
+            self.record(compiled=True, compilation_seconds=round(seconds, 2))
 
     def _say(self, trainer: Trainer, line: str) -> None:
         if trainer.is_global_zero:
@@ -149,10 +149,20 @@ def optimum_progress(console: Console) -> Iterator[Report]:
 
 
 class Stopwatch(Callback):
-    """Tells each member how many rollout steps per second the last training step made, gradient included."""
+    """Tells each member how many rollout steps per second the last training step made, gradient included.
+
+    `seconds` is what all training steps took so far, other processes of the same run included; neither compilation nor
+    validations, figures and checkpoints count.
+    """
 
     def __init__(self) -> None:
-        self._started = 0.0
+        self._started = self.seconds = 0.0
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.seconds = state_dict["seconds"]
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
         self._started = time.perf_counter()
@@ -162,13 +172,21 @@ class Stopwatch(Callback):
     ) -> None:
         module = trained_module(pl_module)
         seconds = time.perf_counter() - self._started
+        self.seconds += seconds
         for member in module.members:
             steps = batch.shape[-2] * member.task.horizon.steps * trainer.world_size
             member.steps_per_second = steps / seconds
 
 
 class ScalarLogger(Callback):
-    """Writes the curves: every training step, every validation, and one validation before the first step."""
+    """Writes the curves: every training step, every validation, and one validation before the first step.
+
+    Args:
+        stopwatch: tells how long the training steps took.
+    """
+
+    def __init__(self, stopwatch: Stopwatch):
+        self.stopwatch = stopwatch
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:
@@ -200,8 +218,7 @@ class ScalarLogger(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._log_validation(trainer, trained_module(pl_module))
 
-    @staticmethod
-    def _log_validation(trainer: Trainer, module: TrainedModule) -> None:
+    def _log_validation(self, trainer: Trainer, module: TrainedModule) -> None:
         for member, curves in with_writers(trainer, module):
             summary = _shown(member.validation).summary()
             names = {
@@ -214,6 +231,7 @@ class ScalarLogger(Callback):
                 "bounded_fraction/val": summary["bounded_fraction"],
                 "decreasing_fraction/val": summary["decreasing_fraction"],
                 "terminal_error/val": summary["terminal_error"],
+                "training_seconds": self.stopwatch.seconds,
             }
             log_scalars(trainer, curves, {name: value for name, value in names.items() if value is not None})
 

@@ -1,4 +1,4 @@
-"""The command line: lyapnet train | evaluate | sweep | certify | bench | systems."""
+"""The command line: lyapnet train | evaluate | sweep | certify | compare | bench | systems."""
 
 import json
 import sys
@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from lyapnet.bench import commands
+from lyapnet.comparison.command import compare
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.tables import (
     certificate_table,
@@ -247,6 +248,7 @@ def certify(
         notes.print(f"wrote {path}", soft_wrap=True)
 
 
+app.command()(compare)
 app.add_typer(commands.app, name="bench")
 
 

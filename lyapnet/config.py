@@ -10,7 +10,7 @@ import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args
 
 import yaml
 from omegaconf import MISSING, OmegaConf
@@ -207,6 +207,15 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
     """
+    return config_from_plain(read_yaml(path, Config), overrides)
+
+
+def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
+    """The content of a YAML file that has some keys of a schema.
+
+    Raises:
+        UsageError: no such file, not YAML, or none of the keys.
+    """
     try:
         content = OmegaConf.to_container(
             OmegaConf.load(path), resolve=False
@@ -218,12 +227,12 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
         reason = " ".join(str(error).split())
         raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
-    sections = [f.name for f in dataclasses.fields(Config)]
+    sections = [f.name for f in dataclasses.fields(schema)]
     if not isinstance(content, Mapping) or not any(name in content for name in sections):
         raise UsageError(
             f"Expected a config in {str(path)!r}, got none of its keys ({', '.join(sections)}); see conf/."
         )
-    return config_from_plain({str(key): value for key, value in content.items()}, overrides)
+    return {str(key): value for key, value in content.items()}
 
 
 def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
@@ -232,27 +241,40 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     Raises:
         UsageError: as load_config.
     """
+    config = checked(Config, content, overrides)
+    # YAML reads on and off as booleans
+    config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
+    check_values(config)
+    return config
+
+
+Schema = TypeVar("Schema")
+
+
+def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Schema:
+    """An object of a schema from plain nested dictionaries with overrides: its keys and types, not its values.
+
+    Raises:
+        UsageError: an unknown key, a missing one, or a wrong type.
+    """
     for override in overrides:
         if "=" not in override.lstrip("="):
             raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
     try:
         layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
         for layer in layers:
-            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), Config, "")
-        merged = OmegaConf.merge(OmegaConf.structured(Config), *layers)
+            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), schema, "")
+        merged = OmegaConf.merge(OmegaConf.structured(schema), *layers)
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
-        raise UsageError(_explain(error)) from error
+        raise UsageError(_explain(error, schema)) from error
     except TypeError as error:  # a section's field changed from a list to a mapping, or back
         raise UsageError(
             f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
         ) from error
     except yaml.YAMLError as error:
         raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
-    assert isinstance(config, Config)
-    # YAML reads on and off as booleans
-    config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
-    _check_values(config)
+    assert isinstance(config, schema)
     return config
 
 
@@ -280,12 +302,12 @@ def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             yield f"{prefix}{key}", value
 
 
-def _refuse_unknown_keys(content: Any, schema: type, prefix: str) -> None:
+def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
     known = {f.name: f for f in dataclasses.fields(schema)}
     for key, value in content.items():
         if key not in known:
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-            names = _same_name_elsewhere(str(key)) or [prefix + name for name in near]
+            names = _same_name_elsewhere(str(key), schema) or [prefix + name for name in near]
             hint = f"did you mean {names[0]}?" if names else f"choose one of {', '.join(known)}."
             raise UsageError(f"Expected a key of the schema, got unknown key {prefix}{key}; {hint}")
         section = known[key].type
@@ -296,6 +318,9 @@ def _refuse_unknown_keys(content: Any, schema: type, prefix: str) -> None:
                     f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
                 )
             _refuse_unknown_keys(value, section, f"{prefix}{key}.")
+        for entry in get_args(section)[1:]:  # of dict[str, section]
+            for name, one in value.items() if dataclasses.is_dataclass(entry) else ():
+                _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
 
 
 def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
@@ -309,27 +334,27 @@ def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _same_name_elsewhere(key: str) -> list[str]:
+def _same_name_elsewhere(key: str, schema: type) -> list[str]:
     """The full names of fields of that name: for a key written in the wrong section."""
-    return [name for name in _annotations(Config) if name.split(".")[-1] == key]
+    return [name for name in _annotations(schema) if name.split(".")[-1] == key]
 
 
-def _explain(error: OmegaConfBaseException) -> str:
+def _explain(error: OmegaConfBaseException, schema: type) -> str:
     key = error.full_key or "a key"
     if isinstance(error, MissingMandatoryValue):
         return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
-    annotation = _annotations(Config).get(key.split("[")[0])
+    annotation = _annotations(schema).get(key.split("[")[0])
     kind = annotation.__name__ if type(annotation) is type else annotation
     got = str(error).splitlines()[0]
     return f"Expected {key} as {kind}, got: {got}; correct its value."
 
 
-def _check_values(config: Any, prefix: str = "") -> None:
+def check_values(config: Any, prefix: str = "") -> None:
     """Hold every field against the rule it was declared with."""
     for f in dataclasses.fields(config):
         key, value = f"{prefix}{f.name}", getattr(config, f.name)
         if dataclasses.is_dataclass(value):
-            _check_values(value, f"{key}.")
+            check_values(value, f"{key}.")
         elif f.metadata and value is not None:
             _check_value(key, value, f.metadata)
 

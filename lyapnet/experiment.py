@@ -10,7 +10,6 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +202,7 @@ def _trainer(plan: Plan, console: Console) -> L.Trainer:
         TensorBoardLogger(r.folder.parent, name="", version=r.folder.name, default_hp_metric=False) for r in runs
     ]
     labels = [label_of(c) for c in configs_of_seeds(config)] if config.seeds > 1 else [""]
+    stopwatch = Stopwatch()
     return L.Trainer(
         max_epochs=training.iterations,  # an epoch is one step
         check_val_every_n_epoch=training.validate_every,
@@ -216,8 +216,8 @@ def _trainer(plan: Plan, console: Console) -> L.Trainer:
         callbacks=[
             *_compilation(plan, console),
             ValidationOptimum(console),
-            Stopwatch(),
-            ScalarLogger(),
+            stopwatch,
+            ScalarLogger(stopwatch),
             FigureLogger(training.validate_every * config.evaluation.figures_every),
             *_certified_share(config),
             TrainingProgress(console),
@@ -256,7 +256,7 @@ def _compilation(plan: Plan, console: Console) -> list[Compilation]:
     if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
         return []
     wanted = goes_on or options.compile == "on" or _earns_compilation(plan.config)
-    return [Compilation(console, plan.config.training.batch_size, wanted, partial(plan.run.note, compiled=True))]
+    return [Compilation(console, plan.config.training.batch_size, wanted, plan.run.note)]
 
 
 def _earns_compilation(config: Config) -> bool:

@@ -2,22 +2,16 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from lyapnet.baselines.measurement import Measurement
 from lyapnet.run import write_json
 
-
-@dataclass(frozen=True)
-class Measurement:
-    """One validation during a training."""
-
-    environment_steps: int  # Euler steps of single trajectories so far
-    seconds: float  # of training so far; validations, figures and checkpoints are left out
-    cost: float  # mean J_N of the validation states
-    cost_ratio: float | None  # to their optimum, where there is an oracle
-    constraint_loss: float | None  # of a lyapnet program
+__all__ = ["Measurement", "Result", "with_common_optima"]
 
 
 @dataclass(frozen=True)
@@ -48,3 +42,13 @@ class Result:
         """The result that `write` left."""
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         return Result(**{**content, "curve": [Measurement(**point) for point in content["curve"]]})
+
+
+def with_common_optima(results: Sequence[Result]) -> list[Result]:
+    """The results with the least optimum that any job knew of each state: a controller's own may have bettered one."""
+    known: dict[str, torch.Tensor] = {}
+    for result in results:
+        if result.optima is not None:
+            optima = torch.tensor(result.optima, dtype=torch.float64)
+            known[result.task] = torch.fmin(known.get(result.task, optima), optima)
+    return [replace(r, optima=known[r.task].tolist()) if r.task in known else r for r in results]

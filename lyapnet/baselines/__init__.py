@@ -1,0 +1,8 @@
+"""Reinforcement learning on lyapnet's tasks, to compare with. Needs the extra lyapnet[baselines]."""
+
+import gymnasium
+
+from lyapnet.baselines.tasks import IDS
+
+for _name, _id in IDS.items():  # importing this package registers them: gymnasium.make("lyapnet/Reacher-v0")
+    gymnasium.register(id=_id, entry_point="lyapnet.baselines.env:Environment", kwargs={"task": _name})

@@ -1,0 +1,197 @@
+"""What is compared: the schema of conf/compare.yaml, and the jobs that it consists of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING
+
+from lyapnet.baselines.rl import Baseline
+from lyapnet.baselines.settings import SETTINGS
+from lyapnet.baselines.tasks import CONTROL_SCALES, BoundedTask, bounded_task
+from lyapnet.build import build_task
+from lyapnet.comparison.results import Result
+from lyapnet.config import Config, check_values, checked, load_config, option, read_yaml
+from lyapnet.errors import UsageError
+
+OURS = "lyapnet"
+METHODS = (OURS, *SETTINGS)
+RESULT = "result.json"  # written last: its presence says that the job is finished
+
+
+@dataclass
+class ComparedTask:
+    """One task: what lyapnet trains on it, and what the baselines may."""
+
+    config: str = option(MISSING, "The experiment of lyapnet, a YAML file; it also defines the task.")
+    overrides: list[str] = option([], "Changes to it, as key.sub=value.")
+    control_scale: list[float] | None = option(
+        None, "Largest |u_i| of the baselines; null: the reference task's of that name.", above=0
+    )
+    hidden: list[int] = option([64, 64], "Widths of the baselines' networks.", at_least=1)
+    steps: dict[str, int] = option({}, "Environment steps of each baseline.")
+    options: dict[str, Any] = option({}, "Options of a baseline's algorithm that differ from its setting's.")
+
+
+@dataclass
+class ComparisonConfig:
+    """One comparison: every method on every task, from several seeds."""
+
+    comparison: str = option("compare", "Its name: everything goes to <logs>/<comparison>.")
+    logs: str = option("logs", "The folder of all runs.")
+    methods: list[str] = option(list(METHODS), "What is compared.")
+    seeds: int = option(5, "Seeds of lyapnet: 0, 1, …", at_least=1)
+    baseline_seeds: int = option(3, "Seeds of each baseline.", at_least=1)
+    evaluation_states: int = option(
+        256, "States of X₀ on which all methods are measured, the same for all.", at_least=1
+    )
+    evaluation_seed: int = option(0, "Of their draw.", at_least=0)
+    tasks: dict[str, ComparedTask] = option({}, "What they are compared on, by name.")
+
+    @property
+    def folder(self) -> Path:
+        """Where the comparison is."""
+        return Path(self.logs) / self.comparison
+
+
+def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> ComparisonConfig:
+    """The comparison of a YAML file with `key.sub=value` overrides.
+
+    Raises:
+        UsageError: the file or a value does not hold, as for the config of an experiment.
+    """
+    config = checked(ComparisonConfig, read_yaml(path, ComparisonConfig), overrides)
+    check_values(config)
+    if not config.tasks:
+        raise UsageError(f"Expected at least one task under tasks in {str(path)!r}, got none; see conf/compare.yaml.")
+    for method in config.methods:
+        _require_among(method, METHODS, "methods")
+    for name, task in config.tasks.items():
+        check_values(task, f"tasks.{name}.")
+        for key in ("steps", "options"):
+            for method in getattr(task, key):
+                _require_among(method, SETTINGS, f"tasks.{name}.{key}")
+    return config
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A method trained on a task from a seed, in a folder of its own."""
+
+    comparison: ComparisonConfig
+    task: str
+    method: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """task/method/seed_k, which is also its place below the comparison's folder."""
+        return f"{self.task}/{self.method}/seed_{self.seed}"
+
+    @property
+    def folder(self) -> Path:
+        """Its event files, checkpoints and result."""
+        return self.comparison.folder / self.name
+
+    @property
+    def result(self) -> Result | None:
+        """What it left, if it is finished."""
+        path = self.folder / RESULT
+        return Result.read(path) if path.is_file() else None
+
+    @property
+    def compared(self) -> ComparedTask:
+        """The task's section."""
+        return self.comparison.tasks[self.task]
+
+    @property
+    def settings(self) -> list[str]:
+        """The overrides of lyapnet's own run."""
+        place = f"{self.comparison.comparison}/{self.name}"
+        return [*self.compared.overrides, f"seed={self.seed}", f"logs={self.comparison.logs}", f"experiment={place}"]
+
+    @property
+    def config(self) -> Config:
+        """The resolved experiment."""
+        return load_config(self.compared.config, self.settings)
+
+    @property
+    def bounded(self) -> BoundedTask:
+        """The task with the action box in which every method is measured.
+
+        Raises:
+            UsageError: no control scale.
+        """
+        scale = self.compared.control_scale or CONTROL_SCALES.get(self.task)
+        return bounded_task(build_task(self.config), scale)
+
+    @property
+    def baseline(self) -> Baseline:
+        """What SB3 trains.
+
+        Raises:
+            UsageError: no number of steps, or no control scale.
+        """
+        compared, method = self.compared, self.method
+        if compared.steps.get(method, 0) < 1:
+            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got none; give its environment steps.")
+        options = compared.options.get(method, {})
+        return Baseline(self.bounded, method, self.seed, compared.steps[method], compared.hidden, options)
+
+    def check(self) -> None:
+        """Refuse what cannot be trained, before anything is.
+
+        Raises:
+            UsageError: see `config` and `baseline`.
+        """
+        _ = self.bounded if self.method == OURS else self.baseline
+
+
+def jobs_of(
+    config: ComparisonConfig,
+    tasks: Sequence[str] | None = None,
+    methods: Sequence[str] | None = None,
+    seeds: int | None = None,
+) -> list[Job]:
+    """The jobs of a comparison, or of some of its tasks and methods; seed by seed, so that all grow together.
+
+    Raises:
+        UsageError: a task or method that it does not have; or a job that cannot be trained.
+    """
+    tasks, methods = list(tasks or config.tasks), list(methods or config.methods)
+    for task in tasks:
+        _require_among(task, config.tasks, "--tasks")
+    for method in methods:
+        _require_among(method, METHODS, "--methods")
+    count = {m: seeds or (config.seeds if m == OURS else config.baseline_seeds) for m in methods}
+    jobs = [
+        Job(config, task, method, seed)
+        for seed in range(max(count.values()))
+        for task in tasks
+        for method in methods
+        if seed < count[method]
+    ]
+    for job in jobs[: len(tasks) * len(methods)]:
+        job.check()
+    return jobs
+
+
+def job_named(config: ComparisonConfig, name: str) -> Job:
+    """The job task/method/seed_k.
+
+    Raises:
+        UsageError: it is not one of the comparison's.
+    """
+    task, _, rest = name.partition("/")
+    method, _, seed = rest.partition("/seed_")
+    _require_among(task, config.tasks, "--job")
+    _require_among(method, METHODS, "--job")
+    if not seed.isdigit():
+        raise UsageError(f"Expected --job as task/method/seed_k, got {name!r}.")
+    return Job(config, task, method, int(seed))
+
+
+def _require_among(name: str, known: Any, where: str) -> None:
+    if name not in known:
+        raise UsageError(f"Expected {where} among {', '.join(known)}, got {name!r}.")

@@ -1,0 +1,173 @@
+"""One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from torch import nn
+
+from lyapnet.baselines.env import Costs, costs_of
+from lyapnet.baselines.policy import ControllerPolicy
+from lyapnet.baselines.rl import BaselineTraining, costs_of_best
+from lyapnet.build import build_program, resolve
+from lyapnet.comparison.plan import OURS, RESULT, Job
+from lyapnet.comparison.results import Measurement, Result
+from lyapnet.config import to_plain
+from lyapnet.controller import load
+from lyapnet.errors import OracleError, UsageError
+from lyapnet.evaluation import measure
+from lyapnet.event_files import curve
+from lyapnet.experiment import fit, plan_run
+from lyapnet.networks import NETWORKS
+from lyapnet.oracles import oracle_of
+from lyapnet.randomness import TEST, stream
+from lyapnet.run import Run, write_json
+from lyapnet.sweep import Point
+from lyapnet.types import State
+
+RECORD = "job.json"
+
+
+def run_job(job: Job, console: Console) -> Result:
+    """Train what is not trained yet, measure it, and leave the result.
+
+    Raises:
+        UsageError: the folder holds another job of that name.
+        LyapnetError: the training fails.
+    """
+    if (done := job.result) is not None:
+        return done
+    _require_same(job)
+    torch.set_num_threads(1)  # jobs run side by side
+    result = _lyapnet(job, console) if job.method == OURS else _baseline(job, console)
+    result.write(job.folder / RESULT)
+    return result
+
+
+def _require_same(job: Job) -> None:
+    """Hold the job against what its folder was made for."""
+    wanted = json.loads(json.dumps(_description(job)))
+    record = job.folder / RECORD
+    if not record.is_file():
+        job.folder.mkdir(parents=True, exist_ok=True)
+        write_json(record, wanted)
+        return
+    kept = json.loads(record.read_text(encoding="utf-8"))
+    changed = [key for key in wanted if wanted[key] != kept.get(key)]
+    if changed:
+        raise UsageError(
+            f"Expected {job.name} as it was begun, got another {', '.join(changed)}; undo the change, remove "
+            f"{str(job.folder)!r}, or give the comparison another name."
+        )
+
+
+def _description(job: Job) -> dict[str, Any]:
+    """What a result depends on."""
+    evaluation = [job.comparison.evaluation_states, job.comparison.evaluation_seed]
+    config, scale = to_plain(job.config), job.bounded.control_scale
+    if job.method == OURS:
+        return {"evaluation": evaluation, "control_scale": scale, "config": {**config, "logs": ""}}
+    baseline = job.baseline
+    setting = {**dataclasses.asdict(baseline.setting), "algorithm": baseline.setting.algorithm.__name__}
+    task = [config[key] for key in ("system", "cost", "initial_states", "horizon")]
+    return {
+        "evaluation": evaluation, "control_scale": scale, "task": task, "setting": setting,
+        "options": dict(baseline.options), "hidden": baseline.hidden, "steps": baseline.steps,
+    }  # fmt: skip
+
+
+def _lyapnet(job: Job, console: Console) -> Result:
+    point, config, bounded, states = (
+        Point(Path(job.compared.config), job.settings),
+        job.config,
+        job.bounded,
+        _states(job),
+    )
+    run = point.run()
+    if run is None or not run.finished:
+        last = None if run is None or not run.last.is_file() else str(run.last)
+        plan = plan_run(point.path, point.settings, resume=last)
+        fit(plan, console)
+        run = plan.run
+    network = resolve(config.network.name, NETWORKS, "network.name", nn.Module)
+    controller = load(run.best, system=bounded.task.system, network=network)
+    costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states)
+    with torch.no_grad():
+        constraint_loss = measure(controller.rollout(states), build_program(config)).constraint_loss
+    compilation = run.record().get("compilation_seconds", 0.0)
+    validations = _validations(run, config.training.batch_size * config.horizon.steps, compilation)
+    return _result(job, states, costs, validations, run.best, compilation, float(constraint_loss.mean()))
+
+
+def _validations(run: Run, steps: int, compilation: float) -> list[Measurement]:
+    """The validations of a run, `steps` environment steps to an iteration, from its event files."""
+    tags = ("trajectory_cost/val", "training_seconds", "constraint_loss/val")
+    columns = [curve(run.folder, tag) for tag in tags]
+    gaps = {iteration: gap for _, iteration, gap in curve(run.folder, "optimality_gap/val")}
+    return [
+        Measurement(iteration * steps, compilation + seconds, cost, _plus_one(gaps.get(iteration)), loss)
+        for (_, iteration, cost), (_, _, seconds), (_, _, loss) in zip(*columns, strict=True)
+    ]
+
+
+def _plus_one(gap: float | None) -> float | None:
+    return None if gap is None else 1 + gap
+
+
+def _baseline(job: Job, console: Console) -> Result:
+    baseline, states = job.baseline, _states(job)
+    training = BaselineTraining(baseline, job.folder)
+
+    def report(point: Measurement) -> None:
+        ratio = "" if point.cost_ratio is None else f"  cost/optimum {point.cost_ratio:.4g}"
+        console.print(f"{point.environment_steps}/{baseline.steps}  cost {point.cost:.4g}{ratio}", soft_wrap=True)
+
+    training.run(report)
+    path, costs = costs_of_best(baseline, job.folder, states)
+    return _result(job, states, costs, training.curve, path)
+
+
+def _states(job: Job) -> State:
+    """The evaluation states: the same for every method and seed."""
+    comparison = job.comparison
+    draw = stream(comparison.evaluation_seed, TEST)
+    return job.bounded.task.initial_states.sample(comparison.evaluation_states, draw)
+
+
+def _result(
+    job: Job,
+    states: State,
+    costs: Costs,
+    validations: Sequence[Measurement],
+    checkpoint: Path,
+    compilation: float = 0.0,
+    constraint_loss: float | None = None,
+) -> Result:
+    return Result(
+        task=job.task,
+        method=job.method,
+        seed=job.seed,
+        environment_steps=validations[-1].environment_steps,
+        seconds=validations[-1].seconds,
+        compilation_seconds=compilation,
+        costs=costs.cost.tolist(),
+        sums=costs.sum.tolist(),
+        optima=_optima(job, states),
+        constraint_loss=constraint_loss,
+        clipped_fraction=costs.clipped_fraction,
+        horizon_steps=job.bounded.task.horizon.steps,
+        checkpoint=str(checkpoint),
+        curve=validations,
+    )
+
+
+def _optima(job: Job, states: State) -> list[float] | None:
+    system, cost, _, horizon = job.bounded.task
+    try:
+        return oracle_of(system, cost, horizon).solve(states).cost.tolist()
+    except OracleError:
+        return None

@@ -1,0 +1,228 @@
+"""lyapnet compare: its jobs, each run once, in processes or on Ray; a killed one goes on; all measured alike."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import lyapnet
+from lyapnet.cli import main
+from lyapnet.comparison import workers
+from lyapnet.comparison.plan import METHODS, OURS, Job, job_named, jobs_of, load_comparison
+from lyapnet.comparison.results import Result, with_common_optima
+from lyapnet.comparison.workers import run_locally, run_on_ray, seconds_left
+from lyapnet.errors import UsageError
+from lyapnet.evaluation import evaluate
+
+ROOT = Path(__file__).parents[1]
+SMOKE, FULL = ROOT / "conf" / "compare_smoke.yaml", ROOT / "conf" / "compare.yaml"
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory):
+    """The whole comparison in two minutes, from a process of its own, as a user starts it: its folder and output."""
+    folder = tmp_path_factory.mktemp("smoke")
+    (folder / "conf").symlink_to(ROOT / "conf")
+    return folder, compared(folder, "--workers", "2")
+
+
+def compared(folder, *arguments):
+    """What `lyapnet compare --config conf/compare_smoke.yaml` says."""
+    command = [sys.executable, "-m", "lyapnet", "compare", "--config", "conf/compare_smoke.yaml", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+
+
+def results_of(folder):
+    return [Result.read(path) for path in sorted((folder / "logs" / "compare_smoke").rglob("result.json"))]
+
+
+def test_every_method_is_trained_on_every_task(smoke):
+    folder, said = smoke
+    assert said.returncode == 0, said.stderr
+    results = results_of(folder)
+    assert {(r.task, r.method) for r in results} == {(t, m) for t in load_comparison(SMOKE).tasks for m in METHODS}
+    assert "20/20" in said.stdout
+    assert "left" in said.stdout
+    for result in results:
+        assert len(result.costs) == len(result.sums) == len(result.optima or ()) == 8
+        assert result.curve[0].environment_steps == 0
+        assert result.environment_steps == result.curve[-1].environment_steps > 0
+        assert 0 < result.seconds < 60
+        assert (result.constraint_loss is None) == (result.method != OURS)
+        assert all(cost > 0.999 * best for cost, best in zip(result.costs, result.optima or (), strict=True))
+
+
+def test_all_are_measured_on_the_same_states_at_their_own_cost(smoke):
+    folder, _ = smoke
+    optima = {}
+    for result in with_common_optima(results_of(folder)):
+        assert optima.setdefault(result.task, result.optima) == result.optima
+        if result.method == OURS:
+            found = evaluate(lyapnet.load(folder / result.checkpoint), 8, 0, optimum=False)
+            assert sum(result.costs) / 8 == pytest.approx(found["cost_mean"], rel=1e-9)
+            assert result.constraint_loss == pytest.approx(found["constraint_loss"], rel=1e-6)
+
+
+def test_the_same_command_again_trains_nothing(smoke):
+    folder, _ = smoke
+    before = {path: path.stat().st_mtime_ns for path in (folder / "logs").rglob("result.json")}
+    said = compared(folder)
+    assert said.returncode == 0, said.stderr
+    assert before == {path: path.stat().st_mtime_ns for path in before}
+
+
+def test_another_config_is_not_taken_for_the_same(smoke):
+    folder, _ = smoke
+    job = "double_integrator/ppo_tuned/seed_0"
+    path = folder / "logs" / "compare_smoke" / job / "result.json"
+    content = path.read_text()
+    path.unlink()
+    try:
+        said = compared(folder, "--job", job, "tasks.double_integrator.hidden=[5]")
+    finally:
+        path.write_text(content)
+    assert said.returncode == 2
+    assert "another hidden" in said.stderr
+    assert len(said.stderr.strip().splitlines()) == 1
+
+
+def test_a_killed_comparison_goes_on(tmp_path):
+    (tmp_path / "conf").symlink_to(ROOT / "conf")
+    chosen = ["--tasks", "double_integrator", "--methods", "ppo_tuned", "--workers", "1"]
+    longer = "tasks.double_integrator.steps.ppo_tuned=200000"
+    job = tmp_path / "logs" / "compare_smoke" / "double_integrator" / "ppo_tuned" / "seed_0"
+    command = [sys.executable, "-m", "lyapnet", "compare", "--config", "conf/compare_smoke.yaml", *chosen, longer]
+    process = subprocess.Popen(command, cwd=tmp_path, start_new_session=True)
+    deadline = time.monotonic() + 120
+    while len(list((job / "checkpoints").glob("step_[1-9]*"))) < 1 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = max(int(path.name[5:]) for path in (job / "checkpoints").glob("step_*"))
+    assert 0 < kept < 200_000, "it was killed on its way"
+    said = compared(tmp_path, *chosen, longer)
+    assert said.returncode == 0, said.stderr
+    assert "1/1" in said.stdout
+    lines = (job / "job.log").read_text().splitlines()
+    assert sum(line.startswith("0/200000") for line in lines) == 1, "it did not begin anew"
+    assert Result.read(job / "result.json").environment_steps >= 200_000
+
+
+def test_jobs_go_seed_by_seed_and_are_as_many_as_asked_for():
+    comparison = load_comparison(FULL)
+    jobs = jobs_of(comparison)
+    assert len(jobs) == 4 * (5 + 4 * 3)
+    assert [job.seed for job in jobs] == sorted(job.seed for job in jobs)
+    some = jobs_of(comparison, ["reacher"], ["lyapnet", "sac_paper"], 2)
+    assert [job.name for job in some] == [f"reacher/{m}/seed_{k}" for k in (0, 1) for m in ("lyapnet", "sac_paper")]
+    assert job_named(comparison, some[-1].name).folder == some[-1].folder
+
+
+def test_baselines_have_the_networks_and_the_task_of_the_comparison():
+    jobs = {job.name: job for job in jobs_of(load_comparison(FULL))}
+    baseline = jobs["cartpole_balancing/ppo_paper/seed_2"].baseline
+    assert (baseline.hidden, baseline.seed) == ([200, 500], 2)
+    assert baseline.bounded.control_scale == (20.0,)
+    assert jobs["double_integrator/ppo_paper/seed_0"].baseline.options["learning_rate"] == 3e-5
+    assert "learning_rate" not in jobs["reacher/ppo_paper/seed_0"].baseline.options
+
+
+@pytest.mark.parametrize(
+    ("overrides", "tasks", "methods", "named"),
+    [
+        ([], ["reachr"], None, "--tasks among"),
+        ([], None, ["ppo"], "--methods among"),
+        (["methods=[ppo]"], None, None, "methods among"),
+        (["seedz=3"], None, None, "did you mean seeds"),
+        (["seeds=0"], None, None, "seeds ≥ 1"),
+        (["tasks.reacher.stepz=3"], None, None, "tasks.reacher.steps"),
+        (["tasks.reacher.steps.ppo=3"], None, None, "tasks.reacher.steps among"),
+        (["tasks.reacher.steps.ppo_paper=0"], None, None, "tasks.reacher.steps.ppo_paper ≥ 1"),
+        (["tasks.reacher.control_scale=[1]"], None, None, "each of"),
+        (["tasks.reacher.config=nowhere.yaml"], None, None, "config file"),
+    ],
+)
+def test_impossible_comparison_is_refused_before_anything_is_trained(overrides, tasks, methods, named):
+    with pytest.raises(UsageError, match=named):
+        jobs_of(load_comparison(SMOKE, overrides), tasks, methods)
+
+
+def test_command_says_in_one_line_what_is_wrong(capsys):
+    assert main(["compare"]) == 2
+    assert "--config PATH" in capsys.readouterr().err
+    assert main(["compare", "--config", str(SMOKE), "--job", "reacher"]) == 2
+    assert "--job among" in capsys.readouterr().err
+    assert main(["compare", "--config", str(SMOKE), "--job", "reacher/lyapnet/seed_x"]) == 2
+    assert "task/method/seed_k" in capsys.readouterr().err
+
+
+def pretended(monkeypatch, tmp_path, script):
+    """Two jobs, and a command that runs a Python script in the place of a training."""
+    comparison = load_comparison(SMOKE, [f"logs={tmp_path}"])
+    jobs = jobs_of(comparison, ["reacher", "double_integrator"], ["ppo_tuned"])
+    return jobs, [sys.executable, "-c", script]
+
+
+FAILING = """
+import os, sys
+print("threads", os.environ["OMP_NUM_THREADS"], flush=True)
+sys.exit("last words" if "reacher" in sys.argv[1] else 0)
+"""
+
+
+@pytest.mark.parametrize("runner", ["local", "ray"])
+def test_a_job_that_fails_is_told_and_the_others_go_on(runner, monkeypatch, tmp_path):
+    jobs, command = pretended(monkeypatch, tmp_path, FAILING)
+    begun = []
+    if runner == "local":
+        outcomes = list(run_locally(jobs, command, 2, begun.append))
+    else:
+        pytest.importorskip("ray")
+        outcomes = list(run_on_ray(jobs, command, "local", begun.append))
+    assert {outcome.job.task: outcome.failure for outcome in outcomes} == {
+        "reacher": "last words", "double_integrator": "",
+    }  # fmt: skip
+    assert set(begun) == set(jobs)
+    assert all("threads 1" in (job.folder / "job.log").read_text() for job in jobs)
+
+
+def test_interrupting_stops_what_runs(monkeypatch, tmp_path):
+    jobs, command = pretended(monkeypatch, tmp_path, "import time; time.sleep(60)")
+    started = time.monotonic()
+
+    def interrupt(*_, **__):
+        while len(list(tmp_path.rglob("job.log"))) < 2:
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(workers, "wait", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        list(run_locally(jobs, command, 2, lambda job: None))
+    assert time.monotonic() - started < 30
+
+
+def test_time_left_is_that_of_jobs_alike():
+    comparison = load_comparison(FULL)
+    ours, ppo, other = (Job(comparison, "reacher", m, 0) for m in ("lyapnet", "ppo_paper", "sac_paper"))
+    again = Job(comparison, "reacher", "lyapnet", 1)
+    elsewhere = Job(comparison, "double_integrator", "lyapnet", 0)
+    assert seconds_left([ours], {}, {}, 1) is None
+    assert seconds_left([ours, again, elsewhere], {}, {ours: 10.0}, 2) == pytest.approx(10)
+    assert seconds_left([ours, again], {again: 4.0}, {ours: 10.0}, 1) == pytest.approx(6)
+    assert seconds_left([ours, again], {again: 40.0}, {ours: 10.0}, 1) == 0
+    assert seconds_left([ours, ppo, other], {}, {ours: 10.0, ppo: 30.0}, 1) == pytest.approx(20)
+
+
+def test_result_reads_what_it_wrote(tmp_path):
+    result = Result("t", "m", 1, 5, 2.0, 0.5, [1.0], [100.0], [0.9], None, 0.25, 3, "c.ckpt", [])
+    result.write(tmp_path / "result.json")
+    assert Result.read(tmp_path / "result.json") == result
+    known = with_common_optima([result, Result(**{**vars(result), "optima": [math.nan]})])
+    assert [r.optima for r in known] == [[0.9], [0.9]]
+    better = with_common_optima([result, Result(**{**vars(result), "optima": [0.8]})])
+    assert [r.optima for r in better] == [[0.8], [0.8]]

@@ -151,12 +151,13 @@ def optimum_progress(console: Console) -> Iterator[Report]:
 class Stopwatch(Callback):
     """Tells each member how many rollout steps per second the last training step made, gradient included.
 
-    `seconds` is what all training steps took so far, other processes of the same run included; neither compilation nor
+    `seconds` is what all training steps took so far, before an interruption too, in CPU time of the process: on a core of
+    its own that is wall-clock time, and it does not depend on what else the machine does. Neither compilation nor
     validations, figures and checkpoints count.
     """
 
     def __init__(self) -> None:
-        self._started = self.seconds = 0.0
+        self._started = self._cpu_started = self.seconds = 0.0
 
     def state_dict(self) -> dict[str, Any]:
         return {"seconds": self.seconds}
@@ -165,14 +166,14 @@ class Stopwatch(Callback):
         self.seconds = state_dict["seconds"]
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        self._started = time.perf_counter()
+        self._started, self._cpu_started = time.perf_counter(), time.process_time()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         module = trained_module(pl_module)
         seconds = time.perf_counter() - self._started
-        self.seconds += seconds
+        self.seconds += time.process_time() - self._cpu_started
         for member in module.members:
             steps = batch.shape[-2] * member.task.horizon.steps * trainer.world_size
             member.steps_per_second = steps / seconds

@@ -8,7 +8,7 @@ class Measurement:
     """One validation during a training."""
 
     environment_steps: int  # Euler steps of single trajectories so far
-    seconds: float  # of training so far; validations, figures and checkpoints are left out
+    seconds: float  # CPU time of training so far, compilation included; without validations, figures, checkpoints
     cost: float  # mean J_N of the validation states
     cost_ratio: float | None  # to their optimum, where there is an oracle
     constraint_loss: float | None  # of a lyapnet program

@@ -192,9 +192,9 @@ class BaselineTraining:
         rate = self.baseline.options_of_algorithm["learning_rate"]
         now = rate * remaining if self.baseline.setting.decays else rate
         self.model.lr_schedule = lambda _: now
-        started = time.perf_counter()
+        started = time.process_time()  # as lyapnet.callbacks.Stopwatch
         self.model.learn(self.baseline.piece, reset_num_timesteps=False, log_interval=10)
-        self.seconds += time.perf_counter() - started
+        self.seconds += time.process_time() - started
 
     def _validate(self) -> Measurement:
         """The policy on the validation states, logged under the tags of a lyapnet run."""

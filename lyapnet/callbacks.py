@@ -151,8 +151,8 @@ def optimum_progress(console: Console) -> Iterator[Report]:
 class Stopwatch(Callback):
     """Tells each member how many rollout steps per second the last training step made, gradient included.
 
-    `seconds` is what all training steps took so far, before an interruption too, in CPU time of the process: on a core of
-    its own that is wall-clock time, and it does not depend on what else the machine does. Neither compilation nor
+    `seconds` is what all training steps took so far, before an interruption too, in CPU time of the process: on a core
+    of its own that is wall-clock time, and it does not depend on what else the machine does. Neither compilation nor
     validations, figures and checkpoints count.
     """
 

@@ -330,6 +330,20 @@ def test_letters_stay_readable_in_print_and_methods_in_grey(comparison):
         assert len({look[index] for look in looks}) == len(looks)
 
 
+def test_a_legend_stays_within_its_figure_and_names_what_is_drawn(comparison):
+    alone = compared([one for one in everything() if one.task == "reacher"])
+    unknown = [
+        replace(one, optima=None, curve=[replace(p, cost_ratio=None) for p in one.curve]) for one in everything()
+    ]
+    for several in (comparison, alone, compared(unknown)):
+        for figure in map(drawn, (figures.figure3(several), figures.final(several))):
+            box, width = figure.legends[0].get_window_extent(), figure.bbox.width
+            assert 0 <= box.x0 < box.x1 <= width
+    names = {text.get_text() for text in figures.figure3(compared(unknown)).legends[0].get_texts()}
+    assert {"ours", "a seed diverges"} <= names
+    assert not {"optimum", "ours has converged"} & names
+
+
 def untrained(name):
     config = load_config(Path(__file__).parents[1] / f"conf/{name}.yaml", ["horizon.steps=6", "network.hidden=[8, 8]"])
     task = build_task(config)

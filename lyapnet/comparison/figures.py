@@ -45,8 +45,9 @@ FIGURE3_CAPTION = (
     "Vertical: where ours has converged."
 )
 FINAL_CAPTION = (
-    "J(x₀) / J*(x₀) of the best checkpoints on the evaluation states: a dot for each seed's interquartile mean over "
-    "the states; the marker is that over all seeds and states, the bar its 95 % bootstrap interval."
+    "J(x₀) / J*(x₀), or J_N itself without a known optimum, of the best checkpoints on the evaluation states: a dot "
+    "for each seed's interquartile mean over the states; the marker is that over all seeds and states, the bar its "
+    "95 % bootstrap interval."
 )
 
 
@@ -94,7 +95,7 @@ def validation_optimum(groups: Sequence[Group]) -> float | None:
 def figure3(comparison: Comparison) -> Figure:
     """Constraint loss, our cost and the baselines' cost against environment steps; a column for each task."""
     tasks = comparison.tasks
-    figure = Figure(figsize=(max(WIDTH * len(tasks) / 4, 3.4), 5.2), layout="constrained")
+    figure = Figure(figsize=(WIDTH * max(len(tasks), 2) / 4, 5.2), layout="constrained")
     grid = figure.subplots(3, len(tasks), sharex="col", squeeze=False)
     for column, task in zip(grid.T.tolist(), tasks, strict=True):
         _draw_task(column, comparison, task)
@@ -104,12 +105,14 @@ def figure3(comparison: Comparison) -> Figure:
                            strict=True):  # fmt: skip
         axes.set_ylabel(label, fontsize=LARGE)
     figure.align_ylabels(grid[:, 0])
-    _legend_below(figure, list(_handles(comparison)))
+    _legend_below(figure, list(_handles(comparison)), 1.4)
     return figure
 
 
-def _legend_below(figure: Figure, handles: list[Line2D]) -> None:
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=SMALL, frameon=False)
+def _legend_below(figure: Figure, handles: list[Line2D], inches: float) -> None:
+    """A legend in as many columns of that width as fit."""
+    columns = int(figure.get_size_inches()[0] / inches)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=SMALL, frameon=False)
 
 
 def _draw_task(column: Sequence[Axes], comparison: Comparison, task: str) -> None:
@@ -166,8 +169,10 @@ def _handles(comparison: Comparison) -> Iterator[Line2D]:
         yield Line2D([], [], color=color, linestyle=dashes, marker=marker, markersize=3, linewidth=1.1, label=label)
     if OURS in comparison.methods and len(comparison.methods) > 1:
         yield Line2D([], [], color=GREY, linewidth=1.1, label="ours, again")
-    yield Line2D([], [], color="black", linewidth=0.8, dashes=(4, 2), label="optimum")
-    yield Line2D([], [], color=GREY, linewidth=0.8, linestyle=":", label="ours has converged")
+    if any(validation_optimum(comparison.of_task(task)) for task in comparison.tasks):
+        yield Line2D([], [], color="black", linewidth=0.8, dashes=(4, 2), label="optimum")
+    if any(comparison.convergence_step(task) for task in comparison.tasks):
+        yield Line2D([], [], color=GREY, linewidth=0.8, linestyle=":", label="ours has converged")
     if any(math.isinf(p.cost) for group in comparison.groups.values() for r in group.results for p in r.curve):
         yield Line2D([], [], color="black", marker="x", markersize=3, linestyle="", label="a seed diverges")
 
@@ -194,7 +199,7 @@ def _name_decades(axis: Axis) -> None:
 def final(comparison: Comparison) -> Figure:
     """Cost over optimum of each method: its seeds, their interquartile mean and its interval; a panel for each task."""
     tasks, methods = comparison.tasks, comparison.methods
-    size = (max(WIDTH * len(tasks) / 4, 3.4), 1.1 + 0.28 * len(methods))
+    size = (WIDTH * max(len(tasks), 2) / 4, 1.1 + 0.28 * len(methods))
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
     for axes, task in zip(panels, tasks, strict=True):
@@ -211,7 +216,7 @@ def final(comparison: Comparison) -> Figure:
         Line2D([], [], color=GREY, marker=marker, linestyle=line, markersize=size, label=f"interquartile mean: {label}")
         for label, (marker, line, size) in meanings.items()
     ]
-    _legend_below(figure, handles)
+    _legend_below(figure, handles, 3)
     return figure
 
 

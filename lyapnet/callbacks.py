@@ -12,12 +12,10 @@ from statistics import fmean
 from types import FrameType
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, ProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -266,7 +264,7 @@ class FigureLogger(Callback):
             warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
             return
         for name, figure in drawn.items():
-            pictures.add_image(name, _pixels(figure), trainer.global_step, dataformats="HWC")
+            pictures.add_image(name, figures.pixels(figure), trainer.global_step, dataformats="HWC")
 
     @staticmethod
     def _figures(module: ProgramModule) -> dict[str, Figure]:
@@ -465,11 +463,3 @@ def trained_module(module: LightningModule) -> TrainedModule:
     """The module as what it is here."""
     assert isinstance(module, TrainedModule)
     return module
-
-
-def _pixels(figure: Figure):
-    """The figure as an array (height, width, 4) of bytes."""
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(110)
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())

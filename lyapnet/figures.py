@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import fmean
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
@@ -19,7 +20,7 @@ from torch import Tensor
 from lyapnet.bench import Accuracy, Row
 from lyapnet.evaluation import StateTable
 from lyapnet.programs.terms import hinge, satisfied
-from lyapnet.rollout import Rollout, Trajectory
+from lyapnet.rollout import Trajectory
 from lyapnet.sets import Box
 from lyapnet.sweep import Row as SweptRow
 from lyapnet.systems import ControlAffineSystem
@@ -65,7 +66,10 @@ def widest_axes(initial_states: Box) -> list[int]:
 
 
 def certified_region(
-    rollout: Rollout, system: ControlAffineSystem, initial_states: Box, tolerance: float = 1e-2
+    rollout: Callable[[State], Trajectory],
+    system: ControlAffineSystem,
+    initial_states: Box,
+    tolerance: float = 1e-2,
 ) -> Figure:
     """Which initial states of a slice of X₀ satisfy the Lyapunov condition along their whole closed loop.
 
@@ -104,7 +108,7 @@ def _draw_plane_region(
 ) -> None:
     first, second = (numpy_of(g) for g in region.grid)
     shape = (len(first), len(second))
-    levels = ["#F4C9A8", "#CFE6F3"]
+    levels = ["#E8A06A", "#CFE6F3"]  # of a different grey, too
     axes.pcolormesh(
         first, second, numpy_of(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
         shading="nearest", rasterized=True,
@@ -166,7 +170,7 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
     curves += [(control_label(system, i), numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
     columns = 1 if len(curves) < 4 else 2
     rows = -(-(len(curves) + 1) // columns)
-    figure = Figure(figsize=(4.8 * columns, 1.6 * rows + 0.4), layout="constrained")
+    figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels = list(grid.flatten(order="F"))
     for panel, (label, values_over_time, color) in zip(panels, curves, strict=False):
@@ -405,6 +409,14 @@ def _spread(region: Slice) -> list[int]:
 
 def _free_components(box: Box) -> int:
     return int((box.widths > 0).sum())
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    """The figure as (height, width, 4) bytes, as TensorBoard takes it."""
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(110)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())
 
 
 def numpy_of(tensor: Tensor) -> np.ndarray:

@@ -1,0 +1,268 @@
+"""The figures of a comparison: the paper's Fig. 3, the final costs, and its Figs. 1 and 4 of controllers."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from lyapnet.comparison.results import Measurement, Result
+from lyapnet.comparison.statistics import OURS, Comparison, Group, interquartile_mean, relative_costs, spread
+from lyapnet.comparison.tables import method_name, name_of
+from lyapnet.controller import Controller
+from lyapnet.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, VERMILION, certified_region, trajectories
+from lyapnet.randomness import FIGURES, stream
+
+WIDTH = 7.2  # inches: two columns of a paper, where the letters below stay above 7 pt
+SMALL, LARGE = 7, 8
+
+
+class Look(NamedTuple):
+    """How a method is drawn: without its colour, its dashes and its marker still tell it apart."""
+
+    color: str
+    dashes: Any  # as matplotlib's linestyle
+    marker: str
+
+
+LOOKS = {
+    OURS: Look(BLUE, "-", "o"),
+    "ppo_paper": Look(ORANGE, "--", "s"),
+    "ppo_tuned": Look(VERMILION, "-.", "D"),
+    "sac_paper": Look(GREEN, ":", "^"),
+    "sac_tuned": Look(PURPLE, (0, (5, 1, 1, 1, 1, 1)), "v"),
+}
+FIGURE3_CAPTION = (
+    "Against environment steps, Euler steps of single trajectories, on a logarithmic axis because ours stops where the "
+    "baselines have hardly begun: rows of constraint loss (ours), cost of ours, cost of the baselines with ours again "
+    "in grey. Lines are means over the seeds, bands their least and greatest, both by each seed's last validation and "
+    "only where all of them were validated and none has stopped. Horizontal: the optimum of the validation states. "
+    "Vertical: where ours has converged."
+)
+FINAL_CAPTION = (
+    "J(x₀) / J*(x₀), or J_N itself without a known optimum, of the best checkpoints on the evaluation states: a dot "
+    "for each seed's interquartile mean over the states; the marker is that over all seeds and states, the bar its "
+    "95 % bootstrap interval."
+)
+
+
+class Band(NamedTuple):
+    """Mean, least and greatest over the seeds at environment steps that all of them cover."""
+
+    steps: np.ndarray
+    mean: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def band(results: Sequence[Result], measure: Callable[[Measurement], float | None]) -> Band | None:
+    """A measure over the seeds, on the union of their validation steps.
+
+    Between validations a seed keeps its last one: costs lie orders of magnitude apart, or diverged, and a line between
+    two of them would show what nobody measured. Step 0 is left out, which a logarithmic axis does not have.
+    """
+    curves = [[(p.environment_steps, value) for p in r.curve if (value := measure(p)) is not None] for r in results]
+    if not curves or not all(curves):
+        return None
+    first, last = max(curve[0][0] for curve in curves), min(curve[-1][0] for curve in curves)
+    steps = np.array(sorted({step for curve in curves for step, _ in curve if max(first, 1) <= step <= last}))
+    if not len(steps):
+        return None
+    values = np.array([_held(curve, steps) for curve in curves])
+    return Band(steps, values.mean(0), values.min(0), values.max(0))
+
+
+def _held(curve: Sequence[tuple[int, float]], steps: np.ndarray) -> np.ndarray:
+    """The last value at or before each step."""
+    at, values = np.array([step for step, _ in curve]), np.array([value for _, value in curve], dtype=float)
+    return values[np.searchsorted(at, steps, side="right") - 1]
+
+
+def validation_optimum(groups: Sequence[Group]) -> float | None:
+    """The cost at which the validations' cost / optimum is 1: not that of the evaluation states, which are others."""
+    points = (point for group in groups for result in group.results for point in result.curve)
+    return next((p.cost / p.cost_ratio for p in points if p.cost_ratio and math.isfinite(p.cost)), None)
+
+
+# Fig. 3
+
+
+def figure3(comparison: Comparison) -> Figure:
+    """Constraint loss, our cost and the baselines' cost against environment steps; a column for each task."""
+    tasks = comparison.tasks
+    figure = Figure(figsize=(WIDTH * max(len(tasks), 2) / 4, 5.2), layout="constrained")
+    grid = figure.subplots(3, len(tasks), sharex="col", squeeze=False)
+    for column, task in zip(grid.T.tolist(), tasks, strict=True):
+        _draw_task(column, comparison, task)
+        column[0].set_title(name_of(task), fontsize=LARGE)
+        column[-1].set_xlabel("environment steps", fontsize=LARGE)
+    for axes, label in zip(grid[:, 0], ("constraint loss\n(cost)", "ours: $J_N$\n(cost)", "baselines: $J_N$\n(cost)"),
+                           strict=True):  # fmt: skip
+        axes.set_ylabel(label, fontsize=LARGE)
+    figure.align_ylabels(grid[:, 0])
+    _legend_below(figure, list(_handles(comparison)), 1.4)
+    return figure
+
+
+def _legend_below(figure: Figure, handles: list[Line2D], inches: float) -> None:
+    """A legend in as many columns of that width as fit."""
+    columns = int(figure.get_size_inches()[0] / inches)
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=SMALL, frameon=False)
+
+
+def _draw_task(column: Sequence[Axes], comparison: Comparison, task: str) -> None:
+    loss, ours, theirs = column
+    step, optimum = comparison.convergence_step(task), validation_optimum(comparison.of_task(task))
+    for group in comparison.of_task(task):
+        if group.method == OURS:
+            _draw_band(loss, group, lambda point: point.constraint_loss)
+            _draw_band(ours, group, _cost)
+            _draw_band(theirs, group, _cost, Look(GREY, "-", ""))
+        else:
+            _draw_band(theirs, group, _cost)
+    for axes in column:
+        axes.set(xscale="log", yscale="log")
+        if axes is not loss and optimum:
+            axes.axhline(optimum, color="black", linewidth=0.8, dashes=(4, 2))
+        if step:
+            axes.axvline(step, color=GREY, linewidth=0.8, linestyle=":")
+        _plain(axes)
+        _name_decades(axes.yaxis)
+
+
+def _cost(point: Measurement) -> float:
+    return point.cost
+
+
+def _draw_band(
+    axes: Axes, group: Group, measure: Callable[[Measurement], float | None], look: Look | None = None
+) -> None:
+    drawn = band(group.results, measure)
+    if drawn is None:
+        return
+    color, dashes, marker = look or look_of(group.method)
+    finite = np.isfinite(drawn.mean)
+    every = max(1, len(drawn.steps) // 5)
+    axes.plot(
+        drawn.steps, np.where(finite, drawn.mean, np.nan), linestyle=dashes, color=color, marker=marker, markersize=3,
+        markevery=every, linewidth=1.1,
+    )  # fmt: skip
+    axes.fill_between(drawn.steps, drawn.low, drawn.high, where=finite.tolist(), color=color, alpha=0.2, linewidth=0)
+    top = np.full((~finite).sum(), 0.97)
+    axes.plot(drawn.steps[~finite], top, "x", color=color, markersize=3, transform=axes.get_xaxis_transform())
+
+
+def look_of(method: str) -> Look:
+    """How a method is drawn, also one that is not known here."""
+    return LOOKS.get(method, Look(CYCLE[sum(map(ord, method)) % len(CYCLE)], (0, (1, 3)), "P"))
+
+
+def _handles(comparison: Comparison) -> Iterator[Line2D]:
+    for method in comparison.methods:
+        color, dashes, marker = look_of(method)
+        label = "ours" if method == OURS else method_name(method)
+        yield Line2D([], [], color=color, linestyle=dashes, marker=marker, markersize=3, linewidth=1.1, label=label)
+    if OURS in comparison.methods and len(comparison.methods) > 1:
+        yield Line2D([], [], color=GREY, linewidth=1.1, label="ours, again")
+    if any(validation_optimum(comparison.of_task(task)) for task in comparison.tasks):
+        yield Line2D([], [], color="black", linewidth=0.8, dashes=(4, 2), label="optimum")
+    if any(comparison.convergence_step(task) for task in comparison.tasks):
+        yield Line2D([], [], color=GREY, linewidth=0.8, linestyle=":", label="ours has converged")
+    if any(math.isinf(p.cost) for group in comparison.groups.values() for r in group.results for p in r.curve):
+        yield Line2D([], [], color="black", marker="x", markersize=3, linestyle="", label="a seed diverges")
+
+
+def _plain(axes: Axes) -> None:
+    axes.tick_params(which="both", labelsize=SMALL)
+    axes.tick_params(which="minor", length=1.5)
+    axes.grid(color=GREY, alpha=0.25, linewidth=0.5)
+
+
+def _name_decades(axis: Axis) -> None:
+    """Numbers at 1, 2 and 5 where a logarithmic axis has few decades, powers of ten where it has many."""
+    low, high = axis.get_view_interval()
+    few = high < 30 * low
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,), numticks=7))
+    if high < 1e4 * low:
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+# What each method ends with
+
+
+def final(comparison: Comparison) -> Figure:
+    """Cost over optimum of each method: its seeds, their interquartile mean and its interval; a panel for each task."""
+    tasks, methods = comparison.tasks, comparison.methods
+    size = (WIDTH * max(len(tasks), 2) / 4, 1.1 + 0.28 * len(methods))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+    for axes, task in zip(panels, tasks, strict=True):
+        relative = all(group.relative_cost for group in comparison.of_task(task))
+        for group in comparison.of_task(task):
+            _draw_seeds(axes, group, methods.index(group.method), relative)
+        _draw_scale(axes, relative)
+        axes.set_title(name_of(task), fontsize=LARGE)
+    labels = ["ours" if method == OURS else method_name(method) for method in methods]
+    panels[0].set_yticks(range(len(methods)), labels, fontsize=SMALL)
+    panels[0].set_ylim(len(methods) - 0.5, -0.5)
+    meanings = {"a seed": ("o", "", 2.5), "all seeds, with 95 % interval": ("s", "-", 5)}
+    handles = [
+        Line2D([], [], color=GREY, marker=marker, linestyle=line, markersize=size, label=f"interquartile mean: {label}")
+        for label, (marker, line, size) in meanings.items()
+    ]
+    _legend_below(figure, handles, 3)
+    return figure
+
+
+def _draw_seeds(axes: Axes, group: Group, row: int, relative: bool) -> None:
+    measured = (relative_costs(result) if relative else result.costs for result in group.results)
+    table = [np.asarray(one, dtype=float) for one in measured if one is not None]
+    color, _, marker = look_of(group.method)
+    _, _, middle, low, high, *_ = spread(table)
+    for seed in map(interquartile_mean, table):
+        _draw_dot(axes, seed, row + 0.22, "o", color, 2.5)
+    if low is not None and high is not None and math.isfinite(high):
+        axes.plot([low, high], [row, row], color=color, linewidth=1.4)
+    _draw_dot(axes, middle, row, marker, color, 5)
+
+
+def _draw_dot(axes: Axes, x: float, y: float, marker: str, color: str, size: float) -> None:
+    """At its place, or as an arrowhead at the right edge if it diverged."""
+    if math.isfinite(x):
+        axes.plot(x, y, marker, color=color, markersize=size, markeredgewidth=0)
+    else:
+        axes.plot(0.97, y, ">", color=color, markersize=size, transform=axes.get_yaxis_transform())
+
+
+def _draw_scale(axes: Axes, relative: bool) -> None:
+    axes.set_xscale("log")
+    axes.set_xlabel("$J$ / $J^*$" if relative else "$J_N$ (cost)", fontsize=LARGE)
+    if relative:
+        axes.axvline(1, color="black", linewidth=0.8, dashes=(4, 2))
+        axes.set_xlim(left=0.9)
+    _plain(axes)
+    _name_decades(axes.xaxis)
+
+
+# Figs. 1 and 4
+
+
+def pictures(controllers: Mapping[str, Controller]) -> dict[str, Figure]:
+    """Name ↦ figure of learned controllers, task ↦ controller: trajectories with V (the paper's Fig. 4).
+
+    Of Lyapunov programs also where their condition holds (Fig. 1): a value function is not trained to satisfy it.
+    """
+    drawn = {}
+    for task, controller in controllers.items():
+        if controller.config.program.name == "lyapunov":
+            figure = certified_region(controller.rollout, controller.system, controller.initial_states)
+            drawn[f"certified_region_{task}"] = figure
+        x0 = controller.initial_states.sample(12, stream(controller.config.seed, FIGURES))
+        drawn[f"trajectories_{task}"] = trajectories(controller.rollout(x0), controller.system)
+    return drawn

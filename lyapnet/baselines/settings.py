@@ -38,7 +38,8 @@ SETTINGS: dict[str, Setting] = {
         },
     ),
     # What the task is: a finite horizon (time is seen, nothing lies beyond the end, nothing is discounted), in units
-    # of its own; a small exploration noise to begin with, since the action box leaves room for all of X₀.
+    # of its own; a small exploration noise to begin with, since the action box leaves room for all of X₀; and, as the
+    # terminal cost is most of the return, long eligibility traces (PPO) and returns of several steps (SAC).
     "ppo_tuned": Setting(
         PPO, environments=64, observe_time=True, normalise=True, truncates=False, decays=True,
         options={
@@ -48,6 +49,9 @@ SETTINGS: dict[str, Setting] = {
     ),
     "sac_tuned": Setting(
         SAC, environments=16, observe_time=True, normalise=True, truncates=False, decays=True,
-        options={"learning_rate": 1e-3, "batch_size": 256, "tau": 0.005, "gamma": 1.0, "train_freq": 1},
+        options={
+            "learning_rate": 1e-3, "batch_size": 256, "tau": 0.02, "gamma": 1.0, "train_freq": 1, "n_steps": 10,
+            "ent_coef": "auto_0.1",
+        },
     ),
 }  # fmt: skip

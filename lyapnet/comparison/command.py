@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -53,9 +54,10 @@ def compare(
         return
     jobs = jobs_of(comparison, _names(tasks), _names(methods), seeds)
     missing = [] if report else [one for one in jobs if one.result is None]
-    command = [sys.executable, "-m", "lyapnet", "compare", "--config", str(config), *(overrides or []), "--job"]
-    failed = _run(missing, len(jobs), command, workers or os.cpu_count() or 1, ray, console)
-    _report(comparison, console)
+    command = ["compare", "--config", str(config), *(overrides or [])]
+    worker = [sys.executable, "-m", "lyapnet", *command, "--job"]
+    failed = _run(missing, len(jobs), worker, workers or os.cpu_count() or 1, ray, console)
+    _report(comparison, command, console)
     if failed:
         raise LyapnetError(f"Expected {len(jobs)} jobs, {failed} failed; the same command tries them again.")
 
@@ -128,13 +130,27 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _report(comparison: Any, console: Console) -> None:
-    """Write what all finished jobs say."""
+def _report(comparison: Any, command: Sequence[str], console: Console) -> None:
+    """Write and show what all finished jobs say."""
+    from lyapnet.comparison import layout, tables
     from lyapnet.comparison.plan import jobs_of
+    from lyapnet.comparison.report import write_report
     from lyapnet.comparison.results import with_common_optima
+    from lyapnet.comparison.statistics import compared
+    from lyapnet.comparison.training import controllers_of
 
-    results = [result for one in jobs_of(comparison) if (result := one.result) is not None]
+    jobs = jobs_of(comparison)
+    results = with_common_optima([result for job in jobs if (result := job.result) is not None])
     if not results:
         console.print("no job is finished: nothing to report", soft_wrap=True)
         return
-    _ = with_common_optima(results)
+    planned = [(job.task, job.method, job.seed) for job in jobs]
+    wrote = write_report(
+        results, comparison.folder / "report", command=shlex.join(["lyapnet", *command]), planned=planned,
+        controllers=controllers_of(jobs),
+    )  # fmt: skip
+    summary = compared(results)
+    console.print(layout.terminal(tables.summary(summary)))
+    for line in tables.missing(summary, planned):
+        console.print(line, soft_wrap=True, markup=False)
+    console.print(f"wrote {wrote[0]} and {len(wrote) - 1} files beside it", soft_wrap=True)

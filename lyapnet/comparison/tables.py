@@ -1,7 +1,7 @@
 """The tables of a comparison: the paper's Table I in both forms of the cost, the details, and every result in a row."""
 
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from math import isfinite
 from statistics import stdev
 from typing import Any, NamedTuple
@@ -216,6 +216,14 @@ def details(comparison: Comparison) -> Table:
         Column("clipped", ("clipped_fraction",), share),
     ]  # fmt: skip
     return Table("Details, in J_N", columns, rows, "task")
+
+
+def summary(comparison: Comparison) -> Table:
+    """The columns of the details that fit into a terminal."""
+    table = details(comparison)
+    shown = ("task", "method", "seeds", "cost / J*", "/ ours", "steps to 10 %", "seconds to 10 %", "speedup")
+    columns = [column for column in table.columns if column.heading in shown]
+    return replace(table, title="Cost against the optimum; / ours: where ours has converged", columns=columns)
 
 
 def _detail(comparison: Comparison, group: Group) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from lyapnet.build import build_program, resolve
 from lyapnet.comparison.plan import OURS, RESULT, Job
 from lyapnet.comparison.results import Measurement, Result
 from lyapnet.config import to_plain
-from lyapnet.controller import load
+from lyapnet.controller import Controller, load
 from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation import measure
 from lyapnet.event_files import curve
@@ -93,14 +93,27 @@ def _lyapnet(job: Job, console: Console) -> Result:
         plan = plan_run(point.path, point.settings, resume=last)
         fit(plan, console)
         run = plan.run
-    network = resolve(config.network.name, NETWORKS, "network.name", nn.Module)
-    controller = load(run.best, system=bounded.task.system, network=network)
+    controller = _controller(job, run.best)
     costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states)
     with torch.no_grad():
         constraint_loss = measure(controller.rollout(states), build_program(config)).constraint_loss
     compilation = run.record().get("compilation_seconds", 0.0)
     validations = _validations(run, config.training.batch_size * config.horizon.steps, compilation)
     return _result(job, states, costs, validations, run.best, compilation, float(constraint_loss.mean()))
+
+
+def _controller(job: Job, checkpoint: Path) -> Controller:
+    network = resolve(job.config.network.name, NETWORKS, "network.name", nn.Module)
+    return load(checkpoint, system=job.bounded.task.system, network=network)
+
+
+def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
+    """task ↦ the controller of its first finished job of lyapnet."""
+    found: dict[str, Controller] = {}
+    for job in jobs:
+        if job.method == OURS and job.task not in found and (result := job.result) is not None:
+            found[job.task] = _controller(job, Path(result.checkpoint))
+    return found
 
 
 def _validations(run: Run, steps: int, compilation: float) -> list[Measurement]:

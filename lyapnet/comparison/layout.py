@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.table import Column as RichColumn
 from rich.table import Table as RichTable
 
@@ -104,7 +105,8 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 def terminal(table: Table) -> RichTable:
     """The table as `rich` prints it."""
     first, *others = (column.heading for column in table.columns)
-    shown = RichTable(first, *(RichColumn(heading, justify="right") for heading in others), title=table.title)
+    columns = [RichColumn(first, no_wrap=True), *(RichColumn(name, justify="right", no_wrap=True) for name in others)]
+    shown = RichTable(*columns, title=table.title, box=SIMPLE, padding=0)
     for cells, ends in zip(table.cells(), table.breaks(), strict=True):
         shown.add_row(*cells, end_section=ends)
     return shown

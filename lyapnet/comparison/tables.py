@@ -70,7 +70,8 @@ NOTES = (
     "Every method is scored by one evaluator on the same evaluation states of X₀, which no training saw, with the "
     "checkpoint of its least validation cost.",
     "Environment steps are Euler steps of single trajectories: steps times batch. Validations are not counted.",
-    "Seconds are of training alone: validations, figures and checkpoints are left out, compilation is not.",
+    "Seconds are CPU time of training alone, on one thread, which is wall-clock time on a core of its own: "
+    "validations, figures and checkpoints are left out, compilation is not.",
     "mean ± std: over the seeds, of their means over the states, with n − 1. IQM: mean of the middle half of all "
     "seeds × states, with its 95 % percentile bootstrap interval by resampling seeds (2,000 times, generator seed 0); "
     "of three seeds that is about their range. It leaves out the costliest states of X₀ and so can lie below the mean "
@@ -219,11 +220,16 @@ def details(comparison: Comparison) -> Table:
 
 
 def summary(comparison: Comparison) -> Table:
-    """The columns of the details that fit into a terminal."""
-    table = details(comparison)
-    shown = ("task", "method", "seeds", "cost / J*", "/ ours", "steps to 10 %", "seconds to 10 %", "speedup")
-    columns = [column for column in table.columns if column.heading in shown]
-    return replace(table, title="Cost against the optimum; / ours: where ours has converged", columns=columns)
+    """What of the details fits into a terminal."""
+    columns = [
+        Column("task", ("task",), name_of), Column("method", ("method",), method_name),
+        Column("cost/J*", ("cost_ratio",), _ratio), Column("/ours*", ("at_convergence_factor",), factor),
+        Column("to 10 %", ("to_10_reached", "to_10_seeds"), lambda reached, seeds: f"{reached} of {seeds}"),
+        Column("k steps", ("to_10_steps",), lambda value: number(value / 1000)),
+        Column("s", ("to_10_seconds",), number), Column("speedup", ("speedup", "speedup_at_least"), factor),
+    ]  # fmt: skip
+    title = "Cost against the optimum\n* where ours has converged; to 10 %: seeds that got there, steps, seconds"
+    return replace(details(comparison), title=title, columns=columns)
 
 
 def _detail(comparison: Comparison, group: Group) -> dict[str, Any]:

@@ -49,6 +49,9 @@ def brief(arguments: list[str]) -> list[str]:
         return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]
     if arguments[:2] == ["bench", "certify"]:
         return [*arguments, "--dimensions", "1", "--boxes", "2", "--repeats", "1", "--seconds", "1"]
+    if arguments[0] == "compare":
+        config, tasks = "conf/compare_smoke.yaml", ["--tasks", "double_integrator", "--methods", "lyapnet,ppo_tuned"]
+        return ["compare", "--config", config, *tasks, "--workers", "2"]
     if "--seconds" in arguments:
         at = arguments.index("--seconds")
         short = SHORT if "--refine" in arguments else []
@@ -80,7 +83,7 @@ def test_every_command_runs(workplace, capsys):
 
 def test_the_python_example_runs(workplace):
     assert train(["--config", "conf/double_integrator.yaml"]) == 0
-    (example,) = [block for block in blocks("python") if "lyapnet.load" in block]
+    (example,) = [block for block in blocks("python") if "controller.rollout" in block]
     names: dict = {}
     exec(example, names)
     assert names["u"].shape == (1,)
@@ -88,6 +91,14 @@ def test_the_python_example_runs(workplace):
     (example,) = [block for block in blocks("python") if "oracle_of" in block]
     exec(example, names)
     assert names["optima"].cost.shape == (4,)
+
+
+def test_the_environment_example_runs(workplace):
+    assert train(["--config", "conf/double_integrator.yaml"]) == 0
+    (example,) = [block for block in blocks("python") if "gymnasium.make" in block]
+    names: dict = {}
+    exec(example, names)
+    assert names["mean_return"] < 0
 
 
 def test_a_system_of_your_own(workplace):

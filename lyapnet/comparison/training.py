@@ -21,7 +21,6 @@ from lyapnet.controller import Controller, load
 from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation import measure
 from lyapnet.event_files import curve
-from lyapnet.experiment import fit, plan_run
 from lyapnet.networks import NETWORKS
 from lyapnet.oracles import oracle_of
 from lyapnet.randomness import TEST, stream
@@ -81,6 +80,8 @@ def _description(job: Job) -> dict[str, Any]:
 
 
 def _lyapnet(job: Job, console: Console) -> Result:
+    from lyapnet.experiment import fit, plan_run  # Lightning takes seconds to import: baselines do without
+
     point, config, bounded, states = (
         Point(Path(job.compared.config), job.settings),
         job.config,

@@ -39,7 +39,8 @@ SETTINGS: dict[str, Setting] = {
     ),
     # What the task is: a finite horizon (time is seen, nothing lies beyond the end, nothing is discounted), in units
     # of its own; a small exploration noise to begin with, since the action box leaves room for all of X₀; and, as the
-    # terminal cost is most of the return, long eligibility traces (PPO) and returns of several steps (SAC).
+    # terminal cost is most of the return, long eligibility traces (PPO) and returns of several steps (SAC). Whole
+    # episodes between updates: all trajectories are in step, and a rollout of a part of them forgets the other parts.
     "ppo_tuned": Setting(
         PPO, environments=64, observe_time=True, normalise=True, truncates=False, decays=True,
         options={

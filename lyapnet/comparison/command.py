@@ -151,6 +151,6 @@ def _report(comparison: Any, command: Sequence[str], console: Console) -> None:
     )  # fmt: skip
     summary = compared(results)
     console.print(layout.terminal(tables.summary(summary)))
-    for line in tables.missing(summary, planned):
-        console.print(line, soft_wrap=True, markup=False)
+    if lacking := len(planned) - len(results):
+        console.print(f"{lacking} of {len(planned)} jobs are missing; the same command goes on", soft_wrap=True)
     console.print(f"wrote {wrote[0]} and {len(wrote) - 1} files beside it", soft_wrap=True)

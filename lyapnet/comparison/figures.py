@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from lyapnet.comparison.results import Measurement, Result
-from lyapnet.comparison.statistics import OURS, Comparison, Group, interquartile_mean, relative_costs, spread
+from lyapnet.comparison.statistics import NEAR, OURS, Comparison, Group, interquartile_mean, relative_costs, spread
 from lyapnet.comparison.tables import method_name, name_of
 from lyapnet.controller import Controller
 from lyapnet.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, VERMILION, certified_region, trajectories
@@ -20,6 +21,7 @@ from lyapnet.randomness import FIGURES, stream
 
 WIDTH = 7.2  # inches: two columns of a paper, where the letters below stay above 7 pt
 SMALL, LARGE = 7, 8
+LEAST_LOSS, LEAST_GAP = 1e-6, 1e-5  # that are drawn: in cost, and as a share of the optimum
 
 
 class Look(NamedTuple):
@@ -39,10 +41,11 @@ LOOKS = {
 }
 FIGURE3_CAPTION = (
     "Against environment steps, Euler steps of single trajectories, on a logarithmic axis because ours stops where the "
-    "baselines have hardly begun: rows of constraint loss (ours), cost of ours, cost of the baselines with ours again "
-    "in grey. Lines are means over the seeds, bands their least and greatest, both by each seed's last validation and "
-    "only where all of them were validated and none has stopped. Horizontal: the optimum of the validation states. "
-    "Vertical: where ours has converged."
+    "baselines have hardly begun: rows of constraint loss (ours), optimality gap of ours, that of the baselines with "
+    "ours again in grey. The gap is cost / optimum − 1 on each seed's validation states. Lines are means over the "
+    "seeds, bands their least and greatest, both by each seed's last validation and only where all of them were "
+    "validated and none has stopped; losses below 1e-6 and gaps below 1e-5 are drawn there. Vertical: where ours has "
+    "converged."
 )
 FINAL_CAPTION = (
     "J(x₀) / J*(x₀), or J_N itself without a known optimum, of the best checkpoints on the evaluation states: a dot "
@@ -83,10 +86,10 @@ def _held(curve: Sequence[tuple[int, float]], steps: np.ndarray) -> np.ndarray:
     return values[np.searchsorted(at, steps, side="right") - 1]
 
 
-def validation_optimum(groups: Sequence[Group]) -> float | None:
-    """The cost at which the validations' cost / optimum is 1: not that of the evaluation states, which are others."""
-    points = (point for group in groups for result in group.results for point in result.curve)
-    return next((p.cost / p.cost_ratio for p in points if p.cost_ratio and math.isfinite(p.cost)), None)
+def is_relative(comparison: Comparison) -> bool:
+    """Whether every validation is known against the optimum of its states, which are others for each seed."""
+    results = [result for group in comparison.groups.values() for result in group.results]
+    return all(point.cost_ratio is not None for result in results for point in result.curve)
 
 
 # Fig. 3
@@ -94,15 +97,16 @@ def validation_optimum(groups: Sequence[Group]) -> float | None:
 
 def figure3(comparison: Comparison) -> Figure:
     """Constraint loss, our cost and the baselines' cost against environment steps; a column for each task."""
-    tasks = comparison.tasks
+    tasks, relative = comparison.tasks, is_relative(comparison)
     figure = Figure(figsize=(WIDTH * max(len(tasks), 2) / 4, 5.2), layout="constrained")
     grid = figure.subplots(3, len(tasks), sharex="col", squeeze=False)
     for column, task in zip(grid.T.tolist(), tasks, strict=True):
-        _draw_task(column, comparison, task)
+        _draw_task(column, comparison, task, relative)
         column[0].set_title(name_of(task), fontsize=LARGE)
         column[-1].set_xlabel("environment steps", fontsize=LARGE)
-    for axes, label in zip(grid[:, 0], ("constraint loss\n(cost)", "ours: $J_N$\n(cost)", "baselines: $J_N$\n(cost)"),
-                           strict=True):  # fmt: skip
+    cost = "optimality gap" if relative else "$J_N$ (cost)"
+    labels = ("constraint loss\n(cost)", f"ours:\n{cost}", f"baselines:\n{cost}")
+    for axes, label in zip(grid[:, 0], labels, strict=True):
         axes.set_ylabel(label, fontsize=LARGE)
     figure.align_ylabels(grid[:, 0])
     _legend_below(figure, list(_handles(comparison)), 1.4)
@@ -115,28 +119,34 @@ def _legend_below(figure: Figure, handles: list[Line2D], inches: float) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=SMALL, frameon=False)
 
 
-def _draw_task(column: Sequence[Axes], comparison: Comparison, task: str) -> None:
+def _draw_task(column: Sequence[Axes], comparison: Comparison, task: str, relative: bool) -> None:
     loss, ours, theirs = column
-    step, optimum = comparison.convergence_step(task), validation_optimum(comparison.of_task(task))
+    step, cost = comparison.convergence_step(task), _shown_gap if relative else attrgetter("cost")
     for group in comparison.of_task(task):
         if group.method == OURS:
-            _draw_band(loss, group, lambda point: point.constraint_loss)
-            _draw_band(ours, group, _cost)
-            _draw_band(theirs, group, _cost, Look(GREY, "-", ""))
+            _draw_band(loss, group, _shown_loss)
+            _draw_band(ours, group, cost)
+            _draw_band(theirs, group, cost, Look(GREY, "-", ""))
         else:
-            _draw_band(theirs, group, _cost)
+            _draw_band(theirs, group, cost)
     for axes in column:
         axes.set(xscale="log", yscale="log")
-        if axes is not loss and optimum:
-            axes.axhline(optimum, color="black", linewidth=0.8, dashes=(4, 2))
+        if axes is not loss and relative:
+            axes.axhline(NEAR - 1, color="black", linewidth=0.8, dashes=(4, 2))
         if step:
             axes.axvline(step, color=GREY, linewidth=0.8, linestyle=":")
         _plain(axes)
         _name_decades(axes.yaxis)
+        axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _cost(point: Measurement) -> float:
-    return point.cost
+def _shown_gap(point: Measurement) -> float | None:
+    return None if point.cost_ratio is None else max(point.cost_ratio - 1, LEAST_GAP)
+
+
+def _shown_loss(point: Measurement) -> float | None:
+    """A logarithmic axis has no 0, which a hinge reaches."""
+    return None if point.constraint_loss is None else max(point.constraint_loss, LEAST_LOSS)
 
 
 def _draw_band(
@@ -169,8 +179,8 @@ def _handles(comparison: Comparison) -> Iterator[Line2D]:
         yield Line2D([], [], color=color, linestyle=dashes, marker=marker, markersize=3, linewidth=1.1, label=label)
     if OURS in comparison.methods and len(comparison.methods) > 1:
         yield Line2D([], [], color=GREY, linewidth=1.1, label="ours, again")
-    if any(validation_optimum(comparison.of_task(task)) for task in comparison.tasks):
-        yield Line2D([], [], color="black", linewidth=0.8, dashes=(4, 2), label="optimum")
+    if is_relative(comparison):
+        yield Line2D([], [], color="black", linewidth=0.8, dashes=(4, 2), label="10 % above the optimum")
     if any(comparison.convergence_step(task) for task in comparison.tasks):
         yield Line2D([], [], color=GREY, linewidth=0.8, linestyle=":", label="ours has converged")
     if any(math.isinf(p.cost) for group in comparison.groups.values() for r in group.results for p in r.curve):

@@ -21,7 +21,10 @@ SMALL = {
     "ppo": {"n_steps": 6, "batch_size": 24, "n_epochs": 2},
     "sac": {"batch_size": 8, "learning_starts": 30, "buffer_size": 600},
 }  # fmt: skip
-pytestmark = pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:You have specified a mini-batch size"),
+    pytest.mark.filterwarnings("ignore:.*n_steps=.* is ignored because a custom"),  # SB3 on loading its own buffer
+]
 
 
 @pytest.fixture(autouse=True)
@@ -66,7 +69,7 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
     best = best_checkpoint(tmp_path)
     assert best.step == steps[int(np.argmin(costs))]
     model = {"ppo": PPO, "sac": SAC}[method[:3]].load(best.folder / "model.zip")
-    assert model.policy.net_arch in ([8], {"pi": [8], "vf": [8]})
+    assert model.policy.net_arch == [8]
     path, measured = costs_of_best(baseline, tmp_path, training.states)
     assert path == best.folder / "model.zip"
     assert float(measured.cost.mean()) == pytest.approx(min(costs), rel=1e-5), "the best one is what is measured"
@@ -75,10 +78,11 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
 
 @pytest.mark.parametrize("method", SETTINGS)
 def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
-    baseline = baseline_of(method, 1200)
+    baseline = baseline_of(method, 2400)
     whole = trained(tmp_path / "whole", baseline)
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "parts", baseline, pieces=1)
+        trained(tmp_path / "parts", baseline, pieces=3)
+    assert 0 < checkpoints(tmp_path / "parts")[-1].step < whole.curve[-3].environment_steps
     torch.manual_seed(5)  # a new process knows nothing of the old one's streams
     np.random.seed(5)  # noqa: NPY002
     resumed = trained(tmp_path / "parts", baseline)
@@ -87,7 +91,7 @@ def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
         assert torch.equal(one, other)
     drawn = [step for _, step, _ in curve(tmp_path / "parts", "trajectory_cost/val")]
     assert sorted(drawn) == [p.environment_steps for p in whole.curve], "logged once"
-    other = trained(tmp_path / "other", baseline_of(method, 1200, seed=1))
+    other = trained(tmp_path / "other", baseline_of(method, 2400, seed=1))
     assert other.curve[-1].cost != whole.curve[-1].cost
 
 

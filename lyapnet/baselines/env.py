@@ -206,7 +206,8 @@ class VectorEnvironment(VecEnv):
         }  # fmt: skip
 
     def resume(self, position: dict[str, Any]) -> None:
-        """Go on from a `position`."""
+        """Go on from a `position`, whatever seed was asked for since."""
+        self._reset_seeds()
         self.generator.set_state(position["generator"])
         for name in ("state", "step", "clipped", "controls"):
             setattr(self.episodes, name, position[name])

@@ -4,6 +4,8 @@ import json
 import shutil
 import tempfile
 import time
+import warnings
+from collections import ChainMap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -82,21 +84,21 @@ class Baseline:
 
     @property
     def options_of_algorithm(self) -> dict[str, Any]:
-        """The setting's, and what replaces them."""
-        return {**self.setting.options, **self.options}
+        """The setting's, and what replaces them; those of its network one by one."""
+        merged = {**self.setting.options, **self.options}
+        policies = (options.get("policy_kwargs", {}) for options in (self.setting.options, self.options))
+        return {**merged, "policy_kwargs": dict(ChainMap(*reversed([*policies]), {"net_arch": list(self.hidden)}))}
 
     def model(self, environment: VecEnv) -> BaseAlgorithm:
         """The untrained model."""
-        hidden, options = list(self.hidden), self.options_of_algorithm
         create: Any = self.setting.algorithm
-        policy = {"net_arch": hidden, **options.pop("policy_kwargs", {})}
+        options = self.options_of_algorithm
         if issubclass(create, OnPolicyAlgorithm):
-            policy["net_arch"] = {"pi": hidden, "vf": hidden}
             steps = options.setdefault("n_steps", self.bounded.task.horizon.steps)
             options.setdefault("batch_size", max(steps * self.setting.environments // MINIBATCHES, 1))
         else:
             options.setdefault("buffer_size", min(BUFFER, self.steps + self.piece))
-        return create("MlpPolicy", environment, policy_kwargs=policy, seed=self.seed, device="cpu", **options)
+        return create("MlpPolicy", environment, seed=self.seed, device="cpu", **options)
 
 
 class BaselinePolicy(NamedTuple):
@@ -133,8 +135,13 @@ class Checkpoint(NamedTuple):
         """The policy as it was then."""
         kept = self.folder / NORMALISATION
         environment = baseline.wrapped(baseline.environment(), kept if kept.is_file() else None)
-        model = baseline.setting.algorithm.load(self.folder / MODEL, device="cpu")
-        return BaselinePolicy(model, environment if isinstance(environment, VecNormalize) else None)
+        return BaselinePolicy(self.model(baseline), environment if isinstance(environment, VecNormalize) else None)
+
+    def model(self, baseline: Baseline, environment: VecEnv | None = None) -> BaseAlgorithm:
+        """The model as it was then."""
+        with warnings.catch_warnings():  # SB3 takes its own buffer of returns of several steps for the user's
+            warnings.filterwarnings("ignore", ".*n_steps=.* is ignored because a custom.*")
+            return baseline.setting.algorithm.load(self.folder / MODEL, environment, device="cpu", force_reset=False)
 
 
 def checkpoints(folder: Path) -> list[Checkpoint]:
@@ -244,13 +251,11 @@ class BaselineTraining:
         drop_events_after(self.folder, checkpoint.step)
         kept = checkpoint.folder / NORMALISATION
         self.environment = self.baseline.wrapped(self.episodes, kept if kept.is_file() else None)
-        self.model = self.baseline.setting.algorithm.load(
-            checkpoint.folder / MODEL, self.environment, device="cpu", force_reset=False
-        )
+        self.model = checkpoint.model(self.baseline, self.environment)
         if isinstance(self.model, OffPolicyAlgorithm):
             self.model.load_replay_buffer(checkpoint.folder / REPLAY)
         streams = torch.load(checkpoint.folder / STREAMS, weights_only=True)
-        self.episodes.resume(streams)
+        self.episodes.resume(streams)  # after loading, which seeds everything anew
         _restore(streams)
         progress = checkpoint.progress
         self.seconds, self.best = progress["seconds"], progress["best"]

@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lyapnet.build import build_task, build_value_function
 from lyapnet.comparison import figures, layout, tables
 from lyapnet.comparison.report import write_report
-from lyapnet.comparison.results import Measurement, Result
+from lyapnet.comparison.results import Measurement, Result, with_cold_compilation
 from lyapnet.comparison.statistics import compared, interquartile_mean, spread
 from lyapnet.config import load_config
 from lyapnet.controller import Controller
@@ -137,30 +137,68 @@ def test_the_threshold_itself_is_within():
     assert compared([result(curve=((0, 2.0), (10, 1.0201), (20, 1.0)))]).convergence_step("reacher") == 20
 
 
-def test_a_baseline_counts_with_its_last_validation_until_then():
-    ours = result(curve=((0, 9.0), (300, 1.0)))
-    theirs = [
-        result("ppo_paper", 0, curve=((0, 20.0), (299, 7.0), (301, 3.0))),
-        result("ppo_paper", 1, curve=((0, 20.0), (300, 5.0))),  # at that step itself
-        result("ppo_paper", 2, curve=((0, 20.0), (299, 1.0))),  # stopped a step before: 1.0 is not extrapolated
-        result("ppo_paper", 3, curve=((400, 9.0), (900, 3.0))),  # not validated yet
-    ]
-    comparison = compared([ours, *theirs])
-    at = comparison.at_convergence("reacher", "ppo_paper")
-    assert at is not None
-    assert (list(at.costs), at.stopped, at.unvalidated) == ([14, 10], 1, 1)
-    assert comparison.improvement_at_convergence("reacher", "ppo_paper") == pytest.approx(12 / 2)
-    (_, cells) = tables.details(comparison).cells()
-    assert "12.00 (2 of 4)" in cells
-    (_, cells) = tables.details(compared([ours, theirs[2]])).cells()
-    assert "stopped before" in cells
+def at_convergence(*theirs):
+    """A baseline against ours, which has 1.5 times the optimum after 100 steps and the optimum after 300."""
+    comparison = compared([result(curve=((0, 9.0), (100, 1.5), (300, 1.0), (500, 1.2))), *theirs])
+    return comparison.at_convergence("reacher", "ppo_paper"), tables.details(comparison).cells()[-1]
+
+
+def test_a_baseline_counts_with_the_best_that_it_had_until_then():
+    at, cells = at_convergence(
+        result("ppo_paper", 0, curve=((0, 20.0), (200, 5.0), (299, 7.0), (301, 3.0))),  # 5 was kept, 3 is later
+        result("ppo_paper", 1, curve=((0, 20.0), (300, 4.0))),  # at that step itself
+    )
+    assert (at.steps, at.ended, at.cost, at.ours) == (300, False, 4.5, 1.0)
+    assert at.factor == 4.5
+    assert "4.5000" in cells
+
+
+def test_a_baseline_that_ended_before_is_compared_where_it_ended():
+    at, cells = at_convergence(
+        result("ppo_paper", 0, curve=((0, 20.0), (299, 3.0), (400, 1.0))),
+        result("ppo_paper", 1, curve=((0, 20.0), (299, 6.0))),
+    )
+    assert (at.steps, at.ended, at.cost, at.ours) == (299, True, 4.5, 1.5), "nothing is extrapolated, ours neither"
+    assert at.factor == 3
+    assert "4.5000 (ended at 299)" in cells
+
+
+def test_costs_there_are_relative_to_each_seeds_own_states():
+    harder = [replace(p, cost=10 * p.cost) for p in result("ppo_paper", curve=((0, 9.0), (300, 1.0))).curve]
+    at, _ = at_convergence(result("ppo_paper", curve=((0, 9.0), (300, 1.0))), result("ppo_paper", 1, curve=((0, 9.0),)))
+    same, _ = at_convergence(replace(result("ppo_paper"), curve=harder, environment_steps=300))
+    assert same.factor == 1, "as good, from states that cost ten times as much"
+    assert at.ended
+
+
+def test_every_seed_is_charged_with_the_compilation_that_one_took():
+    first = result(seed=0, compilation_seconds=40.0, seconds=90.0)
+    second = result(seed=1, compilation_seconds=2.0, seconds=52.0)
+    theirs = result("ppo_paper", curve=((0, 9.0), (1000, 1.0)))
+    charged = with_cold_compilation([first, second, theirs])
+    assert [one.compilation_seconds for one in charged] == [40, 40, 0]
+    assert [one.seconds for one in charged] == [90, 90, 100]
+    assert [p.seconds for p in charged[1].curve] == [0, 10 + 38]
+    assert charged[0].curve == first.curve
+    comparison = compared(charged)
+    assert comparison.speedup("reacher", "ppo_paper") == (100 / 29, False)
+    later = replace(first, curve=[replace(p, seconds=p.seconds + 40) for p in first.curve])
+    assert compared([later, theirs]).speedup("reacher", "ppo_paper") == (100 / 50, False)
+    assert compared([later, theirs]).speedup("reacher", "ppo_paper", compiled=True) == (100 / 10, False)
+    assert compared([first, theirs]).speedup("reacher", "ppo_paper") == (10, False)
+
+
+def test_budgets_are_told_in_multiples_of_ours():
+    ours, theirs = result(curve=((0, 9.0), (100, 1.0), (400, 1.0))), result("ppo_paper", curve=((0, 9.0), (1000, 5.0)))
+    row = tables.details(compared([ours, theirs])).rows[1]
+    assert (row["budget_of_all"], row["budget_of_convergence"], row["budget_of_seconds"]) == (2.5, 10, 2.5)
 
 
 def test_improvement_and_speedup_by_hand(comparison):
     ours = fmean([1.0, 1.01, 1.02])
     assert comparison.improvement("reacher", "ppo_paper") == pytest.approx(3.5 / ours)
     assert comparison.improvement("reacher", "ppo_paper", "sum") == pytest.approx(3.5 / ours)
-    assert comparison.improvement_at_convergence("reacher", "ppo_paper") == pytest.approx(10 / 1.01)
+    assert comparison.at_convergence("reacher", "ppo_paper").factor == pytest.approx(10 / 1.01)
     assert comparison.speedup("reacher", "ppo_tuned") == (600 / 20, False)
     assert comparison.speedup("reacher", "ppo_paper") == (600 / 20, True)
     assert comparison.improvement("double_integrator", "sac_paper") == INF

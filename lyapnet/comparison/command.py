@@ -135,12 +135,13 @@ def _report(comparison: Any, command: Sequence[str], console: Console) -> None:
     from lyapnet.comparison import layout, tables
     from lyapnet.comparison.plan import jobs_of
     from lyapnet.comparison.report import write_report
-    from lyapnet.comparison.results import with_common_optima
+    from lyapnet.comparison.results import with_cold_compilation, with_common_optima
     from lyapnet.comparison.statistics import compared
     from lyapnet.comparison.training import controllers_of
 
     jobs = jobs_of(comparison)
-    results = with_common_optima([result for job in jobs if (result := job.result) is not None])
+    finished = [result for job in jobs if (result := job.result) is not None]
+    results = with_cold_compilation(with_common_optima(finished))
     if not results:
         console.print("no job is finished: nothing to report", soft_wrap=True)
         return

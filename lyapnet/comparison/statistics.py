@@ -95,9 +95,10 @@ def first_within(result: Result, ratio: float) -> Measurement | None:
     return next((one for one in result.curve if one.cost_ratio is not None and one.cost_ratio <= ratio), None)
 
 
-def last_until(result: Result, steps: float) -> Measurement | None:
-    """The last validation at or before an environment step."""
-    return next((one for one in reversed(result.curve) if one.environment_steps <= steps), None)
+def best_until(result: Result, steps: float) -> float | None:
+    """The least cost / optimum of the validations at or before an environment step; cost, where no optimum is known."""
+    points = [one for one in result.curve if one.environment_steps <= steps]
+    return min((one.cost if one.cost_ratio is None else one.cost_ratio for one in points), default=None)
 
 
 def _known(result: Result) -> tuple[np.ndarray, np.ndarray] | None:
@@ -126,21 +127,21 @@ class Reach(NamedTuple):
 
 
 class AtStep(NamedTuple):
-    """What the seeds had reached at an environment step: their last validation until then, never one after it."""
+    """A method and ours at the same environment step: where ours had converged, or where the method's training ended.
 
-    costs: Sequence[float]  # of the seeds that trained as far and were validated before
-    stopped: int  # seeds whose training ended before that step
-    unvalidated: int  # seeds that trained as far without any validation
+    Costs are over the optimum of each seed's own validation states, since those are others for each seed (J_N where no
+    optimum is known), and the least so far: a training that has forgotten what it knew has kept its checkpoint.
+    """
+
+    steps: float
+    ended: bool  # the method's training, before ours had converged
+    cost: float  # mean over the seeds
+    ours: float
 
     @property
-    def mean(self) -> float | None:
-        """Over those seeds."""
-        return fmean(self.costs) if self.costs else None
-
-    @property
-    def seeds(self) -> int:
-        """All of them."""
-        return len(self.costs) + self.stopped + self.unvalidated
+    def factor(self) -> float | None:
+        """A method's cost / ours."""
+        return _quotient(self.cost, self.ours)
 
 
 @dataclass(frozen=True)
@@ -197,23 +198,28 @@ class Group:
         shares = [result.clipped_fraction for result in self.results if result.clipped_fraction is not None]
         return fmean(shares) if shares else None
 
-    def within(self, ratio: float) -> Reach | None:
-        """When the seeds first came within a ratio of the optimum; None without an oracle."""
+    def within(self, ratio: float, *, compiled: bool = False) -> Reach | None:
+        """When the seeds first came within a ratio of the optimum; None without an oracle.
+
+        Args:
+            compiled: leave out the seconds of compilation.
+        """
         if all(point.cost_ratio is None for result in self.results for point in result.curve):
             return None
         firsts = [(first_within(result, ratio), result) for result in self.results]
+        left_out = [result.compilation_seconds if compiled else 0.0 for result in self.results]
         steps = median(math.inf if first is None else first.environment_steps for first, _ in firsts)
-        seconds = median(math.inf if first is None else first.seconds for first, _ in firsts)
-        at_least = median(result.seconds if first is None else first.seconds for first, result in firsts)
+        ends = [(result if first is None else first).seconds for first, result in firsts]
+        seconds = [end - out for end, out in zip(ends, left_out, strict=True)]
+        known = [math.inf if one is None else end for (one, _), end in zip(firsts, seconds, strict=True)]
         reached = sum(first is not None for first, _ in firsts)
-        return Reach(reached, len(firsts), _finite(steps), _finite(seconds), at_least)
+        return Reach(reached, len(firsts), _finite(steps), _finite(median(known)), median(seconds))
 
-    def at(self, steps: float) -> AtStep:
-        """What the seeds had reached at an environment step."""
-        going = [result for result in self.results if result.environment_steps >= steps]
-        points = [last_until(result, steps) for result in going]
-        costs = [point.cost for point in points if point is not None]
-        return AtStep(costs, len(self.results) - len(going), len(going) - len(costs))
+    def best_until(self, steps: float) -> float | None:
+        """Mean over the seeds of the least cost / optimum until an environment step."""
+        costs = [best_until(result, steps) for result in self.results]
+        known = [cost for cost in costs if cost is not None]
+        return fmean(known) if len(known) == len(costs) else None
 
 
 def relative_costs(result: Result) -> np.ndarray | None:
@@ -273,9 +279,14 @@ class Comparison:
         return reach.steps if reach else None
 
     def at_convergence(self, task: str, method: str) -> AtStep | None:
-        """What a method had reached where ours had converged."""
-        step, group = self.convergence_step(task), self.of(task, method)
-        return None if step is None or group is None else group.at(step)
+        """What a method and ours had reached where ours had converged, or where the method's training ended before."""
+        converged, group, ours = self.convergence_step(task), self.of(task, method), self.of(task, OURS)
+        if converged is None or group is None or ours is None:
+            return None
+        end = min(result.environment_steps for result in group.results)
+        steps = min(converged, end)
+        theirs, own = group.best_until(steps), ours.best_until(steps)
+        return None if theirs is None or own is None else AtStep(steps, end < converged, theirs, own)
 
     def improvement(self, task: str, method: str, form: str = "cost") -> float | None:
         """A method's mean cost / ours, of the best checkpoints.
@@ -286,14 +297,14 @@ class Comparison:
         ours, theirs = self.of(task, OURS), self.of(task, method)
         return _quotient(*(getattr(group, form).mean if group else None for group in (theirs, ours)))
 
-    def improvement_at_convergence(self, task: str, method: str) -> float | None:
-        """A method's mean cost / ours, both by the last validation until ours had converged; of J_N alone."""
-        ours, theirs = self.at_convergence(task, OURS), self.at_convergence(task, method)
-        return _quotient(theirs.mean if theirs else None, ours.mean if ours else None)
+    def speedup(self, task: str, method: str, *, compiled: bool = False) -> Speedup | None:
+        """Of ours against a method, to within 10 % of the optimum; None where ours does not get there.
 
-    def speedup(self, task: str, method: str) -> Speedup | None:
-        """Of ours against a method, to within 10 % of the optimum; None where ours does not get there."""
-        ours, theirs = (group and group.within(NEAR) for group in (self.of(task, OURS), self.of(task, method)))
+        Args:
+            compiled: leave out the seconds of compilation, as the second run of a task does.
+        """
+        groups = self.of(task, OURS), self.of(task, method)
+        ours, theirs = (group and group.within(NEAR, compiled=compiled) for group in groups)
         if ours is None or theirs is None or ours.seconds is None:
             return None
         seconds = theirs.seconds_at_least if theirs.seconds is None else theirs.seconds

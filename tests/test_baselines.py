@@ -161,3 +161,23 @@ def test_progress_is_plain_data(tmp_path):
     progress = json.loads((checkpoints(tmp_path)[-1].folder / "progress.json").read_text())
     assert progress["seconds"] > 0
     assert progress["curve"][0]["environment_steps"] == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "named"),
+    [
+        ("ppo_tuned", {"learnig_rate": 1}, "did you mean learning_rate"),
+        ("sac_tuned", {"clip_range": 0.2}, "options of SAC"),
+        ("ppo_tuned", {"n_steps": 4}, "n_steps of ppo_tuned to divide 6"),
+    ],
+)
+def test_impossible_options_are_refused(method, options, named):
+    with pytest.raises(UsageError, match=named):
+        baseline_of(method, 10, **options).check()
+    baseline_of(method, 10).check()
+
+
+def test_finished_training_keeps_no_replay_buffer(tmp_path):
+    trained(tmp_path, baseline_of("sac_tuned", 500))
+    assert not list(tmp_path.rglob("replay.pkl"))
+    assert trained(tmp_path, baseline_of("sac_tuned", 500)).curve[-1].environment_steps >= 500

@@ -1,5 +1,6 @@
 """lyapnet compare: its jobs, each run once, in processes or on Ray; a killed one goes on; all measured alike."""
 
+import csv
 import math
 import os
 import signal
@@ -15,7 +16,7 @@ from lyapnet.cli import main
 from lyapnet.comparison import workers
 from lyapnet.comparison.plan import METHODS, OURS, Job, job_named, jobs_of, load_comparison
 from lyapnet.comparison.results import Result, with_common_optima
-from lyapnet.comparison.workers import run_locally, run_on_ray, seconds_left
+from lyapnet.comparison.workers import run_locally, run_on_ray, run_process, seconds_left
 from lyapnet.errors import UsageError
 from lyapnet.evaluation import evaluate
 
@@ -59,13 +60,15 @@ def test_every_method_is_trained_on_every_task(smoke):
 
 def test_all_are_measured_on_the_same_states_at_their_own_cost(smoke):
     folder, _ = smoke
-    optima = {}
+    optima, unclipped = {}, 0
     for result in with_common_optima(results_of(folder)):
         assert optima.setdefault(result.task, result.optima) == result.optima
-        if result.method == OURS:
+        if result.method == OURS and not result.clipped_fraction:
+            unclipped += 1
             found = evaluate(lyapnet.load(folder / result.checkpoint), 8, 0, optimum=False)
             assert sum(result.costs) / 8 == pytest.approx(found["cost_mean"], rel=1e-9)
             assert result.constraint_loss == pytest.approx(found["constraint_loss"], rel=1e-6)
+    assert unclipped == 3, "four steps of training leave swing-up beyond its box"
 
 
 def test_the_same_command_again_trains_nothing(smoke):
@@ -78,39 +81,53 @@ def test_the_same_command_again_trains_nothing(smoke):
 
 def test_another_config_is_not_taken_for_the_same(smoke):
     folder, _ = smoke
-    job = "double_integrator/ppo_tuned/seed_0"
-    path = folder / "logs" / "compare_smoke" / job / "result.json"
-    content = path.read_text()
-    path.unlink()
-    try:
-        said = compared(folder, "--job", job, "tasks.double_integrator.hidden=[5]")
-    finally:
-        path.write_text(content)
-    assert said.returncode == 2
-    assert "another hidden" in said.stderr
-    assert len(said.stderr.strip().splitlines()) == 1
+    for change, named in (
+        ("tasks.double_integrator.hidden=[5]", "another hidden"),
+        ("evaluation_seed=7", "evaluation"),
+    ):
+        for report in ([], ["--report"]):
+            said = compared(folder, change, *report)
+            assert said.returncode == 2
+            assert named in said.stderr
+            assert len(said.stderr.strip().splitlines()) == 1
 
 
-def test_a_killed_comparison_goes_on(tmp_path):
+def test_seeds_beyond_the_config_are_reported(smoke):
+    folder, _ = smoke
+    said = compared(folder, "--tasks", "reacher,reacher", "--methods", "ppo_tuned", "--seeds", "2")
+    assert said.returncode == 0, said.stderr
+    assert "2/2" in said.stdout
+    with (folder / "logs" / "compare_smoke" / "report" / "results.csv").open(newline="") as file:
+        rows = [(row["task"], row["method"], row["seed"]) for row in csv.DictReader(file)]
+    assert ("reacher", "ppo_tuned", "1") in rows
+    assert len(rows) == 21
+
+
+@pytest.mark.parametrize("killed", ["all of it", "the parent alone"])
+def test_a_killed_comparison_goes_on(killed, tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     chosen = ["--tasks", "double_integrator", "--methods", "ppo_tuned", "--workers", "1"]
-    longer = "tasks.double_integrator.steps.ppo_tuned=200000"
+    chosen += ["tasks.double_integrator.steps.ppo_tuned=60000"]
     job = tmp_path / "logs" / "compare_smoke" / "double_integrator" / "ppo_tuned" / "seed_0"
-    command = [sys.executable, "-m", "lyapnet", "compare", "--config", "conf/compare_smoke.yaml", *chosen, longer]
+    command = [sys.executable, "-m", "lyapnet", "compare", "--config", "conf/compare_smoke.yaml", *chosen]
     process = subprocess.Popen(command, cwd=tmp_path, start_new_session=True)
     deadline = time.monotonic() + 120
-    while len(list((job / "checkpoints").glob("step_[1-9]*"))) < 1 and time.monotonic() < deadline:
+    while not list((job / "checkpoints").glob("step_[1-9]*")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGKILL)
+    if killed == "all of it":
+        os.killpg(process.pid, signal.SIGKILL)
+    else:  # its job goes on, and the next command waits for it
+        process.kill()
     process.wait()
     kept = max(int(path.name[5:]) for path in (job / "checkpoints").glob("step_*"))
-    assert 0 < kept < 200_000, "it was killed on its way"
-    said = compared(tmp_path, *chosen, longer)
+    assert 0 < kept < 60_000, "it was killed on its way"
+    said = compared(tmp_path, *chosen)
     assert said.returncode == 0, said.stderr
     assert "1/1" in said.stdout
-    lines = (job / "job.log").read_text().splitlines()
-    assert sum(line.startswith("0/200000") for line in lines) == 1, "it did not begin anew"
-    assert Result.read(job / "result.json").environment_steps >= 200_000
+    steps = [line.split("/")[0] for line in (job / "job.log").read_text().splitlines() if "/60000" in line]
+    assert steps[0] == "0"
+    assert len(steps) <= len(set(steps)) + 1, "it went on, and two did not train at once"
+    assert Result.read(job / "result.json").environment_steps >= 60_000
 
 
 def test_jobs_go_seed_by_seed_and_are_as_many_as_asked_for():
@@ -140,6 +157,9 @@ def test_baselines_have_the_networks_and_the_task_of_the_comparison():
         (["methods=[ppo]"], None, None, "methods among"),
         (["seedz=3"], None, None, "did you mean seeds"),
         (["seeds=0"], None, None, "seeds ≥ 1"),
+        (["methods=[]"], None, None, "at least one of"),
+        (["tasks.reacher.options.ppo_paper=3"], None, None, "section of options"),
+        (["tasks.reacher.options.ppo_paper.learnig_rate=3"], None, None, "did you mean learning_rate"),
         (["tasks.reacher.stepz=3"], None, None, "tasks.reacher.steps"),
         (["tasks.reacher.steps.ppo=3"], None, None, "tasks.reacher.steps among"),
         (["tasks.reacher.steps.ppo_paper=0"], None, None, "tasks.reacher.steps.ppo_paper ≥ 1"),
@@ -163,15 +183,19 @@ def test_command_says_in_one_line_what_is_wrong(capsys):
 
 def pretended(monkeypatch, tmp_path, script):
     """Two jobs, and a command that runs a Python script in the place of a training."""
-    comparison = load_comparison(SMOKE, [f"logs={tmp_path}"])
+    comparison = load_comparison(SMOKE)
+    (tmp_path / "conf").symlink_to(ROOT / "conf")
+    monkeypatch.chdir(tmp_path)
     jobs = jobs_of(comparison, ["reacher", "double_integrator"], ["ppo_tuned"])
     return jobs, [sys.executable, "-c", script]
 
 
 FAILING = """
-import os, sys
+import os, pathlib, sys
 print("threads", os.environ["OMP_NUM_THREADS"], flush=True)
-sys.exit("last words" if "reacher" in sys.argv[1] else 0)
+if "reacher" in sys.argv[1]:
+    sys.exit("last words")
+(pathlib.Path("logs") / "compare_smoke" / sys.argv[1] / "result.json").write_text("{}")
 """
 
 
@@ -189,6 +213,21 @@ def test_a_job_that_fails_is_told_and_the_others_go_on(runner, monkeypatch, tmp_
     }  # fmt: skip
     assert set(begun) == set(jobs)
     assert all("threads 1" in (job.folder / "job.log").read_text() for job in jobs)
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("print('saved')", "saved"),  # a training that was told to stop leaves with status 0, and without a result
+        ("import os, signal; print('ratio 1.2'); os.kill(os.getpid(), signal.SIGKILL)", "stopped by SIGKILL"),
+        ("import sys; sys.exit(3)", "stopped with status 3"),
+    ],
+)
+def test_only_a_result_counts_as_success(script, words, tmp_path):
+    (tmp_path / "job.log").write_text("words of an earlier attempt\n")
+    _, failure = run_process([sys.executable, "-c", script], tmp_path)
+    assert failure == words
+    assert (tmp_path / "job.log").read_text().startswith("words of an earlier attempt")
 
 
 def test_interrupting_stops_what_runs(monkeypatch, tmp_path):

@@ -54,9 +54,9 @@ def test_return_is_minus_the_cost_of_the_rollout(name):
     x0 = controller.initial_states.sample(1)[0].numpy()
     trajectory = controller.rollout(x0)
     total, states = played(environment, x0, trajectory.u.clip(-scale, scale), scale)
-    if (np.abs(trajectory.u) <= scale).all():
-        np.testing.assert_allclose(states, trajectory.x, rtol=1e-9, atol=1e-12)
-        assert total == pytest.approx(-trajectory.cost, rel=1e-9)
+    assert (np.abs(trajectory.u) <= scale).all()
+    np.testing.assert_allclose(states, trajectory.x, rtol=1e-9, atol=1e-12)
+    assert total == pytest.approx(-trajectory.cost, rel=1e-9)
     again, _ = played(environment, x0, 0.9 * trajectory.u.clip(-scale, scale), scale)
     assert again != pytest.approx(-trajectory.cost, rel=1e-6), "other controls cost something else"
 
@@ -225,6 +225,33 @@ def test_paper_sum_is_the_cost_without_the_step():
 def test_impossible_environment_is_refused(task, scale, named):
     with pytest.raises(UsageError, match=named):
         Environment(task, scale)
+
+
+def test_policy_that_diverges_costs_infinity_where_it_does():
+    class Pushes:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.where(observation[:, :1] > 1e100, 1.0, 0.0), state
+
+    x0 = torch.tensor([[0.0, 0.1, 0.0, 0.0], [0.0, 0.1, 0.0, 1e200], [0.0, 0.1, 0.0, 0.0]])
+    costs = costs_of(Pushes(), bounded_task("cartpole_swingup"), False, x0)
+    assert costs.cost[1] == torch.inf
+    assert costs.sum[1] == torch.inf
+    assert torch.isfinite(costs.cost[0])
+    assert costs.cost[0] == costs.cost[2]
+
+
+def test_action_of_another_shape_is_refused():
+    environment = Environment("double_integrator")
+    environment.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(1,\), got \(2,\)"):
+        environment.step(np.zeros(2))
+    with pytest.raises(ValueError, match="one a_i for each control"):
+        environment.step(np.zeros((1, 1)))
+
+
+def test_any_task_is_made_by_name():
+    environment = gymnasium.make("lyapnet/Task-v0", task=str(CONF / "integrator_chain.yaml"), control_scale=[5.0])
+    assert environment.observation_space.shape == (4,)
 
 
 def test_environment_of_a_config_of_your_own(tmp_path):

@@ -40,9 +40,14 @@ class EulerEpisodes:
         """One step; the rewards (*batch,).
 
         Raises:
-            DivergenceError: a state left the finite numbers.
+            ValueError: actions of another shape.
         """
         given = torch.tensor(np.asarray(action)).to(self.scale)
+        if given.shape != (*self.state.shape[:-1], len(self.scale)):
+            raise ValueError(
+                f"Expected actions of shape {(*self.state.shape[:-1], len(self.scale))}, got {tuple(given.shape)}; "
+                "one a_i for each control."
+            )
         self.clipped += int((given.abs() >= 1).sum())  # at the bound: learners clip before they ask
         self.controls += given.numel()
         self.control = self.scale * given.clamp(-1, 1)
@@ -50,11 +55,21 @@ class EulerEpisodes:
         reward = -horizon.dt * cost.running(self.state, self.control)
         self.state = self.state + horizon.dt * system.dynamics(self.state, self.control)
         self.step += 1
-        if not torch.isfinite(self.state).all():
-            raise DivergenceError(
-                f"Expected a finite state, got {self.state.tolist()} at step {self.step}; lower control_scale or Δt."
-            )
         return reward - cost.terminal(self.state) if self.over else reward
+
+    def require_finite(self) -> None:
+        """Refuse to go on with a state that left the finite numbers.
+
+        Raises:
+            DivergenceError: naming the first such state.
+        """
+        lost = torch.nonzero(~torch.isfinite(self.state).all(-1).reshape(-1)).flatten()
+        if len(lost):
+            first = self.state.reshape(-1, self.state.shape[-1])[lost[0]].tolist()
+            raise DivergenceError(
+                f"Expected finite states, got x = {first} at step {self.step} in one of {len(lost)} trajectories; "
+                "lower control_scale or Δt."
+            )
 
     @property
     def over(self) -> bool:
@@ -84,7 +99,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     or beyond its bound. `reset(options={"state": x0})` starts from x₀ instead of drawing it from X₀.
 
     Args:
-        task: a reference task by name, a config file, or a Task.
+        task: a reference task by name, a config file, or a Task; lyapnet/Task-v0 makes an environment of any.
         control_scale: max |u_i|; known for the reference tasks.
         observe_time: join t in s to the observation: the optimal control depends on it.
 
@@ -135,6 +150,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         reward = float(self._episode.advance(action))
+        self._episode.require_finite()
         info = {"control": self._episode.control.numpy().copy(), "clipped": bool((np.abs(action) >= 1).any())}
         return self._episode.observation, reward, False, self._episode.over, info
 
@@ -188,6 +204,7 @@ class VectorEnvironment(VecEnv):
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         rewards = self.episodes.advance(self._actions).numpy()
+        self.episodes.require_finite()
         applied = zip(self.episodes.control.numpy(), np.abs(self._actions), strict=True)
         infos: list[dict[str, Any]] = [{"control": u, "clipped": bool((a >= 1).any())} for u, a in applied]
         over, observation = self.episodes.over, self.episodes.observation
@@ -234,7 +251,7 @@ class VectorEnvironment(VecEnv):
 class Costs(NamedTuple):
     """What a policy costs from each of a batch (b,) of states."""
 
-    cost: PerState  # J_N = Δt Σℓ_n + φ
+    cost: PerState  # J_N = Δt Σℓ_n + φ; ∞ where the closed loop left the finite numbers
     sum: PerState  # Σℓ_n + φ, as the paper has it
     clipped_fraction: float  # share of controls at the bounds of the action box
 
@@ -247,5 +264,9 @@ def costs_of(policy: Any, bounded: BoundedTask, observe_time: bool, x0: State) -
     while not episodes.over:
         action, memory = policy.predict(episodes.observation, state=memory, episode_start=start, deterministic=True)
         cost, start = cost - episodes.advance(action), np.zeros(len(x0), dtype=bool)
+        lost = ~torch.isfinite(episodes.state).all(-1)
+        cost[lost] = torch.inf
+        episodes.state[lost] = 0  # a policy cannot be asked about what is no number
     terminal = bounded.task.cost.terminal(episodes.state)
+    cost = torch.nan_to_num(cost, nan=torch.inf, posinf=torch.inf)
     return Costs(cost, (cost - terminal) / dt + terminal, episodes.clipped_fraction)

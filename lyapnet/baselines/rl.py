@@ -1,5 +1,7 @@
 """PPO and SAC of Stable-Baselines3 on a task: trained in pieces, each followed by a validation and a checkpoint."""
 
+import difflib
+import inspect
 import json
 import shutil
 import tempfile
@@ -28,7 +30,7 @@ from lyapnet.event_files import drop_events_after
 from lyapnet.oracles import oracle_of
 from lyapnet.randomness import VALIDATION, stream
 from lyapnet.run import write_json
-from lyapnet.types import State
+from lyapnet.types import PerState, State
 
 VALIDATIONS, VALIDATION_STATES = 40, 64  # a training's pieces; the states are those of a lyapnet run of that seed
 BUFFER, MINIBATCHES = 1_000_000, 8  # of SAC; of a rollout of PPO, where its options do not say
@@ -57,6 +59,23 @@ class Baseline:
         if self.method not in SETTINGS:
             raise UsageError(f"Expected a baseline among {', '.join(SETTINGS)}, got {self.method!r}.")
         return SETTINGS[self.method]
+
+    def check(self) -> None:
+        """Refuse options that its algorithm does not have, and rollouts that cut episodes.
+
+        Raises:
+            UsageError: naming them.
+        """
+        algorithm, horizon = self.setting.algorithm, self.bounded.task.horizon.steps
+        known = inspect.signature(algorithm).parameters
+        for name in self.options:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}."
+                raise UsageError(f"Expected options of {algorithm.__name__}, got {name!r} for {self.method}; {hint}")
+        steps = self.options_of_algorithm.get("n_steps", horizon)
+        if issubclass(algorithm, OnPolicyAlgorithm) and horizon % steps and steps % horizon:
+            raise UsageError(f"Expected n_steps of {self.method} to divide {horizon}, the horizon, got {steps}.")
 
     @property
     def piece(self) -> int:
@@ -163,9 +182,11 @@ class BaselineTraining:
         self.baseline, self.folder = baseline, folder
         task = baseline.bounded.task
         self.states = task.initial_states.sample(VALIDATION_STATES, stream(baseline.seed, VALIDATION))
-        self.optimum = _mean_optimum(baseline.bounded, self.states)
+        self.optima = _optima(baseline.bounded, self.states)
         self.episodes, self.seconds, self.best = baseline.environment(), 0.0, 0
         self.curve: list[Measurement] = []
+        for draft in folder.glob("checkpoints/.new_*"):  # killed while it was written
+            shutil.rmtree(draft)
         kept = checkpoints(folder)
         if kept:
             self._resume(kept[-1])
@@ -187,6 +208,8 @@ class BaselineTraining:
             self._learn()
             report(self._validate())
             self._save()
+        for leftover in self.folder.glob(f"checkpoints/*/{REPLAY}"):  # tens of MB, to go on from
+            leftover.unlink()
 
     @property
     def policy(self) -> BaselinePolicy:
@@ -208,13 +231,14 @@ class BaselineTraining:
         setting, model = self.baseline.setting, self.model
         costs = costs_of(self.policy, self.baseline.bounded, setting.observe_time, self.states)
         cost = float(costs.cost.mean())
-        ratio = None if self.optimum is None else cost / self.optimum
+        ratio = None if self.optima is None else _ratio_of_means(costs.cost, self.optima)
         scalars = {
             "trajectory_cost/val": cost,
             "optimality_gap/val": None if ratio is None else ratio - 1,
             "clipped_fraction/val": costs.clipped_fraction,
             "clipped_fraction/train": self.episodes.episodes.clipped_fraction,
             "trajectory_cost/train": _mean_return(model),
+            "training_seconds": self.seconds,
             "rollout_steps_per_second": model.num_timesteps / self.seconds if self.seconds else None,
         }
         for name, value in scalars.items():
@@ -252,7 +276,7 @@ class BaselineTraining:
         kept = checkpoint.folder / NORMALISATION
         self.environment = self.baseline.wrapped(self.episodes, kept if kept.is_file() else None)
         self.model = checkpoint.model(self.baseline, self.environment)
-        if isinstance(self.model, OffPolicyAlgorithm):
+        if isinstance(self.model, OffPolicyAlgorithm) and (checkpoint.folder / REPLAY).is_file():  # not at its end
             self.model.load_replay_buffer(checkpoint.folder / REPLAY)
         streams = torch.load(checkpoint.folder / STREAMS, weights_only=True)
         self.episodes.resume(streams)  # after loading, which seeds everything anew
@@ -269,12 +293,18 @@ def costs_of_best(baseline: Baseline, folder: Path, x0: State) -> tuple[Path, Co
     return checkpoint.folder / MODEL, costs
 
 
-def _mean_optimum(bounded: BoundedTask, x0: State) -> float | None:
+def _optima(bounded: BoundedTask, x0: State) -> PerState | None:
     system, cost, _, horizon = bounded.task
     try:
-        return float(oracle_of(system, cost, horizon).solve(x0).cost.nanmean())
+        return oracle_of(system, cost, horizon).solve(x0).cost
     except OracleError:
         return None
+
+
+def _ratio_of_means(cost: PerState, optima: PerState) -> float | None:
+    """Over the states whose optimum is known."""
+    known = torch.isfinite(optima)
+    return float(cost[known].mean() / optima[known].mean()) if known.any() else None
 
 
 def _mean_return(model: BaseAlgorithm) -> float | None:

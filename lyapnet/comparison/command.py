@@ -42,8 +42,8 @@ def compare(
     lyapnet compare --config conf/compare.yaml --tasks reacher --methods lyapnet,ppo_tuned --seeds 1
     """
     _require_extra()
-    from lyapnet.comparison.plan import job_named, jobs_of, load_comparison
-    from lyapnet.comparison.training import run_job
+    from lyapnet.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
+    from lyapnet.comparison.training import require_same, run_job
 
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/compare.yaml.")
@@ -53,11 +53,13 @@ def compare(
         run_job(job_named(comparison, job), console)
         return
     jobs = jobs_of(comparison, _names(tasks), _names(methods), seeds)
+    for one in begun_jobs(comparison):
+        require_same(one)
     missing = [] if report else [one for one in jobs if one.result is None]
     command = ["compare", "--config", str(config), *(overrides or [])]
     worker = [sys.executable, "-m", "lyapnet", *command, "--job"]
     failed = _run(missing, len(jobs), worker, workers or os.cpu_count() or 1, ray, console)
-    _report(comparison, command, console)
+    _report(comparison, jobs, command, console)
     if failed:
         raise LyapnetError(f"Expected {len(jobs)} jobs, {failed} failed; the same command tries them again.")
 
@@ -130,16 +132,16 @@ def _duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _report(comparison: Any, command: Sequence[str], console: Console) -> None:
-    """Write and show what all finished jobs say."""
+def _report(comparison: Any, chosen: Sequence[Any], command: Sequence[str], console: Console) -> None:
+    """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
     from lyapnet.comparison import layout, tables
-    from lyapnet.comparison.plan import jobs_of
+    from lyapnet.comparison.plan import begun_jobs, jobs_of
     from lyapnet.comparison.report import write_report
     from lyapnet.comparison.results import with_cold_compilation, with_common_optima
     from lyapnet.comparison.statistics import compared
     from lyapnet.comparison.training import controllers_of
 
-    jobs = jobs_of(comparison)
+    jobs = list({job.name: job for job in (*jobs_of(comparison), *chosen, *begun_jobs(comparison))}.values())
     finished = [result for job in jobs if (result := job.result) is not None]
     results = with_cold_compilation(with_common_optima(finished))
     if not results:

@@ -1,6 +1,7 @@
 """The figures of a comparison: the paper's Fig. 3, the final costs, and its Figs. 1 and 4 of controllers."""
 
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -12,10 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from lyapnet.comparison.results import Measurement, Result
-from lyapnet.comparison.statistics import NEAR, OURS, Comparison, Group, interquartile_mean, relative_costs, spread
+from lyapnet.comparison.results import OURS, Measurement, Result
+from lyapnet.comparison.statistics import NEAR, Comparison, Group, interquartile_mean, relative_costs, spread
 from lyapnet.comparison.tables import method_name, name_of
 from lyapnet.controller import Controller
+from lyapnet.errors import DivergenceError
 from lyapnet.figures import BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, VERMILION, certified_region, trajectories
 from lyapnet.randomness import FIGURES, stream
 
@@ -270,9 +272,17 @@ def pictures(controllers: Mapping[str, Controller]) -> dict[str, Figure]:
     """
     drawn = {}
     for task, controller in controllers.items():
-        if controller.config.program.name == "lyapunov":
-            figure = certified_region(controller.rollout, controller.system, controller.initial_states)
-            drawn[f"certified_region_{task}"] = figure
-        x0 = controller.initial_states.sample(12, stream(controller.config.seed, FIGURES))
-        drawn[f"trajectories_{task}"] = trajectories(controller.rollout(x0), controller.system)
+        try:
+            drawn |= {f"{name}_{task}": figure for name, figure in _closed_loops(controller).items()}
+        except DivergenceError as error:  # from a corner of X₀: the tables and the other figures are still worth seeing
+            warnings.warn(f"No figures of closed loops on {task}: {error}", stacklevel=1)
     return drawn
+
+
+def _closed_loops(controller: Controller) -> dict[str, Figure]:
+    figures = {}
+    if controller.config.program.name == "lyapunov":
+        region = certified_region(controller.rollout, controller.system, controller.initial_states)
+        figures["certified_region"] = region
+    x0 = controller.initial_states.sample(12, stream(controller.config.seed, FIGURES))
+    return {**figures, "trajectories": trajectories(controller.rollout(x0), controller.system)}

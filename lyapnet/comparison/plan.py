@@ -11,12 +11,10 @@ from lyapnet.baselines.rl import Baseline
 from lyapnet.baselines.settings import SETTINGS
 from lyapnet.baselines.tasks import CONTROL_SCALES, BoundedTask, bounded_task
 from lyapnet.build import build_task
-from lyapnet.comparison.results import Result
+from lyapnet.comparison.results import METHODS, OURS, Result
 from lyapnet.config import Config, check_values, checked, load_config, option, read_yaml
 from lyapnet.errors import UsageError
 
-OURS = "lyapnet"
-METHODS = (OURS, *SETTINGS)
 RESULT = "result.json"  # written last: its presence says that the job is finished
 
 
@@ -65,6 +63,8 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
     check_values(config)
     if not config.tasks:
         raise UsageError(f"Expected at least one task under tasks in {str(path)!r}, got none; see conf/compare.yaml.")
+    if not config.methods:
+        raise UsageError(f"Expected at least one of {', '.join(METHODS)} under methods, got none.")
     for method in config.methods:
         _require_among(method, METHODS, "methods")
     for name, task in config.tasks.items():
@@ -72,6 +72,10 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
         for key in ("steps", "options"):
             for method in getattr(task, key):
                 _require_among(method, SETTINGS, f"tasks.{name}.{key}")
+        for method, options in task.options.items():
+            if not isinstance(options, dict):
+                where = f"tasks.{name}.options.{method}"
+                raise UsageError(f"Expected {where} as a section of options, got {options!r}; indent them below it.")
     return config
 
 
@@ -145,7 +149,10 @@ class Job:
         Raises:
             UsageError: see `config` and `baseline`.
         """
-        _ = self.bounded if self.method == OURS else self.baseline
+        if self.method == OURS:
+            _ = self.bounded
+        else:
+            self.baseline.check()
 
 
 def jobs_of(
@@ -159,7 +166,7 @@ def jobs_of(
     Raises:
         UsageError: a task or method that it does not have; or a job that cannot be trained.
     """
-    tasks, methods = list(tasks or config.tasks), list(methods or config.methods)
+    tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
     for task in tasks:
         _require_among(task, config.tasks, "--tasks")
     for method in methods:
@@ -175,6 +182,17 @@ def jobs_of(
     for job in jobs[: len(tasks) * len(methods)]:
         job.check()
     return jobs
+
+
+def begun_jobs(config: ComparisonConfig) -> list[Job]:
+    """Those of the comparison's tasks and of any method and seed that have a folder."""
+    return [
+        Job(config, task, method, int(path.name.removeprefix("seed_")))
+        for task in config.tasks
+        for method in METHODS
+        for path in sorted((config.folder / task / method).glob("seed_*"))
+        if path.name.removeprefix("seed_").isdigit()
+    ]
 
 
 def job_named(config: ComparisonConfig, name: str) -> Job:

@@ -11,7 +11,10 @@ import torch
 from lyapnet.baselines.measurement import Measurement
 from lyapnet.run import write_json
 
-__all__ = ["Measurement", "Result", "with_cold_compilation", "with_common_optima"]
+__all__ = ["METHODS", "OURS", "Measurement", "Result", "with_cold_compilation", "with_common_optima"]
+
+OURS = "lyapnet"
+METHODS = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")  # the order of tables and figures
 
 
 @dataclass(frozen=True)

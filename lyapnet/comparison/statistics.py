@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import trim_mean
 
-from lyapnet.comparison.results import Measurement, Result
+from lyapnet.comparison.results import METHODS, OURS, Measurement, Result
 from lyapnet.errors import UsageError
 
-OURS = "lyapnet"
 NEAR, CONVERGED = 1.1, 1.02  # cost / optimum: where speeds are compared, and where ours has converged
 TASKS = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # the order of tables and figures
-METHODS = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
 
 CONFIDENCE, RESAMPLES, RESAMPLING_SEED = 0.95, 2000, 0
 

@@ -17,12 +17,10 @@ from lyapnet.comparison.layout import (
     steps,
     with_interval,
 )
-from lyapnet.comparison.results import Result
+from lyapnet.comparison.results import METHODS, OURS, Result
 from lyapnet.comparison.statistics import (
     CONVERGED,
-    METHODS,
     NEAR,
-    OURS,
     TASKS,
     AtStep,
     Comparison,

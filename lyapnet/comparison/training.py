@@ -1,6 +1,7 @@
 """One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
 
 import dataclasses
+import fcntl
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,8 +15,8 @@ from lyapnet.baselines.env import Costs, costs_of
 from lyapnet.baselines.policy import ControllerPolicy
 from lyapnet.baselines.rl import BaselineTraining, costs_of_best
 from lyapnet.build import build_program, resolve
-from lyapnet.comparison.plan import OURS, RESULT, Job
-from lyapnet.comparison.results import Measurement, Result
+from lyapnet.comparison.plan import RESULT, Job
+from lyapnet.comparison.results import OURS, Measurement, Result
 from lyapnet.config import to_plain
 from lyapnet.controller import Controller, load
 from lyapnet.errors import OracleError, UsageError
@@ -28,7 +29,7 @@ from lyapnet.run import Run, write_json
 from lyapnet.sweep import Point
 from lyapnet.types import State
 
-RECORD = "job.json"
+RECORD, LOCK = "job.json", "lock"
 
 
 def run_job(job: Job, console: Console) -> Result:
@@ -38,23 +39,29 @@ def run_job(job: Job, console: Console) -> Result:
         UsageError: the folder holds another job of that name.
         LyapnetError: the training fails.
     """
-    if (done := job.result) is not None:
-        return done
-    _require_same(job)
-    torch.set_num_threads(1)  # jobs run side by side
-    result = _lyapnet(job, console) if job.method == OURS else _baseline(job, console)
-    result.write(job.folder / RESULT)
-    return result
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with (job.folder / LOCK).open("w") as lock:  # another process may be at it: one that outlived its parent
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        require_same(job)
+        if (done := job.result) is not None:
+            return done
+        write_json(job.folder / RECORD, _description(job))
+        torch.set_num_threads(1)  # jobs run side by side
+        result = _lyapnet(job, console) if job.method == OURS else _baseline(job, console)
+        result.write(job.folder / RESULT)
+        return result
 
 
-def _require_same(job: Job) -> None:
-    """Hold the job against what its folder was made for."""
-    wanted = json.loads(json.dumps(_description(job)))
+def require_same(job: Job) -> None:
+    """Hold a job that was begun before against what its folder was made for.
+
+    Raises:
+        UsageError: it was another one.
+    """
     record = job.folder / RECORD
     if not record.is_file():
-        job.folder.mkdir(parents=True, exist_ok=True)
-        write_json(record, wanted)
         return
+    wanted = json.loads(json.dumps(_description(job)))
     kept = json.loads(record.read_text(encoding="utf-8"))
     changed = [key for key in wanted if wanted[key] != kept.get(key)]
     if changed:
@@ -113,7 +120,9 @@ def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
     found: dict[str, Controller] = {}
     for job in jobs:
         if job.method == OURS and job.task not in found and (result := job.result) is not None:
-            found[job.task] = _controller(job, Path(result.checkpoint))
+            checkpoint = Path(result.checkpoint)
+            if checkpoint.is_file():  # the results alone may have been kept
+                found[job.task] = _controller(job, checkpoint)
     return found
 
 

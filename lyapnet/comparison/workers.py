@@ -2,7 +2,9 @@
 
 import logging
 import os
+import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
@@ -10,7 +12,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
-from lyapnet.comparison.plan import Job
+from lyapnet.comparison.plan import RESULT, Job
 from lyapnet.errors import UsageError
 
 LOG = "job.log"
@@ -33,11 +35,17 @@ def run_locally(
         command: what runs a job, but for its name.
         begun: hears of each job that starts.
     """
-    started: list[subprocess.Popen] = []
+    processes: list[subprocess.Popen] = []
+    stopping = threading.Event()
+
+    def started(process: subprocess.Popen) -> None:
+        processes.append(process)
+        if stopping.is_set():  # while it started
+            process.terminate()
 
     def run(job: Job) -> Outcome:
         begun(job)
-        return Outcome(job, *run_process([*command, job.name], job.folder / LOG, started.append))
+        return Outcome(job, *run_process([*command, job.name], job.folder, started=started))
 
     pool = ThreadPoolExecutor(workers)
     waiting = {pool.submit(run, job) for job in jobs}
@@ -46,8 +54,9 @@ def run_locally(
             ended, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             yield from (future.result() for future in ended)
     finally:  # also when the user interrupts: nothing more is started, and what runs is told to leave
+        stopping.set()
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in started:
+        for process in processes:
             process.terminate()
         pool.shutdown()
 
@@ -65,6 +74,7 @@ def run_on_ray(
     """
     try:
         import ray
+        from ray.exceptions import RayError
     except ImportError as error:
         raise UsageError("Expected Ray for --ray, got none; pip install 'lyapnet[ray]'.") from error
     try:
@@ -72,34 +82,49 @@ def run_on_ray(
     except Exception as error:  # ConnectionError, or one of its many own
         line = " ".join(str(error).split())
         raise UsageError(f"Expected a Ray cluster at {address!r}, got {type(error).__name__}: {line}") from error
-    remote = ray.remote(num_cpus=1, max_retries=0)(run_process)
-    waiting = {}
+    remote: Any = ray.remote(num_cpus=1, max_retries=0)(run_process)
+    waiting: dict[Any, Job] = {}
     try:
         for job in jobs:
             begun(job)
-            waiting[remote.remote([*command, job.name], (job.folder / LOG).absolute())] = job
+            waiting[remote.remote([*command, job.name], job.folder.absolute(), Path.cwd())] = job
         while waiting:
             (ended, *_), _ = ray.wait(list(waiting))
-            yield Outcome(waiting.pop(ended), *ray.get(ended))
+            job = waiting.pop(ended)
+            try:
+                yield Outcome(job, *ray.get(ended))
+            except RayError as error:  # a machine was lost: the others go on
+                yield Outcome(job, 0.0, " ".join(str(error).split()))
     finally:
         ray.shutdown()
 
 
 def run_process(
-    command: Sequence[str], log: Path, started: Callable[[subprocess.Popen], Any] = lambda process: None
+    command: Sequence[str],
+    folder: Path,
+    place: Path | None = None,
+    started: Callable[[subprocess.Popen], Any] = lambda process: None,
 ) -> tuple[float, str]:
-    """Run a command on one thread, its output appended to a file; seconds, and its last words if it failed."""
-    log.parent.mkdir(parents=True, exist_ok=True)
+    """Run a job's command on one thread, its output appended to job.log; seconds, and its last words if it failed.
+
+    Args:
+        folder: of the job, which has a result when it is finished.
+        place: the working directory.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    begun = time.perf_counter()
-    with log.open("a", encoding="utf-8") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output, env={**os.environ, **threads})
+    begun, log = time.perf_counter(), folder / LOG
+    with log.open("ab") as output:
+        earlier = output.tell()
+        process = subprocess.Popen(command, cwd=place, stdout=output, stderr=output, env={**os.environ, **threads})
         started(process)
         status = process.wait()
     seconds = time.perf_counter() - begun
-    if status == 0:
+    if (folder / RESULT).is_file():
         return seconds, ""
-    words = log.read_text(encoding="utf-8").strip().splitlines()
+    words = log.read_bytes()[earlier:].decode(errors="replace").strip().splitlines()
+    if status < 0:
+        return seconds, f"stopped by {signal.Signals(-status).name}"
     return seconds, words[-1] if words else f"stopped with status {status}"
 
 

@@ -9,7 +9,7 @@ import signal
 import pytest
 import torch
 from matplotlib.figure import Figure
-from test_training import SMALL, Desk, differences, logged, values, without_figures
+from test_training import MEASURED_TIME, SMALL, Desk, differences, logged, values, without_figures
 from torch import nn
 
 import lyapnet
@@ -265,7 +265,7 @@ def unequal(one, other, folders=FOLDERS):
         yield from differences(*(read_checkpoint(best(desk, folder)) for desk in (one, other)), folder)
         curves, others = logged(one.run / folder), logged(other.run / folder)
         for tag in curves:
-            if tag != "rollout_steps_per_second" and not tag.startswith("_hparams_") and curves[tag] != others[tag]:
+            if tag not in MEASURED_TIME and not tag.startswith("_hparams_") and curves[tag] != others[tag]:
                 yield f"{folder}: {tag}"
 
 

@@ -177,8 +177,13 @@ def values(folder, tag):
     return {step: tensor_util.make_ndarray(tensor).item() for name, step, tensor in events(folder) if name == tag}
 
 
+MEASURED_TIME = {"rollout_steps_per_second", "training_seconds"}
+
+
 def differences(one, other, name=""):
-    """Where two nested structures of tensors and plain data differ, bit for bit."""
+    """Where two nested structures of tensors and plain data differ, bit for bit, measured time aside."""
+    if name.endswith("Stopwatch.seconds"):
+        return
     if isinstance(one, dict) and isinstance(other, dict):
         for key in one.keys() | other.keys():
             yield from differences(one.get(key), other.get(key), f"{name}.{key}")
@@ -222,7 +227,7 @@ def unequal_ends(one, other):
         yield "run.json"
     curves, others = logged(one.run), logged(other.run)
     for tag in curves.keys() | others.keys():
-        measured_time = tag == "rollout_steps_per_second" or tag.startswith("_hparams_")
+        measured_time = tag in MEASURED_TIME or tag.startswith("_hparams_")
         shown = slice(1) if measured_time else slice(None)
         if [entry[shown] for entry in curves[tag]] != [entry[shown] for entry in others[tag]]:
             yield tag
@@ -286,6 +291,7 @@ def test_curves_have_every_step_once(reference):
     for tag in train | {"gradient_norm", "learning_rate", "rollout_steps_per_second"}:
         assert [step for step, _ in curves[tag]] == list(range(1, STEPS + 1)), tag
     names = ("constraint_loss", "trajectory_cost", "optimality_gap", "value_error", "satisfied_fraction")
+    assert [step for step, _ in curves["training_seconds"]] == VALIDATIONS
     for tag in [f"{name}/val" for name in names]:
         assert [step for step, _ in curves[tag]] == VALIDATIONS, tag
 
@@ -422,6 +428,9 @@ def test_interrupted_a_run_saves_and_goes_on_to_the_same_end(number, desk, refer
     assert (status, errors) == (0, "")
     assert "logs/small/version_0" in output
     assert_same_end(desk, reference)
+    seconds = list(values(desk.run, "training_seconds").values())
+    assert seconds == sorted(seconds), "what the interrupted process took counts"
+    assert seconds[-1] > seconds[0] == 0
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -12,7 +12,8 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn
+from rich.text import Text
 
 from lyapnet.errors import LyapnetError, UsageError
 
@@ -101,18 +102,20 @@ def _progress(
     starts: dict[Any, float] = {}
     took: dict[Any, float] = {}
     finished = total - len(jobs)
-    columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"))
-    bar = Progress(*columns, console=console, disable=not console.is_terminal)
-    task = bar.add_task("starting", total=total, completed=finished)
 
     def left() -> str:
         now = time.monotonic()
-        seconds = seconds_left(jobs, {one: now - start for one, start in starts.items()}, took, workers)
+        running = {one: now - start for one, start in list(starts.items())}  # jobs begin while the bar is drawn
+        seconds = seconds_left(jobs, running, dict(took), workers)
         return "time left unknown" if seconds is None else f"{_duration(seconds)} left"
+
+    columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"), TimeLeft(left))
+    bar = Progress(*columns, console=console, disable=not console.is_terminal)
+    task = bar.add_task("starting", total=total, completed=finished)
 
     def begun(job: Any) -> None:
         starts[job] = time.monotonic()
-        bar.update(task, description=f"{job.name}, {left()}")
+        bar.update(task, description=job.name)
 
     def ended(outcome: Any) -> None:
         took[outcome.job] = outcome.seconds
@@ -124,6 +127,17 @@ def _progress(
     console.print(f"{total} jobs, {finished} of them finished", soft_wrap=True)
     with bar:
         yield begun, ended
+
+
+class TimeLeft(ProgressColumn):
+    """What a function says of the time left, each time that the bar is drawn."""
+
+    def __init__(self, left: Callable[[], str]):
+        super().__init__()
+        self.left = left
+
+    def render(self, task: Any) -> Text:
+        return Text(self.left())
 
 
 def _duration(seconds: float) -> str:

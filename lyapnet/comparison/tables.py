@@ -234,7 +234,7 @@ def summary(comparison: Comparison) -> Table:
         Column("k steps", ("to_10_steps",), lambda value: number(value / 1000)),
         Column("s", ("to_10_seconds",), number), Column("speedup", ("speedup", "speedup_at_least"), factor),
     ]  # fmt: skip
-    title = "Cost against the optimum\n* where ours has converged; to 10 %: seeds that got there, steps, seconds"
+    title = "Cost against the optimum\n* where ours has converged; to 10 %: how many seeds, steps, seconds"
     return replace(details(comparison), title=title, columns=columns)
 
 

@@ -239,6 +239,7 @@ class BaselineTraining:
             "clipped_fraction/train": self.episodes.episodes.clipped_fraction,
             "trajectory_cost/train": _mean_return(model),
             "training_seconds": self.seconds,
+            "learning_rate": model.lr_schedule(1.0),
             "rollout_steps_per_second": model.num_timesteps / self.seconds if self.seconds else None,
         }
         for name, value in scalars.items():

@@ -88,6 +88,8 @@ NOTES = (
     "not counts with all its training, which bounds the factor from below.",
     "diverged: in some state of so many seeds the closed loop left the finite numbers; inf in the CSV files, ∞ as a "
     "factor.",
+    "The sum form weighs the running cost 1/Δt times as much as J_N, which every method here minimises: it stands "
+    "beside the paper's numbers and ranks nothing.",
     "Clipped: share of controls at the bounds of the action box, in the evaluation.",
     "The paper's rows are those of its Table I (arXiv 2305.15244), their factors computed from its costs. Absolute "
     "costs do not compare with ours: its model and terminal cost differ where its sources do.",

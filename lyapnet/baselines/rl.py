@@ -182,7 +182,7 @@ class BaselineTraining:
         self.baseline, self.folder = baseline, folder
         task = baseline.bounded.task
         self.states = task.initial_states.sample(VALIDATION_STATES, stream(baseline.seed, VALIDATION))
-        self.optima = _optima(baseline.bounded, self.states)
+        self.optima = optima_of(baseline.bounded, self.states)
         self.episodes, self.seconds, self.best = baseline.environment(), 0.0, 0
         self.curve: list[Measurement] = []
         for draft in folder.glob("checkpoints/.new_*"):  # killed while it was written
@@ -294,7 +294,8 @@ def costs_of_best(baseline: Baseline, folder: Path, x0: State) -> tuple[Path, Co
     return checkpoint.folder / MODEL, costs
 
 
-def _optima(bounded: BoundedTask, x0: State) -> PerState | None:
+def optima_of(bounded: BoundedTask, x0: State) -> PerState | None:
+    """J* from each of x₀ (b, n), NaN where none was found; None where there is no oracle."""
     system, cost, _, horizon = bounded.task
     try:
         return oracle_of(system, cost, horizon).solve(x0).cost

@@ -13,17 +13,16 @@ from torch import nn
 
 from lyapnet.baselines.env import Costs, costs_of
 from lyapnet.baselines.policy import ControllerPolicy
-from lyapnet.baselines.rl import BaselineTraining, costs_of_best
+from lyapnet.baselines.rl import BaselineTraining, costs_of_best, optima_of
 from lyapnet.build import build_program, resolve
 from lyapnet.comparison.plan import RESULT, Job
 from lyapnet.comparison.results import OURS, Measurement, Result
 from lyapnet.config import to_plain
 from lyapnet.controller import Controller, load
-from lyapnet.errors import OracleError, UsageError
+from lyapnet.errors import UsageError
 from lyapnet.evaluation import measure
 from lyapnet.event_files import curve
 from lyapnet.networks import NETWORKS
-from lyapnet.oracles import oracle_of
 from lyapnet.randomness import TEST, stream
 from lyapnet.run import Run, write_json
 from lyapnet.sweep import Point
@@ -89,12 +88,8 @@ def _description(job: Job) -> dict[str, Any]:
 def _lyapnet(job: Job, console: Console) -> Result:
     from lyapnet.experiment import fit, plan_run  # Lightning takes seconds to import: baselines do without
 
-    point, config, bounded, states = (
-        Point(Path(job.compared.config), job.settings),
-        job.config,
-        job.bounded,
-        _states(job),
-    )
+    config, bounded, states = job.config, job.bounded, _states(job)
+    point = Point(Path(job.compared.config), job.settings)
     run = point.run()
     if run is None or not run.finished:
         last = None if run is None or not run.last.is_file() else str(run.last)
@@ -170,6 +165,7 @@ def _result(
     compilation: float = 0.0,
     constraint_loss: float | None = None,
 ) -> Result:
+    optima = optima_of(job.bounded, states)
     return Result(
         task=job.task,
         method=job.method,
@@ -179,18 +175,10 @@ def _result(
         compilation_seconds=compilation,
         costs=costs.cost.tolist(),
         sums=costs.sum.tolist(),
-        optima=_optima(job, states),
+        optima=None if optima is None else optima.tolist(),
         constraint_loss=constraint_loss,
         clipped_fraction=costs.clipped_fraction,
         horizon_steps=job.bounded.task.horizon.steps,
         checkpoint=str(checkpoint),
         curve=validations,
     )
-
-
-def _optima(job: Job, states: State) -> list[float] | None:
-    system, cost, _, horizon = job.bounded.task
-    try:
-        return oracle_of(system, cost, horizon).solve(states).cost.tolist()
-    except OracleError:
-        return None

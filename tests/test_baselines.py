@@ -19,7 +19,7 @@ from lyapnet.rollout import Horizon
 
 SMALL = {
     "ppo": {"n_steps": 6, "batch_size": 24, "n_epochs": 2},
-    "sac": {"batch_size": 8, "learning_starts": 30, "buffer_size": 600},
+    "sac": {"batch_size": 8, "learning_starts": 30, "buffer_size": 600, "train_freq": 4, "gradient_steps": 4},
 }  # fmt: skip
 pytestmark = [
     pytest.mark.filterwarnings("ignore:You have specified a mini-batch size"),
@@ -153,7 +153,8 @@ def test_pieces_are_whole_episodes():
     baseline = baseline_of("sac_paper", 10_000)
     assert baseline.piece % (16 * 6) == 0
     assert baseline.piece == pytest.approx(10_000 / rl.VALIDATIONS, rel=0.5)
-    assert baseline_of("sac_paper", 1).piece == 16 * 6
+    assert baseline_of("sac_paper", 1).piece == 16 * 12, "an update every 4 steps: whole ones as well"
+    assert baseline_of("sac_paper", 1, train_freq=1).piece == 16 * 6
 
 
 def test_progress_is_plain_data(tmp_path):
@@ -169,6 +170,7 @@ def test_progress_is_plain_data(tmp_path):
         ("ppo_tuned", {"learnig_rate": 1}, "did you mean learning_rate"),
         ("sac_tuned", {"clip_range": 0.2}, "options of SAC"),
         ("ppo_tuned", {"n_steps": 4}, "n_steps of ppo_tuned to divide 6"),
+        ("sac_tuned", {"train_freq": [1, "episode"]}, "train_freq of sac_tuned as a number of steps"),
     ],
 )
 def test_impossible_options_are_refused(method, options, named):

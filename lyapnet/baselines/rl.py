@@ -3,6 +3,7 @@
 import difflib
 import inspect
 import json
+import math
 import shutil
 import tempfile
 import time
@@ -61,7 +62,7 @@ class Baseline:
         return SETTINGS[self.method]
 
     def check(self) -> None:
-        """Refuse options that its algorithm does not have, and rollouts that cut episodes.
+        """Refuse options that its algorithm does not have, rollouts that cut episodes, and updates after no step.
 
         Raises:
             UsageError: naming them.
@@ -76,12 +77,25 @@ class Baseline:
         steps = self.options_of_algorithm.get("n_steps", horizon)
         if issubclass(algorithm, OnPolicyAlgorithm) and horizon % steps and steps % horizon:
             raise UsageError(f"Expected n_steps of {self.method} to divide {horizon}, the horizon, got {steps}.")
+        _ = self.update
 
     @property
     def piece(self) -> int:
-        """Environment steps between validations: whole episodes of all trajectories, so that none is cut."""
-        episode = self.setting.environments * self.bounded.task.horizon.steps
-        return episode * max(1, round(self.steps / VALIDATIONS / episode))
+        """Environment steps between validations: whole episodes of all trajectories and whole updates; none is cut."""
+        whole = self.setting.environments * math.lcm(self.bounded.task.horizon.steps, self.update)
+        return whole * max(1, round(self.steps / VALIDATIONS / whole))
+
+    @property
+    def update(self) -> int:
+        """Steps of every trajectory between updates of SAC; those of PPO divide the horizon or are some of it.
+
+        Raises:
+            UsageError: it is not a number of steps.
+        """
+        steps = self.options_of_algorithm.get("train_freq", 1)
+        if not isinstance(steps, int) or steps < 1:
+            raise UsageError(f"Expected train_freq of {self.method} as a number of steps ≥ 1, got {steps!r}.")
+        return steps
 
     def environment(self) -> VectorEnvironment:
         """The trajectories that it learns from."""

@@ -39,8 +39,10 @@ SETTINGS: dict[str, Setting] = {
     ),
     # What the task is: a finite horizon (time is seen, nothing lies beyond the end, nothing is discounted), in units
     # of its own; a small exploration noise to begin with, since the action box leaves room for all of X₀; and, as the
-    # terminal cost is most of the return, long eligibility traces (PPO) and returns of several steps (SAC). Whole
-    # episodes between updates: all trajectories are in step, and a rollout of a part of them forgets the other parts.
+    # terminal cost is most of the return, long eligibility traces (PPO) and returns of several steps (SAC).
+    # PPO: whole episodes between updates, as all trajectories are in step and a part of them forgets the other parts.
+    # SAC: one noise matrix for 16 steps, so that exploration moves the state; a new one at each averages out. Pilots
+    # of 0.3 M steps came to 1.04 times the double integrator's optimum instead of 2.5, to 1.9 times swing-up's (13).
     "ppo_tuned": Setting(
         PPO, environments=64, observe_time=True, normalise=True, truncates=False, decays=True,
         options={
@@ -51,8 +53,8 @@ SETTINGS: dict[str, Setting] = {
     "sac_tuned": Setting(
         SAC, environments=16, observe_time=True, normalise=True, truncates=False, decays=True,
         options={
-            "learning_rate": 1e-3, "batch_size": 256, "tau": 0.02, "gamma": 1.0, "train_freq": 1, "n_steps": 10,
-            "ent_coef": "auto_0.1",
+            "learning_rate": 1e-3, "batch_size": 256, "tau": 0.02, "gamma": 1.0, "n_steps": 10, "ent_coef": "auto_0.1",
+            "use_sde": True, "train_freq": 16, "gradient_steps": 16,
         },
     ),
 }  # fmt: skip

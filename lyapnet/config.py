@@ -290,8 +290,13 @@ def to_yaml(config: Config) -> str:
 
 def differing_keys(one: Config, other: Config) -> list[str]:
     """Full names of the fields in which two configs differ."""
-    a, b = dict(_leaves(to_plain(one))), dict(_leaves(to_plain(other)))
-    return [key for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)]
+    return list(differences(to_plain(one), to_plain(other)))
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Full name ↦ both values, where two nested dictionaries differ; None for one that is missing."""
+    a, b = dict(_leaves(one)), dict(_leaves(other))
+    return {key: (a.get(key), b.get(key)) for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)}
 
 
 def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -344,7 +349,7 @@ def _explain(error: OmegaConfBaseException, schema: type) -> str:
     if isinstance(error, MissingMandatoryValue):
         return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
     annotation = _annotations(schema).get(key.split("[")[0])
-    kind = annotation.__name__ if type(annotation) is type else annotation
+    kind = annotation.__name__ if type(annotation) is type else annotation or "another type"
     got = str(error).splitlines()[0]
     return f"Expected {key} as {kind}, got: {got}; correct its value."
 

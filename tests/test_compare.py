@@ -4,6 +4,7 @@ import csv
 import math
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -82,7 +83,7 @@ def test_the_same_command_again_trains_nothing(smoke):
 def test_another_config_is_not_taken_for_the_same(smoke):
     folder, _ = smoke
     for change, named in (
-        ("tasks.double_integrator.hidden=[5]", "another hidden"),
+        ("tasks.double_integrator.hidden=[5]", "hidden = [5] instead of [16]"),
         ("evaluation_seed=7", "evaluation"),
     ):
         for report in ([], ["--report"]):
@@ -140,6 +141,15 @@ def test_jobs_go_seed_by_seed_and_are_as_many_as_asked_for():
     assert job_named(comparison, some[-1].name).folder == some[-1].folder
 
 
+def test_a_baseline_without_steps_is_not_compared(tmp_path):
+    written = tmp_path / "own.yaml"
+    written.write_text(f"tasks: {{reacher: {{config: {ROOT / 'conf' / 'reacher.yaml'}, steps: {{ppo_tuned: 9}}}}}}")
+    comparison = load_comparison(written)
+    assert {job.method for job in jobs_of(comparison)} == {OURS, "ppo_tuned"}
+    with pytest.raises(UsageError, match="Expected sac_tuned under steps"):
+        jobs_of(comparison, methods=["sac_tuned"])
+
+
 def test_baselines_have_the_networks_and_the_task_of_the_comparison():
     jobs = {job.name: job for job in jobs_of(load_comparison(FULL))}
     baseline = jobs["cartpole_balancing/ppo_paper/seed_2"].baseline
@@ -154,6 +164,8 @@ def test_baselines_have_the_networks_and_the_task_of_the_comparison():
     [
         ([], ["reachr"], None, "--tasks among"),
         ([], None, ["ppo"], "--methods among"),
+        ([], None, ["ppo_tund"], "did you mean ppo_tuned"),
+        (["tasks.reacher.steps.ppo_paper=many"], None, None, "as another type, got: Value 'many'"),
         (["methods=[ppo]"], None, None, "methods among"),
         (["seedz=3"], None, None, "did you mean seeds"),
         (["seeds=0"], None, None, "seeds ≥ 1"),
@@ -213,6 +225,15 @@ def test_a_job_that_fails_is_told_and_the_others_go_on(runner, monkeypatch, tmp_
     }  # fmt: skip
     assert set(begun) == set(jobs)
     assert all("threads 1" in (job.folder / "job.log").read_text() for job in jobs)
+
+
+@pytest.mark.parametrize("scheme", ["", "ray://"])
+def test_a_cluster_that_is_not_there_is_told_at_once(scheme):
+    pytest.importorskip("ray")
+    with socket.create_server(("127.0.0.1", 0)) as server:  # a port that nobody listens on once it is closed
+        address = f"{scheme}127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(UsageError, match="Connection refused; run ray start"):
+        next(run_on_ray([], [], address, print))
 
 
 @pytest.mark.parametrize(

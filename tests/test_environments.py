@@ -220,6 +220,7 @@ def test_paper_sum_is_the_cost_without_the_step():
         ("reacher", [1.0], "each of"),
         ("reacher", [1.0, -1.0], "control_scale > 0"),
         ("nowhere.yaml", [1.0], "config file"),
+        (None, None, "task=…"),
     ],
 )
 def test_impossible_environment_is_refused(task, scale, named):
@@ -250,7 +251,7 @@ def test_action_of_another_shape_is_refused():
 
 
 def test_any_task_is_made_by_name():
-    environment = gymnasium.make("lyapnet/Task-v0", task=str(CONF / "integrator_chain.yaml"), control_scale=[5.0])
+    environment = gymnasium.make("lyapnet/Task-v0", task=str(CONF / "integrator_chain.yaml"), control_scale=5)
     assert environment.observation_space.shape == (4,)
 
 

@@ -110,7 +110,10 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
     metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
 
     def __init__(
-        self, task: str | Path | Task, control_scale: Sequence[float] | None = None, observe_time: bool = False
+        self,
+        task: str | Path | Task | None = None,
+        control_scale: float | Sequence[float] | None = None,
+        observe_time: bool = False,
     ):
         self._episode = EulerEpisodes(bounded_task(task, control_scale), observe_time)
         self.observation_space, self.action_space = self._episode.observation_space, self._episode.action_space

@@ -317,6 +317,16 @@ def optima_of(bounded: BoundedTask, x0: State) -> PerState | None:
         return None
 
 
+def why_no_optimum(bounded: BoundedTask) -> str | None:
+    """What keeps J* of a task from being known; None if nothing does."""
+    system, cost, _, horizon = bounded.task
+    try:
+        oracle_of(system, cost, horizon)
+    except OracleError as error:
+        return str(error)
+    return None
+
+
 def _ratio_of_means(cost: PerState, optima: PerState) -> float | None:
     """Over the states whose optimum is known."""
     known = torch.isfinite(optima)

@@ -64,16 +64,19 @@ class BoundedTask(NamedTuple):
     control_scale: Sequence[float]
 
 
-def bounded_task(task: str | Path | Task, control_scale: Sequence[float] | None = None) -> BoundedTask:
+def bounded_task(
+    task: str | Path | Task | None = None, control_scale: float | Sequence[float] | None = None
+) -> BoundedTask:
     """A reference task by name, the task of a config file, or a task.
 
     Args:
         control_scale: max |u_i| in the units of the control, one for each; known for the reference tasks.
 
     Raises:
-        UsageError: no such task or file; or no scale, a scale of another length, or one that is not positive.
+        UsageError: no such task or file, or none; or no scale, one of another length, or one that is not positive.
     """
-    scale = CONTROL_SCALES.get(str(task)) if control_scale is None else control_scale
+    given = [control_scale] if isinstance(control_scale, int | float) else control_scale
+    scale = CONTROL_SCALES.get(str(task)) if given is None else given
     built = task if isinstance(task, Task) else _build(task)
     m, names = built.system.m, ", ".join(built.system.control_labels)
     if scale is None:
@@ -81,11 +84,13 @@ def bounded_task(task: str | Path | Task, control_scale: Sequence[float] | None 
             f"Expected control_scale, the largest |u| of {names}, got none; choose it above what the task needs."
         )
     if len(scale) != m or not all(0 < bound < float("inf") for bound in scale):
-        raise UsageError(f"Expected control_scale > 0 for each of {names}, got {list(scale)}; give {m}.")
+        raise UsageError(f"Expected control_scale > 0 for each of {names}, got {list(scale)}; give as many.")
     return BoundedTask(built, tuple(float(bound) for bound in scale))
 
 
-def _build(task: str | Path) -> Task:
+def _build(task: str | Path | None) -> Task:
+    if task is None:
+        raise UsageError("Expected task=…, a name, a config file or a Task, got none; say which environment to make.")
     if str(task) not in TASKS:
         if not str(task).endswith((".yaml", ".yml")):
             raise UsageError(f"Expected a task as one of {', '.join(TASKS)}, or a config file, got {str(task)!r}.")

@@ -57,6 +57,7 @@ def compare(
     for one in begun_jobs(comparison):
         require_same(one)
     missing = [] if report else [one for one in jobs if one.result is None]
+    _tell_of_optima(jobs, console)
     command = ["compare", "--config", str(config), *(overrides or [])]
     worker = [sys.executable, "-m", "lyapnet", *command, "--job"]
     failed = _run(missing, len(jobs), worker, workers or os.cpu_count() or 1, ray, console)
@@ -73,6 +74,15 @@ def _require_extra() -> None:
 
 def _names(listed: str | None) -> list[str] | None:
     return None if listed is None else [name.strip() for name in listed.split(",") if name.strip()]
+
+
+def _tell_of_optima(jobs: Sequence[Any], console: Console) -> None:
+    """A line for each task whose costs will stand alone, before hours are spent on it."""
+    from lyapnet.baselines.rl import why_no_optimum
+
+    for job in {job.task: job for job in jobs}.values():
+        if (reason := why_no_optimum(job.bounded)) is not None:
+            console.print(f"{job.task}: cost without its optimum. {reason}", soft_wrap=True, markup=False)
 
 
 def _run(

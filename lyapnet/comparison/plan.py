@@ -1,5 +1,6 @@
 """What is compared: the schema of conf/compare.yaml, and the jobs that it consists of."""
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,7 @@ class ComparedTask:
         None, "Largest |u_i| of the baselines; null: the reference task's of that name.", above=0
     )
     hidden: list[int] = option([64, 64], "Widths of the baselines' networks.", at_least=1)
-    steps: dict[str, int] = option({}, "Environment steps of each baseline.")
+    steps: dict[str, int] = option({}, "Environment steps of each baseline; one without is not compared here.")
     options: dict[str, Any] = option({}, "Options of a baseline's algorithm that differ from its setting's.")
 
 
@@ -138,8 +139,8 @@ class Job:
             UsageError: no number of steps, or no control scale.
         """
         compared, method = self.compared, self.method
-        if compared.steps.get(method, 0) < 1:
-            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got none; give its environment steps.")
+        if (steps := compared.steps.get(method, 0)) < 1:
+            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got {steps}; its environment steps.")
         options = compared.options.get(method, {})
         return Baseline(self.bounded, method, self.seed, compared.steps[method], compared.hidden, options)
 
@@ -164,23 +165,26 @@ def jobs_of(
     """The jobs of a comparison, or of some of its tasks and methods; seed by seed, so that all grow together.
 
     Raises:
-        UsageError: a task or method that it does not have; or a job that cannot be trained.
+        UsageError: a task or method that it does not have, or one without steps; or a job that cannot be trained.
     """
-    tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
-    for task in tasks:
+    for task in tasks or ():
         _require_among(task, config.tasks, "--tasks")
-    for method in methods:
+    for method in methods or ():
         _require_among(method, METHODS, "--methods")
+        if method != OURS and not any(method in config.tasks[task].steps for task in tasks or config.tasks):
+            raise UsageError(f"Expected {method} under steps of a task, got none; give its environment steps.")
+    tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
     count = {m: seeds or (config.seeds if m == OURS else config.baseline_seeds) for m in methods}
     jobs = [
         Job(config, task, method, seed)
         for seed in range(max(count.values()))
         for task in tasks
         for method in methods
-        if seed < count[method]
+        if seed < count[method] and (method == OURS or method in config.tasks[task].steps)
     ]
-    for job in jobs[: len(tasks) * len(methods)]:
-        job.check()
+    for job in jobs:
+        if job.seed == 0:
+            job.check()
     return jobs
 
 
@@ -212,4 +216,6 @@ def job_named(config: ComparisonConfig, name: str) -> Job:
 
 def _require_among(name: str, known: Any, where: str) -> None:
     if name not in known:
-        raise UsageError(f"Expected {where} among {', '.join(known)}, got {name!r}.")
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {near[0]}?" if near else "."
+        raise UsageError(f"Expected {where} among {', '.join(known)}, got {name!r}{hint}")

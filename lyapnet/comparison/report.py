@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torch.utils.tensorboard.writer import SummaryWriter
 
 from lyapnet.atomic import write_atomically
-from lyapnet.comparison.figures import FIGURE3_CAPTION, FINAL_CAPTION, figure3, final, pictures
+from lyapnet.comparison.figures import caption, figure3, final, pictures
 from lyapnet.comparison.layout import Table, csv_text, latex, markdown
 from lyapnet.comparison.results import Result
 from lyapnet.comparison.statistics import Comparison, compared
@@ -97,7 +97,6 @@ def report_text(
 ) -> str:
     """The report for a reader."""
     counted = sum(len(group.results) for group in comparison.groups.values())
-    captions = {"figure3": FIGURE3_CAPTION, "final": FINAL_CAPTION}
     sections = [
         f"# {TITLE}",
         f"{counted} results of {len(comparison.tasks)} tasks and {len(comparison.methods)} methods.",
@@ -107,7 +106,7 @@ def report_text(
         "## Costs",
         *map(markdown, tables["table1"]),
         "## Figures",
-        *(part for name in figures for part in (f"![{name}]({name}.png)", captions.get(name, name.replace("_", " ")))),
+        *(part for name in figures for part in (f"![{name}]({name}.png)", caption(name, comparison))),
         "## Details",
         *map(markdown, tables["details"]),
         *_notes(),

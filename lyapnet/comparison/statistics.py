@@ -99,6 +99,11 @@ def best_until(result: Result, steps: float) -> float | None:
     return min((one.cost if one.cost_ratio is None else one.cost_ratio for one in points), default=None)
 
 
+def best_validation(result: Result) -> Measurement:
+    """That of least cost, the later of two: whose checkpoint a baseline is evaluated with."""
+    return min(reversed(result.curve), key=lambda one: one.cost)
+
+
 def _known(result: Result) -> tuple[np.ndarray, np.ndarray] | None:
     if result.optima is None:
         return None
@@ -213,6 +218,18 @@ class Group:
         reached = sum(first is not None for first, _ in firsts)
         return Reach(reached, len(firsts), _finite(steps), _finite(median(known)), median(seconds))
 
+    @property
+    def best_steps(self) -> float:
+        """Environment steps of the validation of least cost, median over the seeds."""
+        return median(best_validation(result).environment_steps for result in self.results)
+
+    @property
+    def last_cost(self) -> float | None:
+        """Cost / optimum of the last validation, mean over the seeds."""
+        ratios = [result.curve[-1].cost_ratio for result in self.results]
+        known = [ratio for ratio in ratios if ratio is not None]
+        return fmean(known) if len(known) == len(ratios) else None
+
     def best_until(self, steps: float) -> float | None:
         """Mean over the seeds of the least cost / optimum until an environment step."""
         costs = [best_until(result, steps) for result in self.results]
@@ -296,18 +313,19 @@ class Comparison:
         return _quotient(*(getattr(group, form).mean if group else None for group in (theirs, ours)))
 
     def speedup(self, task: str, method: str, *, compiled: bool = False) -> Speedup | None:
-        """Of ours against a method, to within 10 % of the optimum; None where ours does not get there.
+        """Of ours against a method, to within 10 % of the optimum; None where ours does not get there, or unmeasured.
 
         Args:
             compiled: leave out the seconds of compilation, as the second run of a task does.
         """
         groups = self.of(task, OURS), self.of(task, method)
         ours, theirs = (group and group.within(NEAR, compiled=compiled) for group in groups)
-        if ours is None or theirs is None or ours.seconds is None:
+        if ours is None or theirs is None or not ours.seconds:
             return None
-        seconds = theirs.seconds_at_least if theirs.seconds is None else theirs.seconds
-        factor = seconds / ours.seconds if ours.seconds else math.inf
-        return Speedup(factor, theirs.seconds is None)
+        if theirs.seconds is not None:
+            return Speedup(theirs.seconds / ours.seconds, at_least=False)
+        bound = theirs.seconds_at_least / ours.seconds
+        return Speedup(bound, at_least=True) if bound > 1 else None  # of a shorter training than ours: nothing said
 
 
 def compared(results: Iterable[Result]) -> Comparison:

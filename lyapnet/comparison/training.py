@@ -17,7 +17,7 @@ from lyapnet.baselines.rl import BaselineTraining, costs_of_best, optima_of
 from lyapnet.build import build_program, resolve
 from lyapnet.comparison.plan import RESULT, Job
 from lyapnet.comparison.results import OURS, Measurement, Result
-from lyapnet.config import to_plain
+from lyapnet.config import differences, to_plain
 from lyapnet.controller import Controller, load
 from lyapnet.errors import UsageError
 from lyapnet.evaluation import measure
@@ -62,10 +62,13 @@ def require_same(job: Job) -> None:
         return
     wanted = json.loads(json.dumps(_description(job)))
     kept = json.loads(record.read_text(encoding="utf-8"))
-    changed = [key for key in wanted if wanted[key] != kept.get(key)]
-    if changed:
+    changes = [
+        text if len(text := f"{name} = {now} instead of {then}") < 80 else f"another {name}"
+        for name, (then, now) in differences(kept, wanted).items()
+    ]
+    if changes:
         raise UsageError(
-            f"Expected {job.name} as it was begun, got another {', '.join(changed)}; undo the change, remove "
+            f"Expected {job.name} as it was begun, got {', '.join(changes)}; undo the change, remove "
             f"{str(job.folder)!r}, or give the comparison another name."
         )
 

@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -77,6 +78,7 @@ def run_on_ray(
         from ray.exceptions import RayError
     except ImportError as error:
         raise UsageError("Expected Ray for --ray, got none; pip install 'lyapnet[ray]'.") from error
+    _require_listening(address)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except Exception as error:  # ConnectionError, or one of its many own
@@ -97,6 +99,18 @@ def run_on_ray(
                 yield Outcome(job, 0.0, " ".join(str(error).split()))
     finally:
         ray.shutdown()
+
+
+def _require_listening(address: str) -> None:
+    """Refuse host:port where nothing listens: ray.init tries for minutes."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except OSError as error:
+            raise UsageError(
+                f"Expected a Ray cluster at {address!r}, got {error.strerror or error}; run ray start --head there."
+            ) from error
 
 
 def run_process(

@@ -145,12 +145,18 @@ def at_convergence(*theirs):
 
 def test_a_baseline_counts_with_the_best_that_it_had_until_then():
     at, cells = at_convergence(
-        result("ppo_paper", 0, curve=((0, 20.0), (200, 5.0), (299, 7.0), (301, 3.0))),  # 5 was kept, 3 is later
+        result("ppo_paper", 0, curve=((0, 20.0), (200, 5.0), (299, 7.0), (300, 6.0), (301, 3.0))),  # 5 was kept
         result("ppo_paper", 1, curve=((0, 20.0), (300, 4.0))),  # at that step itself
     )
     assert (at.steps, at.ended, at.cost, at.ours) == (300, False, 4.5, 1.0)
     assert at.factor == 4.5
     assert "4.5000" in cells
+    at, _ = at_convergence(result("ppo_paper", curve=((0, 20.0), (200, 5.0), (301, 3.0), (302, 2.0))))
+    assert at.cost == 3, "between two validations the later one counts as well"
+    ours, _ = at_convergence()
+    assert ours is None
+    own = compared([result(seed=k, curve=((0, 9.0), (90 + k, 1.0), (500, 1.0))) for k in range(3)])
+    assert own.at_convergence("reacher", "lyapnet").ours == fmean([1.0, 1.0, 9.0]), "ours has no such favour"
 
 
 def test_a_baseline_that_ended_before_is_compared_where_it_ended():
@@ -198,7 +204,7 @@ def test_improvement_and_speedup_by_hand(comparison):
     ours = fmean([1.0, 1.01, 1.02])
     assert comparison.improvement("reacher", "ppo_paper") == pytest.approx(3.5 / ours)
     assert comparison.improvement("reacher", "ppo_paper", "sum") == pytest.approx(3.5 / ours)
-    assert comparison.at_convergence("reacher", "ppo_paper").factor == pytest.approx(10 / 1.01)
+    assert comparison.at_convergence("reacher", "ppo_paper").factor == pytest.approx(3 / 1.01)
     assert comparison.speedup("reacher", "ppo_tuned") == (600 / 20, False)
     assert comparison.speedup("reacher", "ppo_paper") == (600 / 20, True)
     assert comparison.improvement("double_integrator", "sac_paper") == INF

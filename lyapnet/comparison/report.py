@@ -16,7 +16,7 @@ from lyapnet.comparison.figures import caption, figure3, final, pictures
 from lyapnet.comparison.layout import Table, csv_text, latex, markdown
 from lyapnet.comparison.results import Result
 from lyapnet.comparison.statistics import Comparison, compared
-from lyapnet.comparison.tables import NOTES, curve_rows, details, missing, result_rows, table1, tasks_table
+from lyapnet.comparison.tables import NOTES, curve_rows, details, missing, overview, result_rows, table1, tasks_table
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.event_files import event_files
@@ -103,6 +103,7 @@ def report_text(
         f"```bash\n{command}\n```",
         "\n".join([f"- {fact}" for fact in _facts()]),
         *(["**Missing so far**", "\n".join(f"- {line}" for line in lacking)] if lacking else []),
+        markdown(overview(comparison)),
         "## Costs",
         *map(markdown, tables["table1"]),
         "## Figures",

@@ -93,9 +93,15 @@ def first_within(result: Result, ratio: float) -> Measurement | None:
     return next((one for one in result.curve if one.cost_ratio is not None and one.cost_ratio <= ratio), None)
 
 
-def best_until(result: Result, steps: float) -> float | None:
-    """The least cost / optimum of the validations at or before an environment step; cost, where no optimum is known."""
+def best_until(result: Result, steps: float, *, and_next: bool = False) -> float | None:
+    """The least cost / optimum of the validations at or before an environment step; cost, where no optimum is known.
+
+    Args:
+        and_next: where none is at that very step, the next one counts too.
+    """
     points = [one for one in result.curve if one.environment_steps <= steps]
+    if and_next and points and points[-1].environment_steps < steps:
+        points += result.curve[len(points) : len(points) + 1]
     return min((one.cost if one.cost_ratio is None else one.cost_ratio for one in points), default=None)
 
 
@@ -133,7 +139,8 @@ class AtStep(NamedTuple):
     """A method and ours at the same environment step: where ours had converged, or where the method's training ended.
 
     Costs are over the optimum of each seed's own validation states, since those are others for each seed (J_N where no
-    optimum is known), and the least so far: a training that has forgotten what it knew has kept its checkpoint.
+    optimum is known), and the least so far: a training that has forgotten what it knew has kept its checkpoint. Between
+    two validations of a baseline the later one counts too, in its favour: they are coarse.
     """
 
     steps: float
@@ -230,9 +237,9 @@ class Group:
         known = [ratio for ratio in ratios if ratio is not None]
         return fmean(known) if len(known) == len(ratios) else None
 
-    def best_until(self, steps: float) -> float | None:
-        """Mean over the seeds of the least cost / optimum until an environment step."""
-        costs = [best_until(result, steps) for result in self.results]
+    def best_until(self, steps: float, *, and_next: bool = False) -> float | None:
+        """Mean over the seeds of the least cost / optimum until an environment step; see `best_until` of a result."""
+        costs = [best_until(result, steps, and_next=and_next) for result in self.results]
         known = [cost for cost in costs if cost is not None]
         return fmean(known) if len(known) == len(costs) else None
 
@@ -300,7 +307,7 @@ class Comparison:
             return None
         end = min(result.environment_steps for result in group.results)
         steps = min(converged, end)
-        theirs, own = group.best_until(steps), ours.best_until(steps)
+        theirs, own = group.best_until(steps, and_next=method != OURS), ours.best_until(steps)
         return None if theirs is None or own is None else AtStep(steps, end < converged, theirs, own)
 
     def improvement(self, task: str, method: str, form: str = "cost") -> float | None:

@@ -9,6 +9,7 @@ import pytest
 
 import lyapnet
 from lyapnet.cli import main
+from lyapnet.comparison.plan import jobs_of, load_comparison
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -104,9 +105,11 @@ def test_the_environment_example_runs(workplace):
 def test_a_system_of_your_own(workplace):
     (source,) = [block for block in blocks("python") if "ControlAffineSystem" in block]
     assert len(source.strip().splitlines()) <= 24
-    (config,) = blocks("yaml")
+    (config,) = [block for block in blocks("yaml") if "experiment:" in block]
+    (comparison,) = [block for block in blocks("yaml") if "comparison:" in block]
     (workplace / "pendulum.py").write_text(source, encoding="utf-8")
     (workplace / "pendulum.yaml").write_text(config, encoding="utf-8")
+    (workplace / "compare_pendulum.yaml").write_text(comparison, encoding="utf-8")
     try:
         assert train(["--config", "pendulum.yaml"]) == 0
         from pendulum import Pendulum  # pyright: ignore[reportMissingImports]
@@ -116,6 +119,8 @@ def test_a_system_of_your_own(workplace):
         assert controller.policy(0.0, [0.3, 0.0]).shape == (1,)
         assert main(["evaluate", path, "--system", "pendulum:Pendulum", "--samples", "3"]) == 0
         assert main(["evaluate", path, "--samples", "3"]) == 2  # the system has to be passed
+        compared = {job.method for job in jobs_of(load_comparison("compare_pendulum.yaml"))}
+        assert compared == {"lyapnet", "ppo_tuned"}
     finally:
         sys.modules.pop("pendulum", None)
 

@@ -192,9 +192,7 @@ class Group:
     @property
     def cost_ratio(self) -> float | None:
         """Mean cost / mean optimum; each seed has the same states, so that it is the mean over the seeds."""
-        ratios = [cost_ratio(result) for result in self.results]
-        known = [ratio for ratio in ratios if ratio is not None]
-        return fmean(known) if len(known) == len(ratios) else None
+        return _mean_of_all(cost_ratio(result) for result in self.results)
 
     @property
     def constraint_loss(self) -> Spread | None:
@@ -233,15 +231,11 @@ class Group:
     @property
     def last_cost(self) -> float | None:
         """Cost / optimum of the last validation, mean over the seeds."""
-        ratios = [result.curve[-1].cost_ratio for result in self.results]
-        known = [ratio for ratio in ratios if ratio is not None]
-        return fmean(known) if len(known) == len(ratios) else None
+        return _mean_of_all(result.curve[-1].cost_ratio for result in self.results)
 
     def best_until(self, steps: float, *, and_next: bool = False) -> float | None:
         """Mean over the seeds of the least cost / optimum until an environment step; see `best_until` of a result."""
-        costs = [best_until(result, steps, and_next=and_next) for result in self.results]
-        known = [cost for cost in costs if cost is not None]
-        return fmean(known) if len(known) == len(costs) else None
+        return _mean_of_all(best_until(result, steps, and_next=and_next) for result in self.results)
 
 
 def relative_costs(result: Result) -> np.ndarray | None:
@@ -251,6 +245,13 @@ def relative_costs(result: Result) -> np.ndarray | None:
         return None
     costs, optima = known
     return costs[optima > 0] / optima[optima > 0]
+
+
+def _mean_of_all(values: Iterable[float | None]) -> float | None:
+    """None where one of them is missing."""
+    given = list(values)
+    known = [value for value in given if value is not None]
+    return fmean(known) if len(known) == len(given) else None
 
 
 def _finite(value: float) -> float | None:

@@ -79,8 +79,8 @@ NOTES = (
     "Baselines are validated about 40 times in a training, ours as often as its config says. Steps and seconds to 10 % "
     "and 2 % are those of a validation, and so upper bounds.",
     "Best validation: of least cost so far; median over the seeds of its environment steps. At 0 it is the untrained "
-    "network. Last validation: what a training without kept checkpoints would have ended with; mean over the seeds. On "
-    "few and noisy validations the best one is also lucky: on the evaluation states it costs more.",
+    "network. Last validation: what a training without kept checkpoints would have ended with; mean over the seeds. "
+    "The best of many noisy validations is also a lucky one: on the evaluation states it may cost more.",
     "mean ± std: over the seeds, of their means over the states, with n − 1. IQM: mean of the middle half of all "
     "seeds × states, with its 95 % percentile bootstrap interval by resampling seeds (2,000 times, generator seed 0); "
     "of three seeds that is about their range. It leaves out the costliest states of X₀ and so can lie below the mean "

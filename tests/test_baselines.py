@@ -61,7 +61,8 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
     steps = [point.environment_steps for point in training.curve]
     assert steps[0] == 0
     assert steps[-1] >= 1200
-    assert {step % (baseline.setting.environments * 6) for step in steps} == {0}, "no episode is cut"
+    whole = 6 if method.startswith("ppo") else 4
+    assert {step % (baseline.setting.environments * whole) for step in steps} == {0}, "no rollout is cut"
     assert [step for _, step, _ in curve(tmp_path, "trajectory_cost/val")] == steps
     costs = [value for *_, value in curve(tmp_path, "trajectory_cost/val")]
     np.testing.assert_allclose(costs, [point.cost for point in training.curve], rtol=1e-6)
@@ -81,8 +82,8 @@ def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
     baseline = baseline_of(method, 2400)
     whole = trained(tmp_path / "whole", baseline)
     with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "parts", baseline, pieces=3)
-    assert 0 < checkpoints(tmp_path / "parts")[-1].step < whole.curve[-3].environment_steps
+        trained(tmp_path / "parts", baseline, pieces=5)  # SAC within an episode
+    assert 0 < checkpoints(tmp_path / "parts")[-1].step < whole.curve[-1].environment_steps
     torch.manual_seed(5)  # a new process knows nothing of the old one's streams
     np.random.seed(5)  # noqa: NPY002
     resumed = trained(tmp_path / "parts", baseline)
@@ -149,12 +150,15 @@ def test_unknown_method_is_refused():
         _ = baseline_of("ppo_best", 10).setting
 
 
-def test_pieces_are_whole_episodes():
+def test_pieces_are_whole_episodes_or_updates():
+    baseline = baseline_of("ppo_paper", 30_000)
+    assert baseline.piece % (90 * 6) == 0
     baseline = baseline_of("sac_paper", 10_000)
-    assert baseline.piece % (16 * 6) == 0
+    assert baseline.piece % (16 * 4) == 0
     assert baseline.piece == pytest.approx(10_000 / rl.VALIDATIONS, rel=0.5)
-    assert baseline_of("sac_paper", 1).piece == 16 * 12, "an update every 4 steps: whole ones as well"
-    assert baseline_of("sac_paper", 1, train_freq=1).piece == 16 * 6
+    assert baseline_of("sac_paper", 1).piece == 16 * 4
+    assert baseline_of("sac_paper", 1, train_freq=1).piece == 16
+    assert baseline_of("ppo_paper", 1).piece == 90 * 6
 
 
 def test_progress_is_plain_data(tmp_path):

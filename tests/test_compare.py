@@ -11,14 +11,16 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import lyapnet
 from lyapnet.cli import main
 from lyapnet.comparison import workers
-from lyapnet.comparison.plan import METHODS, OURS, Job, job_named, jobs_of, load_comparison
+from lyapnet.comparison.command import _tell_of_optima
+from lyapnet.comparison.plan import METHODS, OURS, Job, begun_jobs, job_named, jobs_of, load_comparison
 from lyapnet.comparison.results import Result, with_common_optima
 from lyapnet.comparison.workers import run_locally, run_on_ray, run_process, seconds_left
-from lyapnet.errors import UsageError
+from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation import evaluate
 
 ROOT = Path(__file__).parents[1]
@@ -148,6 +150,31 @@ def test_a_baseline_without_steps_is_not_compared(tmp_path):
     assert {job.method for job in jobs_of(comparison)} == {OURS, "ppo_tuned"}
     with pytest.raises(UsageError, match="Expected sac_tuned under steps"):
         jobs_of(comparison, methods=["sac_tuned"])
+
+
+def test_a_baseline_that_lost_its_steps_is_not_asked_for(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    written = tmp_path / "own.yaml"
+    written.write_text(f"tasks: {{reacher: {{config: {ROOT / 'conf' / 'reacher.yaml'}, steps: {{ppo_tuned: 9}}}}}}")
+    for method in ("ppo_tuned", "sac_tuned"):
+        (tmp_path / "logs" / "compare" / "reacher" / method / "seed_0").mkdir(parents=True)
+    assert [job.method for job in begun_jobs(load_comparison(written))] == ["ppo_tuned"]
+
+
+def test_costs_without_their_optimum_are_told_before_anything_is_trained(monkeypatch, capsys):
+    jobs = jobs_of(load_comparison(SMOKE), ["reacher", "double_integrator"], ["ppo_tuned"])
+    _tell_of_optima(jobs, Console())
+    assert not capsys.readouterr().out
+
+    def none(*_):
+        raise OracleError("Expected an oracle.")
+
+    monkeypatch.setattr("lyapnet.baselines.rl.oracle_of", none)
+    _tell_of_optima(jobs, Console())
+    said = capsys.readouterr().out.splitlines()
+    assert said == [
+        f"{task}: cost without its optimum. Expected an oracle." for task in ("reacher", "double_integrator")
+    ]
 
 
 def test_baselines_have_the_networks_and_the_task_of_the_comparison():

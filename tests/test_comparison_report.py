@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -156,7 +157,11 @@ def test_a_baseline_counts_with_the_best_that_it_had_until_then():
     ours, _ = at_convergence()
     assert ours is None
     own = compared([result(seed=k, curve=((0, 9.0), (90 + k, 1.0), (500, 1.0))) for k in range(3)])
-    assert own.at_convergence("reacher", "lyapnet").ours == fmean([1.0, 1.0, 9.0]), "ours has no such favour"
+    at = own.at_convergence("reacher", "lyapnet")
+    assert at.ours == at.cost == fmean([1.0, 1.0, 9.0]), "ours has no such favour"
+    unknown = result("ppo_paper")
+    unknown = replace(unknown, curve=[*unknown.curve, replace(unknown.curve[-1], cost_ratio=None)])
+    assert at_convergence(unknown)[0] is None, "costs are not compared with ratios"
 
 
 def test_a_baseline_that_ended_before_is_compared_where_it_ended():
@@ -279,12 +284,62 @@ def test_details_say_what_was_reached(comparison):
     headings = [column.heading for column in table.columns]
     rows = {(c[0], c[1]): dict(zip(headings, c, strict=True)) for c in table.cells()}
     tuned, plain = rows["reacher", "PPO (tuned)"], rows["reacher", "PPO (paper)"]
-    assert (tuned["steps to 10 %"], tuned["seconds to 10 %"], tuned["speedup"]) == ("6,000", "600.0", "30")
+    assert (tuned["steps to 10 %"], tuned["seconds to 10 %"], tuned["seconds / ours"]) == ("6,000", "600.0", "30")
     assert plain["steps to 10 %"] == "not reached (0 of 2)"
-    assert plain["speedup"] == "> 30"
-    assert (plain["seeds"], plain["steps"], plain["clipped"]) == ("0 1", "6,000", "25.0%")
+    assert plain["seconds / ours"] == "> 30"
+    assert (plain["seeds"], plain["trained for"], plain["clipped"]) == ("0 1", "6,000", "25.0%")
     assert rows["double integrator", "SAC (paper)"]["cost / J*"] == "diverged"
-    assert rows["reacher", "lyapnet"]["speedup"] == layout.NOTHING
+    assert rows["reacher", "lyapnet"]["seconds / ours"] == layout.NOTHING
+
+
+def test_the_overview_is_of_the_details(comparison):
+    full, chosen = tables.details(comparison), tables.overview(comparison)
+    assert len(chosen.columns) == len(tables.OVERVIEW) < len(full.columns)
+    assert all(set(few) <= set(many) for few, many in zip(chosen.cells(), full.cells(), strict=True))
+
+
+def test_a_bound_is_marked_where_compilation_takes_longer_than_the_baseline():
+    ours = result(curve=((0, 9.0), (100, 1.0)), compilation_seconds=8.0)
+    table = tables.details(compared([ours, result("ppo_paper", curve=((0, 9.0), (60, 2.0)))]))
+    row = dict(zip([column.heading for column in table.columns], table.cells()[-1], strict=True))
+    assert row["seconds / ours"] == layout.NOTHING
+    assert row["/ ours without compilation"] == "> 3"
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("figure3", "optimality gap of ours"),
+        ("final", "interquartile mean"),
+        ("certified_region_double_integrator", "Double integrator, ours"),
+        ("trajectories_reacher", "Reacher, ours"),
+    ],
+)
+def test_captions_say_what_is_drawn(name, words, comparison):
+    assert words in figures.caption(name, comparison)
+    alone = compared([result(curve=((0, 9.0), (9, 1.0)))])
+    unknown = replace(alone.groups["reacher", "lyapnet"].results[0])
+    unknown = replace(unknown, curve=[replace(point, cost_ratio=None) for point in unknown.curve])
+    assert "J_N of ours" in figures.caption("figure3", compared([unknown]))
+
+
+@pytest.mark.parametrize(
+    ("limits", "labels"),
+    [
+        ((2e-4, 30.0), ["0.001", "0.01", "0.1", "1", "10"]),
+        ((0.02, 0.4), ["0.02", "0.05", "0.1", "0.2"]),
+        ((1e3, 3e7), ["1000", "$10^{4}$", "$10^{5}$", "$10^{6}$", "$10^{7}$"]),
+    ],
+)
+def test_axes_name_powers_of_ten_or_what_is_between_them(limits, labels):
+    figure = Figure()
+    axes = figure.subplots()
+    axes.set(yscale="log", ylim=limits)
+    figures._name_decades(axes.yaxis)
+    FigureCanvasAgg(figure).draw()
+    low, high = limits
+    ticks = [(at, text.get_text()) for at, text in zip(axes.get_yticks(), axes.get_yticklabels(), strict=True)]
+    assert [text for at, text in ticks if low <= at <= high] == labels
 
 
 def test_what_is_missing_is_named(comparison):

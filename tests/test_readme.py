@@ -102,6 +102,15 @@ def test_the_environment_example_runs(workplace):
     assert names["mean_return"] < 0
 
 
+def test_the_table_of_the_comparison_is_that_of_its_report():
+    lines = [line for line in README.splitlines() if line.startswith("| ")]
+    start = next(k for k, line in enumerate(lines) if line.startswith("| task | method"))
+    shown = [line for line in lines[start:] if line.count("|") == lines[start].count("|")]
+    report = (ROOT / "docs" / "compare" / "report.md").read_text(encoding="utf-8")
+    assert len(shown) == 2 + 4 * 5
+    assert "\n".join(shown) in report
+
+
 def test_a_system_of_your_own(workplace):
     (source,) = [block for block in blocks("python") if "ControlAffineSystem" in block]
     assert len(source.strip().splitlines()) <= 24

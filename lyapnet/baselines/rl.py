@@ -3,7 +3,6 @@
 import difflib
 import inspect
 import json
-import math
 import shutil
 import tempfile
 import time
@@ -81,13 +80,14 @@ class Baseline:
 
     @property
     def piece(self) -> int:
-        """Environment steps between validations: whole episodes of all trajectories and whole updates; none is cut."""
-        whole = self.setting.environments * math.lcm(self.bounded.task.horizon.steps, self.update)
+        """Environment steps between validations: whole episodes of PPO, whole updates of SAC, of all trajectories."""
+        on_policy = issubclass(self.setting.algorithm, OnPolicyAlgorithm)
+        whole = self.setting.environments * (self.bounded.task.horizon.steps if on_policy else self.update)
         return whole * max(1, round(self.steps / VALIDATIONS / whole))
 
     @property
     def update(self) -> int:
-        """Steps of every trajectory between updates of SAC; those of PPO divide the horizon or are some of it.
+        """Steps of every trajectory between updates of SAC.
 
         Raises:
             UsageError: it is not a number of steps.
@@ -275,7 +275,7 @@ class BaselineTraining:
             self.environment.save(str(draft / NORMALISATION))
         if isinstance(self.model, OffPolicyAlgorithm):
             self.model.save_replay_buffer(draft / REPLAY)
-        torch.save({**self.episodes.position(), **_random_streams()}, draft / STREAMS)
+        torch.save({**self.episodes.position(), **_random_streams(), **self._begun()}, draft / STREAMS)
         progress = {"seconds": self.seconds, "best": self.best, "curve": [asdict(point) for point in self.curve]}
         write_json(draft / PROGRESS, progress)
         draft.rename(root / f"step_{self.model.num_timesteps}")
@@ -285,6 +285,15 @@ class BaselineTraining:
                 shutil.rmtree(checkpoint.folder)
             else:
                 (checkpoint.folder / REPLAY).unlink(missing_ok=True)
+
+    def _begun(self) -> dict[str, torch.Tensor]:
+        """What SB3's wrappers know of the episodes that have begun, and leave out of their files; its own memory."""
+        wrapper: Any = self.environment
+        known = {}
+        if isinstance(wrapper, VecNormalize):
+            known, wrapper = {"returns": wrapper.returns}, wrapper.venv
+        known |= {name: getattr(wrapper, name) for name in ("episode_returns", "episode_lengths")}
+        return {name: torch.from_numpy(values) for name, values in known.items()}
 
     def _resume(self, checkpoint: Checkpoint) -> None:
         drop_events_after(self.folder, checkpoint.step)
@@ -296,6 +305,8 @@ class BaselineTraining:
         streams = torch.load(checkpoint.folder / STREAMS, weights_only=True)
         self.episodes.resume(streams)  # after loading, which seeds everything anew
         _restore(streams)
+        for name, values in self._begun().items():
+            values.copy_(streams[name])
         progress = checkpoint.progress
         self.seconds, self.best = progress["seconds"], progress["best"]
         self.curve = [Measurement(**point) for point in progress["curve"]]

@@ -57,7 +57,7 @@ def compare(
     for one in begun_jobs(comparison):
         require_same(one)
     missing = [] if report else [one for one in jobs if one.result is None]
-    _tell_of_optima(jobs, console)
+    _tell_of_optima(missing, console)
     command = ["compare", "--config", str(config), *(overrides or [])]
     worker = [sys.executable, "-m", "lyapnet", *command, "--job"]
     failed = _run(missing, len(jobs), worker, workers or os.cpu_count() or 1, ray, console)

@@ -51,9 +51,9 @@ CAPTIONS = {
     "final": "J(x₀) / J*(x₀) − 1, or J_N itself without a known optimum, of the best checkpoints on the evaluation "
     "states: a dot for each seed's interquartile mean over the states; the marker is that over all seeds and states, "
     "the bar its 95 % bootstrap interval. Dashed: 10 % above the optimum.",
-    "certified_region": "{task}, ours, its first finished seed (the paper's Fig. 1): where the Lyapunov condition "
+    "certified_region": "{task}, ours, its first finished seed (as the paper's Fig. 1): where the Lyapunov condition "
     "holds along closed loops from a grid over a slice of X₀. Sampled, not proved.",
-    "trajectories": "{task}, ours, its first finished seed (the paper's Fig. 4): closed loops from 12 states of X₀, "
+    "trajectories": "{task}, ours, its first finished seed (as the paper's Fig. 4): closed loops from 12 states of X₀, "
     "and V along them with the cost still to come. Controls are as the controller asks, not cut to the action box.",
 }
 
@@ -289,7 +289,7 @@ def _draw_scale(axes: Axes, relative: bool) -> None:
 
 
 def pictures(controllers: Mapping[str, Controller]) -> dict[str, Figure]:
-    """Name ↦ figure of learned controllers, task ↦ controller: trajectories with V (the paper's Fig. 4).
+    """Name ↦ figure of learned controllers, task ↦ controller: trajectories with V (as the paper's Fig. 4).
 
     Of Lyapunov programs also where their condition holds (Fig. 1): a value function is not trained to satisfy it.
     """

@@ -148,7 +148,8 @@ def with_interval(middle: float, low: float | None, high: float | None) -> str:
 
 def factor(value: float, at_least: bool = False) -> str:
     """A ratio of two costs or times; a lower bound is marked."""
-    return f"{'> ' if at_least else ''}{f'{value:,.0f}' if 100 <= value < 1e7 else f'{value:.3g}'}".replace("inf", "∞")
+    digits = ",.0f" if 100 <= value < 1e7 else ".3f" if 0.9 < value < 1.1 else ".3g"
+    return f"{'> ' if at_least else ''}{value:{digits}}".replace("inf", "∞")
 
 
 def share(value: float) -> str:

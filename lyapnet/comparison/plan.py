@@ -140,7 +140,7 @@ class Job:
         """
         compared, method = self.compared, self.method
         if (steps := compared.steps.get(method, 0)) < 1:
-            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got {steps}; its environment steps.")
+            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got {steps}; give its environment steps.")
         options = compared.options.get(method, {})
         return Baseline(self.bounded, method, self.seed, compared.steps[method], compared.hidden, options)
 
@@ -180,12 +180,20 @@ def jobs_of(
         for seed in range(max(count.values()))
         for task in tasks
         for method in methods
-        if seed < count[method] and (method == OURS or method in config.tasks[task].steps)
+        if seed < count[method] and _is_compared(config, task, method)
     ]
+    if not jobs:
+        raise UsageError(
+            "Expected at least one job, got baselines without steps alone; see steps in conf/compare.yaml."
+        )
     for job in jobs:
         if job.seed == 0:
             job.check()
     return jobs
+
+
+def _is_compared(config: ComparisonConfig, task: str, method: str) -> bool:
+    return method == OURS or method in config.tasks[task].steps
 
 
 def begun_jobs(config: ComparisonConfig) -> list[Job]:
@@ -195,7 +203,7 @@ def begun_jobs(config: ComparisonConfig) -> list[Job]:
         for task in config.tasks
         for method in METHODS
         for path in sorted((config.folder / task / method).glob("seed_*"))
-        if path.name.removeprefix("seed_").isdigit()
+        if path.name.removeprefix("seed_").isdigit() and _is_compared(config, task, method)
     ]
 
 

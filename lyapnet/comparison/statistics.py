@@ -94,7 +94,7 @@ def first_within(result: Result, ratio: float) -> Measurement | None:
 
 
 def best_until(result: Result, steps: float, *, and_next: bool = False) -> float | None:
-    """The least cost / optimum of the validations at or before an environment step; cost, where no optimum is known.
+    """The least cost / optimum of the validations at or before an environment step; None where one is not known.
 
     Args:
         and_next: where none is at that very step, the next one counts too.
@@ -102,7 +102,8 @@ def best_until(result: Result, steps: float, *, and_next: bool = False) -> float
     points = [one for one in result.curve if one.environment_steps <= steps]
     if and_next and points and points[-1].environment_steps < steps:
         points += result.curve[len(points) : len(points) + 1]
-    return min((one.cost if one.cost_ratio is None else one.cost_ratio for one in points), default=None)
+    known = [one.cost_ratio for one in points if one.cost_ratio is not None]
+    return min(known) if known and len(known) == len(points) else None
 
 
 def best_validation(result: Result) -> Measurement:
@@ -138,8 +139,8 @@ class Reach(NamedTuple):
 class AtStep(NamedTuple):
     """A method and ours at the same environment step: where ours had converged, or where the method's training ended.
 
-    Costs are over the optimum of each seed's own validation states, since those are others for each seed (J_N where no
-    optimum is known), and the least so far: a training that has forgotten what it knew has kept its checkpoint. Between
+    Costs are over the optimum of each seed's own validation states, since those are others for each seed, and the least
+    so far: a training that has forgotten what it knew has kept its checkpoint. Between
     two validations of a baseline the later one counts too, in its favour: they are coarse.
     """
 

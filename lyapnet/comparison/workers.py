@@ -12,6 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 from lyapnet.comparison.plan import RESULT, Job
 from lyapnet.errors import UsageError
@@ -103,10 +104,10 @@ def run_on_ray(
 
 def _require_listening(address: str) -> None:
     """Refuse host:port where nothing listens: ray.init tries for minutes."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    if host and port.isdigit():
+    place = urlsplit(address if "://" in address else f"//{address}")
+    if place.hostname and place.port:
         try:
-            socket.create_connection((host, int(port)), timeout=5).close()
+            socket.create_connection((place.hostname, place.port), timeout=5).close()
         except OSError as error:
             raise UsageError(
                 f"Expected a Ray cluster at {address!r}, got {error.strerror or error}; run ray start --head there."

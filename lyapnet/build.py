@@ -2,7 +2,6 @@
 
 import copy
 import csv
-import difflib
 import importlib
 import inspect
 import sys
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 from lyapnet.closed_loop import ClosedLoop
 from lyapnet.config import Config, CostConfig, SystemConfig
 from lyapnet.cost import QuadraticCost
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
 from lyapnet.programs import PROGRAMS, PointwiseCondition, Program
@@ -110,8 +109,7 @@ def _check_parameters(cls: type, config: SystemConfig) -> None:
     open_ended = any(a.kind is a.VAR_KEYWORD for a in arguments)
     for name in config.parameters:
         if name not in names and not open_ended:
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f"did you mean system.parameters.{near[0]}?" if near else "remove it."
+            hint = did_you_mean(name, names, "remove it.", "system.parameters.")
             known = ", ".join(names) or "none"
             raise UsageError(f"Expected parameters of {config.name} ({known}), got system.parameters.{name}; {hint}")
     missing = [a.name for a in named if a.default is a.empty and a.name not in config.parameters]

@@ -16,7 +16,7 @@ import yaml
 from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.networks import ACTIVATIONS, NETWORKS
 from lyapnet.policy import POLICIES
 from lyapnet.programs import PROGRAMS
@@ -367,8 +367,7 @@ def check_values(config: Any, prefix: str = "") -> None:
 def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
     choices = rule["choices"]
     if choices and value not in choices and not (rule["user_class"] and ":" in value):
-        near = difflib.get_close_matches(str(value), choices, n=1)
-        hint = f"did you mean {near[0]}?" if near else "choose one of them."
+        hint = did_you_mean(str(value), choices, "choose one of them.")
         own = ", or module:Class" if rule["user_class"] else ""
         raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
     holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}

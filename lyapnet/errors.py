@@ -1,5 +1,14 @@
 """What lyapnet raises for its users: one line that says what was expected, what came, what to do."""
 
+import difflib
+from collections.abc import Iterable
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
+    """How a message about an unknown name ends: with the nearest known one after its prefix, or with another advice."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"did you mean {prefix}{near[0]}?" if near else otherwise
+
 
 class LyapnetError(Exception):
     """A failure with a message meant for the user; the command line prints it and exits with `exit_status`."""

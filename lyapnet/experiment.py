@@ -1,6 +1,5 @@
 """A run: its folder, its trainer, its end; started, resumed, or fine-tuned from another one."""
 
-import difflib
 import inspect
 import logging
 import resource
@@ -38,7 +37,7 @@ from lyapnet.checkpoint import read_checkpoint, read_plain_data, write_checkpoin
 from lyapnet.config import Config, configs_of_seeds, differing_keys, label_of, load_config, to_plain, to_yaml
 from lyapnet.controller import config_of, load, load_value_function
 from lyapnet.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.errors import DivergenceError, Interrupted, UsageError
+from lyapnet.errors import DivergenceError, Interrupted, UsageError, did_you_mean
 from lyapnet.evaluation import evaluate
 from lyapnet.event_files import drop_events_after, event_files
 from lyapnet.modules import TrainedModule, build_module
@@ -281,11 +280,9 @@ def _require_same_experiment(config: Config, stored: Config, checkpoint: Path) -
 def _check_trainer_options(config: Config) -> None:
     for key in config.trainer:
         if key not in TRAINER_OPTIONS:
-            near = difflib.get_close_matches(key, TRAINER_OPTIONS, n=1)
             owned = key in inspect.signature(L.Trainer).parameters
-            hint = (
-                "lyapnet sets that one itself" if owned else f"did you mean trainer.{near[0]}?" if near else "remove it"
-            )
+            nearest = did_you_mean(key, TRAINER_OPTIONS, "remove it", "trainer.")
+            hint = "lyapnet sets that one itself" if owned else nearest
             raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint}")
     _quiet()
     try:  # Lightning refuses values only when it is built: now, before there is a folder

@@ -1,6 +1,5 @@
 """PPO and SAC of Stable-Baselines3 on a task: trained in pieces, each followed by a validation and a checkpoint."""
 
-import difflib
 import inspect
 import json
 import shutil
@@ -25,9 +24,9 @@ from lyapnet.baselines.env import Costs, VectorEnvironment, costs_of
 from lyapnet.baselines.measurement import Measurement
 from lyapnet.baselines.settings import SETTINGS, Setting
 from lyapnet.baselines.tasks import BoundedTask
-from lyapnet.errors import OracleError, UsageError
+from lyapnet.errors import OracleError, UsageError, did_you_mean
 from lyapnet.event_files import drop_events_after
-from lyapnet.oracles import oracle_of
+from lyapnet.oracles import optimal_cost, oracle_of
 from lyapnet.randomness import VALIDATION, stream
 from lyapnet.run import write_json
 from lyapnet.types import PerState, State
@@ -70,8 +69,7 @@ class Baseline:
         known = inspect.signature(algorithm).parameters
         for name in self.options:
             if name not in known:
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"did you mean {near[0]}?" if near else f"choose among {', '.join(known)}."
+                hint = did_you_mean(name, known, f"choose among {', '.join(known)}.")
                 raise UsageError(f"Expected options of {algorithm.__name__}, got {name!r} for {self.method}; {hint}")
         steps = self.options_of_algorithm.get("n_steps", horizon)
         if issubclass(algorithm, OnPolicyAlgorithm) and horizon % steps and steps % horizon:
@@ -322,10 +320,8 @@ def costs_of_best(baseline: Baseline, folder: Path, x0: State) -> tuple[Path, Co
 def optima_of(bounded: BoundedTask, x0: State) -> PerState | None:
     """J* from each of x₀ (b, n), NaN where none was found; None where there is no oracle."""
     system, cost, _, horizon = bounded.task
-    try:
-        return oracle_of(system, cost, horizon).solve(x0).cost
-    except OracleError:
-        return None
+    oracle = optimal_cost(system, cost, horizon)
+    return None if oracle is None else oracle.solve(x0).cost
 
 
 def why_no_optimum(bounded: BoundedTask) -> str | None:

@@ -1,6 +1,5 @@
 """What is compared: the schema of conf/compare.yaml, and the jobs that it consists of."""
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from lyapnet.baselines.tasks import CONTROL_SCALES, BoundedTask, bounded_task
 from lyapnet.build import build_task
 from lyapnet.comparison.results import METHODS, OURS, Result
 from lyapnet.config import Config, check_values, checked, load_config, option, read_yaml
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, did_you_mean
 
 RESULT = "result.json"  # written last: its presence says that the job is finished
 
@@ -224,6 +223,5 @@ def job_named(config: ComparisonConfig, name: str) -> Job:
 
 def _require_among(name: str, known: Any, where: str) -> None:
     if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]}?" if near else "."
-        raise UsageError(f"Expected {where} among {', '.join(known)}, got {name!r}{hint}")
+        hint = did_you_mean(name, known, "choose one of them.")
+        raise UsageError(f"Expected {where} among {', '.join(known)}, got {name!r}; {hint}")

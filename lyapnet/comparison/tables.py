@@ -275,7 +275,7 @@ def _detail(comparison: Comparison, group: Group) -> dict[str, Any]:
         "seeds": " ".join(map(str, group.seeds)),
         "steps_least": min(budgets),
         "steps_most": max(budgets),
-        "seconds_mean": sum(result.seconds for result in group.results) / len(group.results),
+        "seconds_mean": fmean(result.seconds for result in group.results),
         **_full_spread("", group.cost),
         **_full_spread("sum_", group.sum),
         "optimum": group.optimum,

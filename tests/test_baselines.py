@@ -2,12 +2,15 @@
 
 import json
 import shutil
+import textwrap
 
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lyapnet.baselines import rl
 from lyapnet.baselines.rl import Baseline, BaselineTraining, best_checkpoint, checkpoints, costs_of_best
@@ -94,6 +97,23 @@ def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
     assert sorted(drawn) == [p.environment_steps for p in whole.curve], "logged once"
     other = trained(tmp_path / "other", baseline_of(method, 2400, seed=1))
     assert other.curve[-1].cost != whole.curve[-1].cost
+
+
+@pytest.mark.parametrize("method", SETTINGS)
+def test_tensorboard_has_how_it_was_trained_and_every_scalar_once(method, tmp_path):
+    baseline = baseline_of(method, 1200)
+    steps = [point.environment_steps for point in trained(tmp_path, baseline).curve]
+    logged = EventAccumulator(str(tmp_path), {"scalars": 0}).Reload()
+    tags = logged.Tags()["scalars"]
+    for tag in tags:
+        drawn = [event.step for event in logged.Scalars(tag)]
+        assert drawn == steps[-len(drawn) :], f"{tag} once at each validation"
+    assert {"trajectory_cost/train", "train/actor_loss" if "sac" in method else "train/loss"} <= set(tags)
+    (text,) = logged.Tensors("config/text_summary")
+    said = OmegaConf.create(textwrap.dedent(text.tensor_proto.string_val[0].decode()))
+    assert (said["method"], said["seed"], said["steps"], said["hidden"]) == (method, 0, 1200, [8])
+    assert said["setting"]["observe_time"] is baseline.setting.observe_time
+    assert said["options"] == SMALL[method[:3]]
 
 
 def test_finished_training_is_not_trained_again(tmp_path, monkeypatch):

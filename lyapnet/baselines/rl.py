@@ -4,6 +4,7 @@ import inspect
 import json
 import shutil
 import tempfile
+import textwrap
 import time
 import warnings
 from collections import ChainMap
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from omegaconf import OmegaConf
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -120,6 +122,17 @@ class Baseline:
         policies = (options.get("policy_kwargs", {}) for options in (self.setting.options, self.options))
         return {**merged, "policy_kwargs": dict(ChainMap(*reversed([*policies]), {"net_arch": list(self.hidden)}))}
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """How it is trained, as plain values."""
+        setting = {**asdict(self.setting), "algorithm": self.setting.algorithm.__name__}
+        return {"setting": setting, "options": dict(self.options), "hidden": list(self.hidden), "steps": self.steps}
+
+    @property
+    def text(self) -> str:
+        """The same as YAML, with its name and seed."""
+        return OmegaConf.to_yaml(OmegaConf.create({"method": self.method, "seed": self.seed, **self.description}))
+
     def model(self, environment: VecEnv) -> BaseAlgorithm:
         """The untrained model."""
         create: Any = self.setting.algorithm
@@ -214,6 +227,7 @@ class BaselineTraining:
             DivergenceError: a trajectory left the finite numbers.
         """
         if not self.curve:
+            self.model.logger.record("config", textwrap.indent(self.baseline.text, "    "))
             report(self._validate())
             self._save()
         while self.model.num_timesteps < self.baseline.steps:
@@ -235,7 +249,8 @@ class BaselineTraining:
         now = rate * remaining if self.baseline.setting.decays else rate
         self.model.lr_schedule = lambda _: now
         started = time.process_time()  # as lyapnet.callbacks.Stopwatch
-        self.model.learn(self.baseline.piece, reset_num_timesteps=False, log_interval=10)
+        never = self.baseline.steps + 1  # what SB3 has to log goes with our own validations
+        self.model.learn(self.baseline.piece, reset_num_timesteps=False, log_interval=never)
         self.seconds += time.process_time() - started
 
     def _validate(self) -> Measurement:

@@ -1,6 +1,5 @@
 """One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
 
-import dataclasses
 import fcntl
 import json
 from collections.abc import Sequence
@@ -79,13 +78,8 @@ def _description(job: Job) -> dict[str, Any]:
     config, scale = to_plain(job.config), job.bounded.control_scale
     if job.method == OURS:
         return {"evaluation": evaluation, "control_scale": scale, "config": {**config, "logs": ""}}
-    baseline = job.baseline
-    setting = {**dataclasses.asdict(baseline.setting), "algorithm": baseline.setting.algorithm.__name__}
     task = [config[key] for key in ("system", "cost", "initial_states", "horizon")]
-    return {
-        "evaluation": evaluation, "control_scale": scale, "task": task, "setting": setting,
-        "options": dict(baseline.options), "hidden": baseline.hidden, "steps": baseline.steps,
-    }  # fmt: skip
+    return {"evaluation": evaluation, "control_scale": scale, "task": task, **job.baseline.description}
 
 
 def _lyapnet(job: Job, console: Console) -> Result:

@@ -360,6 +360,9 @@ def check_values(config: Any, prefix: str = "") -> None:
         key, value = f"{prefix}{f.name}", getattr(config, f.name)
         if dataclasses.is_dataclass(value):
             check_values(value, f"{key}.")
+        elif isinstance(value, dict) and f.metadata:
+            for name, entry in value.items():
+                _check_value(f"{key}.{name}", entry, f.metadata)
         elif f.metadata and value is not None:
             _check_value(key, value, f.metadata)
 

@@ -12,7 +12,6 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from lyapnet.baselines import rl
 from lyapnet.baselines.rl import Baseline, BaselineTraining, best_checkpoint, checkpoints, costs_of_best
 from lyapnet.baselines.settings import SETTINGS
 from lyapnet.baselines.tasks import bounded_task
@@ -175,7 +174,7 @@ def test_pieces_are_whole_episodes_or_updates():
     assert baseline.piece % (90 * 6) == 0
     baseline = baseline_of("sac_paper", 10_000)
     assert baseline.piece % (16 * 4) == 0
-    assert baseline.piece == pytest.approx(10_000 / rl.VALIDATIONS, rel=0.5)
+    assert baseline.piece == pytest.approx(10_000 / baseline.validations, rel=0.5)
     assert baseline_of("sac_paper", 1).piece == 16 * 4
     assert baseline_of("sac_paper", 1, train_freq=1).piece == 16
     assert baseline_of("ppo_paper", 1).piece == 90 * 6

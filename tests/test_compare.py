@@ -182,6 +182,7 @@ def test_baselines_have_the_networks_and_the_task_of_the_comparison():
     baseline = jobs["cartpole_balancing/ppo_paper/seed_2"].baseline
     assert (baseline.hidden, baseline.seed) == ([200, 500], 2)
     assert baseline.bounded.control_scale == (20.0,)
+    assert (baseline.validations, jobs["double_integrator/sac_tuned/seed_0"].baseline.validations) == (40, 200)
     assert jobs["double_integrator/ppo_paper/seed_0"].baseline.options["learning_rate"] == 3e-5
     assert "learning_rate" not in jobs["reacher/ppo_paper/seed_0"].baseline.options
 
@@ -202,6 +203,8 @@ def test_baselines_have_the_networks_and_the_task_of_the_comparison():
         (["tasks.reacher.stepz=3"], None, None, "tasks.reacher.steps"),
         (["tasks.reacher.steps.ppo=3"], None, None, "tasks.reacher.steps among"),
         (["tasks.reacher.steps.ppo_paper=0"], None, None, "tasks.reacher.steps.ppo_paper ≥ 1"),
+        (["tasks.reacher.validations.ppo_paper=0"], None, None, "tasks.reacher.validations.ppo_paper ≥ 1"),
+        (["tasks.reacher.validations.ppo=3"], None, None, "tasks.reacher.validations among"),
         (["tasks.reacher.control_scale=[1]"], None, None, "each of"),
         (["tasks.reacher.config=nowhere.yaml"], None, None, "config file"),
     ],

@@ -33,7 +33,7 @@ from lyapnet.randomness import VALIDATION, stream
 from lyapnet.run import write_json
 from lyapnet.types import PerState, State
 
-VALIDATIONS, VALIDATION_STATES = 40, 64  # a training's pieces; the states are those of a lyapnet run of that seed
+VALIDATIONS, VALIDATION_STATES = 40, 64  # of a training; the states are those of a lyapnet run of that seed
 BUFFER, MINIBATCHES = 1_000_000, 8  # of SAC; of a rollout of PPO, where its options do not say
 MODEL, NORMALISATION, REPLAY = "model.zip", "normalisation.pkl", "replay.pkl"
 PROGRESS, STREAMS = "progress.json", "streams.pt"
@@ -49,6 +49,7 @@ class Baseline:
     steps: int
     hidden: Sequence[int]
     options: Mapping[str, Any] = field(default_factory=dict)  # in place of those of the setting
+    validations: int = VALIDATIONS  # spread evenly over its steps: the training's pieces
 
     @property
     def setting(self) -> Setting:
@@ -83,7 +84,7 @@ class Baseline:
         """Environment steps between validations: whole episodes of PPO, whole updates of SAC, of all trajectories."""
         on_policy = issubclass(self.setting.algorithm, OnPolicyAlgorithm)
         whole = self.setting.environments * (self.bounded.task.horizon.steps if on_policy else self.update)
-        return whole * max(1, round(self.steps / VALIDATIONS / whole))
+        return whole * max(1, round(self.steps / self.validations / whole))
 
     @property
     def update(self) -> int:
@@ -126,7 +127,8 @@ class Baseline:
     def description(self) -> dict[str, Any]:
         """How it is trained, as plain values."""
         setting = {**asdict(self.setting), "algorithm": self.setting.algorithm.__name__}
-        return {"setting": setting, "options": dict(self.options), "hidden": list(self.hidden), "steps": self.steps}
+        plain = {"options": dict(self.options), "hidden": list(self.hidden)}
+        return {"setting": setting, **plain, "steps": self.steps, "validations": self.validations}
 
     @property
     def text(self) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from lyapnet.baselines.rl import Baseline
+from lyapnet.baselines.rl import VALIDATIONS, Baseline
 from lyapnet.baselines.settings import SETTINGS
 from lyapnet.baselines.tasks import CONTROL_SCALES, BoundedTask, bounded_task
 from lyapnet.build import build_task
@@ -28,7 +28,10 @@ class ComparedTask:
         None, "Largest |u_i| of the baselines; null: the reference task's of that name.", above=0
     )
     hidden: list[int] = option([64, 64], "Widths of the baselines' networks.", at_least=1)
-    steps: dict[str, int] = option({}, "Environment steps of each baseline; one without is not compared here.")
+    steps: dict[str, int] = option(
+        {}, "Environment steps of each baseline; one without is not compared here.", at_least=1
+    )
+    validations: dict[str, int] = option({}, f"Of each baseline, within its steps; {VALIDATIONS}.", at_least=1)
     options: dict[str, Any] = option({}, "Options of a baseline's algorithm that differ from its setting's.")
 
 
@@ -69,7 +72,7 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
         _require_among(method, METHODS, "methods")
     for name, task in config.tasks.items():
         check_values(task, f"tasks.{name}.")
-        for key in ("steps", "options"):
+        for key in ("steps", "validations", "options"):
             for method in getattr(task, key):
                 _require_among(method, SETTINGS, f"tasks.{name}.{key}")
         for method, options in task.options.items():
@@ -138,10 +141,12 @@ class Job:
             UsageError: no number of steps, or no control scale.
         """
         compared, method = self.compared, self.method
-        if (steps := compared.steps.get(method, 0)) < 1:
-            raise UsageError(f"Expected tasks.{self.task}.steps.{method} ≥ 1, got {steps}; give its environment steps.")
-        options = compared.options.get(method, {})
-        return Baseline(self.bounded, method, self.seed, compared.steps[method], compared.hidden, options)
+        if method not in compared.steps:
+            raise UsageError(f"Expected {method} under tasks.{self.task}.steps, got none; give its environment steps.")
+        options, validations = compared.options.get(method, {}), compared.validations.get(method, VALIDATIONS)
+        return Baseline(
+            self.bounded, method, self.seed, compared.steps[method], compared.hidden, options, validations
+        )  # fmt: skip
 
     def check(self) -> None:
         """Refuse what cannot be trained, before anything is.

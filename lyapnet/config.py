@@ -355,16 +355,15 @@ def _explain(error: OmegaConfBaseException, schema: type) -> str:
 
 
 def check_values(config: Any, prefix: str = "") -> None:
-    """Hold every field against the rule it was declared with."""
+    """Hold every field, and every entry of a section, against the rule it was declared with."""
     for f in dataclasses.fields(config):
         key, value = f"{prefix}{f.name}", getattr(config, f.name)
-        if dataclasses.is_dataclass(value):
-            check_values(value, f"{key}.")
-        elif isinstance(value, dict) and f.metadata:
-            for name, entry in value.items():
-                _check_value(f"{key}.{name}", entry, f.metadata)
-        elif f.metadata and value is not None:
-            _check_value(key, value, f.metadata)
+        entries = {f"{key}.{name}": entry for name, entry in value.items()} if isinstance(value, dict) else {key: value}
+        for name, entry in entries.items():
+            if dataclasses.is_dataclass(entry):
+                check_values(entry, f"{name}.")
+            elif f.metadata and entry is not None:
+                _check_value(name, entry, f.metadata)
 
 
 def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:

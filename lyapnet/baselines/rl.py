@@ -127,8 +127,10 @@ class Baseline:
     def description(self) -> dict[str, Any]:
         """How it is trained, as plain values."""
         setting = {**asdict(self.setting), "algorithm": self.setting.algorithm.__name__}
-        plain = {"options": dict(self.options), "hidden": list(self.hidden)}
-        return {"setting": setting, **plain, "steps": self.steps, "validations": self.validations}
+        return {
+            "setting": setting, "options": dict(self.options), "hidden": list(self.hidden), "steps": self.steps,
+            "validations": self.validations,
+        }  # fmt: skip
 
     @property
     def text(self) -> str:

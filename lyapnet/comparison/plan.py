@@ -31,7 +31,7 @@ class ComparedTask:
     steps: dict[str, int] = option(
         {}, "Environment steps of each baseline; one without is not compared here.", at_least=1
     )
-    validations: dict[str, int] = option({}, f"Of each baseline, within its steps; {VALIDATIONS}.", at_least=1)
+    validations: dict[str, int] = option({}, f"Validations of each baseline; {VALIDATIONS} of one without.", at_least=1)
     options: dict[str, Any] = option({}, "Options of a baseline's algorithm that differ from its setting's.")
 
 
@@ -71,7 +71,6 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
     for method in config.methods:
         _require_among(method, METHODS, "methods")
     for name, task in config.tasks.items():
-        check_values(task, f"tasks.{name}.")
         for key in ("steps", "validations", "options"):
             for method in getattr(task, key):
                 _require_among(method, SETTINGS, f"tasks.{name}.{key}")

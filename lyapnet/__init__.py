@@ -1,32 +1,81 @@
 """lyapnet: time-varying value functions and Lyapunov functions, learned through closed-loop rollouts."""
 
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
 try:
     __version__ = version("lyapnet")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0.0.0"
 
-from lyapnet.controller import Controller, load
-from lyapnet.cost import QuadraticCost
-from lyapnet.errors import LyapnetError
-from lyapnet.rollout import Horizon, Trajectory
-from lyapnet.sets import Box
-from lyapnet.systems import SYSTEMS, ControlAffineSystem
+if TYPE_CHECKING:
+    from lyapnet.calculus import ValueFunction
+    from lyapnet.controller import Controller, load
+    from lyapnet.cost import Cost, QuadraticCost
+    from lyapnet.errors import LyapnetError
+    from lyapnet.policy import HJBPolicy, SontagPolicy
+    from lyapnet.problem import Horizon, Problem
+    from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
+    from lyapnet.rollout import Rollout, Trajectory
+    from lyapnet.sets import Box, ControlSet, Unbounded
+    from lyapnet.systems import SYSTEMS, ControlAffineSystem
+    from lyapnet.training.data import InitialStateDataModule
+    from lyapnet.training.experiment import train
+    from lyapnet.training.modules import OptimizerOptions, ValueModule
 
-if find_spec("gymnasium"):  # of the extra lyapnet[baselines]
-    import lyapnet.baselines  # noqa: F401  (registers the environments: gymnasium.make("lyapnet/Reacher-v0"))
+_HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
+    "calculus": ["ValueFunction"],
+    "controller": ["Controller", "load"],
+    "cost": ["Cost", "QuadraticCost"],
+    "errors": ["LyapnetError"],
+    "policy": ["HJBPolicy", "SontagPolicy"],
+    "problem": ["Horizon", "Problem"],
+    "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
+    "rollout": ["Rollout", "Trajectory"],
+    "sets": ["Box", "ControlSet", "Unbounded"],
+    "systems": ["SYSTEMS", "ControlAffineSystem"],
+    "training.data": ["InitialStateDataModule"],
+    "training.experiment": ["train"],
+    "training.modules": ["OptimizerOptions", "ValueModule"],
+}
 
 __all__ = [
     "SYSTEMS",
     "Box",
     "ControlAffineSystem",
+    "ControlSet",
     "Controller",
+    "Cost",
+    "HJBPolicy",
     "Horizon",
+    "InitialStateDataModule",
     "LyapnetError",
+    "LyapunovProgram",
+    "OptimizerOptions",
+    "Problem",
+    "Program",
     "QuadraticCost",
+    "Rollout",
+    "SontagPolicy",
+    "Tolerances",
     "Trajectory",
+    "Unbounded",
+    "ValueFunction",
+    "ValueModule",
+    "ValueProgram",
     "__version__",
     "load",
+    "train",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"lyapnet.{home}"), name)
+    raise AttributeError(f"module 'lyapnet' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

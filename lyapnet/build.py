@@ -1,73 +1,116 @@
 """From a config to the objects it names."""
 
 import copy
-import csv
 import importlib
 import inspect
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lyapnet.closed_loop import ClosedLoop
+from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, CostConfig, SystemConfig
-from lyapnet.cost import QuadraticCost
+from lyapnet.cost import COSTS, Cost, QuadraticCost
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
-from lyapnet.programs import PROGRAMS, PointwiseCondition, Program
-from lyapnet.rollout import Horizon, Rollout
-from lyapnet.sets import Box
+from lyapnet.problem import Horizon, Problem, check_system
+from lyapnet.programs import PROGRAMS, Program
+from lyapnet.rollout import Rollout
+from lyapnet.sets import CONTROL_SETS, Box, ControlSet
 from lyapnet.systems import SYSTEMS, ControlAffineSystem, Linear
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
-class Task(NamedTuple):
-    """minimise J over u(·) for every x₀ ∈ X₀."""
+@dataclass(frozen=True)
+class Parts:
+    """The user's own parts, taken in the place of those that a config names; None: the config's."""
 
-    system: ControlAffineSystem
-    cost: QuadraticCost
-    initial_states: Box
-    horizon: Horizon
+    system: ControlAffineSystem | None = None
+    cost: Cost | None = None
+    controls: ControlSet | None = None
+    network: type[ValueFunction] | None = None
+    program: Program | None = None
 
 
-def build_task(config: Config, system: ControlAffineSystem | None = None) -> Task:
-    """The task of a config, in its precision.
+# section of a config ↦ (what is registered, what a class of the user's own derives from)
+REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
+    "system": (SYSTEMS, ControlAffineSystem),
+    "cost": (COSTS, Cost),
+    "controls": (CONTROL_SETS, ControlSet),
+    "network": (NETWORKS, ValueFunction),
+    "program": (PROGRAMS, Program),
+}
+
+
+def parts_of(config: Config) -> Parts:
+    """The user's own parts that a config names as module:Class, imported; nothing for what is registered.
+
+    Raises:
+        UsageError: no such module or class, or arguments that it does not take.
+    """
+    own = [part for part, (registry, _) in REGISTRIES.items() if getattr(config, part).name not in registry]
+    return parts_named(config, {part: getattr(config, part).name for part in own})
+
+
+def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
+    """Parts by their section and the name of their class, with the other options of a config.
+
+    Raises:
+        UsageError: as parts_of.
+    """
+    config = copy.deepcopy(config)
+    for part, name in names.items():
+        getattr(config, part).name = name
+    builders: dict[str, Callable[[], Any]] = {
+        "system": lambda: build_system(config.system),
+        "cost": lambda: _build_cost(config.cost),
+        "controls": lambda: _with_parameters(config.controls, "controls"),
+        "network": lambda: _class_of(config, "network"),
+        "program": lambda: build_program(config),
+    }
+    return Parts(**{part: builders[part]() for part in names})
+
+
+def build_problem(config: Config, parts: Parts | None = None) -> Problem:
+    """The problem of a config, in its precision.
 
     Args:
-        system: taken instead of the one that the config names.
+        parts: taken instead of those that the config names.
 
     Raises:
         UsageError: a parameter, matrix, bound or dimension does not fit; names the section.
     """
-    dtype = DTYPES[config.training.precision]
+    parts, dtype = parts or Parts(), DTYPES[config.training.precision]
     with _float64_defaults():
-        # in float64 for the checks below, and a copy: the caller's system keeps its precision
-        system = build_system(config.system) if system is None else copy.deepcopy(system).double()
+        # in float64 for the checks below, and copies: the caller's own parts keep their precision
+        system, cost, controls = copy.deepcopy((parts.system, parts.cost, parts.controls))
+        system = build_system(config.system) if system is None else system.double()
         with _section("initial_states"):
             bounds = (config.initial_states.lower, config.initial_states.upper)
             initial_states = Box(*(_repeated(bound, system.n) for bound in bounds))
             _require_length("initial_states.lower", initial_states.dimension, system)
-        check_system(system, initial_states.sample(3, torch.Generator().manual_seed(0)))
-        with _section("cost"):
-            cost = build_cost(config.cost, system)
-            cost.check(initial_states.sample(256, torch.Generator().manual_seed(0)))
         with _section("horizon"):
             horizon = Horizon(config.horizon.steps, config.horizon.dt)
-    return Task(system.to(dtype), cost.to(dtype), initial_states.to(dtype), horizon)
+        check_system(system, initial_states.sample(3, torch.Generator().manual_seed(0)))
+        with _section("cost"):
+            cost = _build_cost(config.cost, system) if cost is None else cost.double()
+            cost.check(initial_states.sample(256, torch.Generator().manual_seed(0)))
+            _require_length("cost.R", cost.R(initial_states.center).shape[-1], system, system.m)
+        with _section("controls"):
+            controls = _with_parameters(config.controls, "controls") if controls is None else controls.double()
+        return Problem(system, cost, controls, initial_states, horizon).to(dtype)
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:
     """The system of a config, registered or the user's own."""
-    cls = resolve(config.name, SYSTEMS, "system.name", ControlAffineSystem)
-    _check_parameters(cls, config)
-    with _float64_defaults(), _section(f"system.parameters of {config.name}"):
-        return cls(**config.parameters)
+    return _with_parameters(config, "system")
 
 
 def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
@@ -101,74 +144,75 @@ def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], 
         return type(system)(**parameters).to(like)
 
 
-def _check_parameters(cls: type, config: SystemConfig) -> None:
-    """Hold the names under system.parameters against the constructor's arguments."""
+def _check_parameters(cls: type, name: str, parameters: Mapping[str, Any], part: str) -> None:
+    """Hold the names under a section's parameters against the constructor's arguments."""
     arguments = inspect.signature(cls).parameters.values()
     named = [a for a in arguments if a.kind in (a.POSITIONAL_OR_KEYWORD, a.KEYWORD_ONLY)]
     names = [a.name for a in named]
     open_ended = any(a.kind is a.VAR_KEYWORD for a in arguments)
-    for name in config.parameters:
-        if name not in names and not open_ended:
-            hint = did_you_mean(name, names, "remove it.", "system.parameters.")
+    for key in parameters:
+        if key not in names and not open_ended:
+            hint = did_you_mean(key, names, "remove it.", f"{part}.parameters.")
             known = ", ".join(names) or "none"
-            raise UsageError(f"Expected parameters of {config.name} ({known}), got system.parameters.{name}; {hint}")
-    missing = [a.name for a in named if a.default is a.empty and a.name not in config.parameters]
+            raise UsageError(f"Expected parameters of {name} ({known}), got {part}.parameters.{key}; {hint}")
+    missing = [a.name for a in named if a.default is a.empty and a.name not in parameters]
     if missing:
-        keys = ", ".join(f"system.parameters.{name}" for name in missing)
-        raise UsageError(f"Expected values for {keys}, got none; {config.name} has no default for them.")
+        keys = ", ".join(f"{part}.parameters.{key}" for key in missing)
+        raise UsageError(f"Expected values for {keys}, got none; {name} has no default for them.")
 
 
-def check_system(system: ControlAffineSystem, x: Tensor) -> None:
-    """Hold a system's f and g against their contract on a batch (b, n) of states.
-
-    Raises:
-        UsageError: f or g fails, returns another type, dtype or shape, or loses its gradient; or names lack a unit.
-    """
-    name, n, m = type(system).__name__, system.n, system.m
-    if len(system.state_units) != n or len(system.control_units) != m:
-        raise UsageError(f"Expected one unit for each state and control name of {name}, got another number of units.")
-    x = x.requires_grad_()
-    for symbol, function, shape in (("f", system.f, (len(x), n)), ("g", system.g, (len(x), n, m))):
-        try:
-            value = function(x)
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            line = " ".join(str(error).split())
+def _build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
+    """The cost of a config; a quadratic one with its shapes held against the system's."""
+    if config.name not in COSTS:
+        return _with_parameters(config, "cost")
+    assert system is not None
+    for key in ("Q", "R", "Q_T"):
+        if getattr(config, key) is None:
             raise UsageError(
-                f"Expected {name}.{symbol}(x) for x of shape {tuple(x.shape)}, got {type(error).__name__}: {line}"
-            ) from error
-        got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
-        if got != (shape, x.dtype):
-            raise UsageError(f"Expected {name}.{symbol}(x) as a tensor of {shape} and {x.dtype}, got {got}.")
-        moved = not torch.equal(value, function(x.detach() + 1e-3))
-        if moved and not value.requires_grad:
-            raise UsageError(
-                f"Expected {name}.{symbol}(x) differentiable by autograd, got a detached tensor; use torch on x."
+                f"Expected a value for cost.{key}, got none; add it to the config file or append cost.{key}=… to the "
+                "command."
             )
-
-
-def build_cost(config: CostConfig, system: ControlAffineSystem) -> QuadraticCost:
-    """The cost of a config, its shapes held against the system's."""
-    R: Any = config.R
-    if isinstance(R, str):
-        if R != "inverse_mass":
-            raise ValueError(f"Expected R as a matrix or inverse_mass, got {R!r}; write R as a list of rows.")
-        inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
-        if inverse_mass is None:
-            raise ValueError(
-                f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} does not have; "
-                "write R as a list of rows."
-            )
-        # constant for a linear system: a matrix then, as the Riccati equation needs it
-        R = inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
-    else:
-        R = _rows("R", R)
-        _require_length("cost.R", len(R), system, system.m)
+    if config.parameters:
+        raise UsageError("Expected no cost.parameters with the quadratic cost, got some; it has Q, R and Q_T.")
+    R = _control_weight(config.R, system)
     cost = QuadraticCost(_rows("Q", _repeated(config.Q, system.n)), R, _rows("Q_T", _repeated(config.Q_T, system.n)))
     _require_length("cost.Q", len(cost.Q), system)
     return cost
 
 
-def build_value_function(config: Config, task: Task, network: type[nn.Module] | None = None) -> nn.Module:
+def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
+    """R as a matrix, or as the function of the state that inverse_mass names."""
+    if not isinstance(R, str):
+        R = _rows("R", _repeated(R, system.m))
+        _require_length("cost.R", len(R), system, system.m)
+        return R
+    if R != "inverse_mass":
+        raise ValueError(f"Expected R as a matrix or inverse_mass, got {R!r}; write R as a list of rows.")
+    inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
+    if inverse_mass is None:
+        raise ValueError(
+            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} does not have; "
+            "write R as a list of rows."
+        )
+    # constant for a linear system: a matrix then, as the Riccati equation needs it
+    return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
+
+
+def _with_parameters(section: Any, part: str) -> Any:
+    """An object of the class that a section names, from its parameters."""
+    cls = resolve(section.name, REGISTRIES[part][0], f"{part}.name", REGISTRIES[part][1])
+    _check_parameters(cls, section.name, section.parameters, part)
+    with _float64_defaults(), _section(f"{part}.parameters of {section.name}"):
+        return cls(**section.parameters)
+
+
+def _class_of(config: Config, part: str) -> Any:
+    """The class that a section of a config names."""
+    registry, base = REGISTRIES[part]
+    return resolve(getattr(config, part).name, registry, f"{part}.name", base)
+
+
+def build_value_function(config: Config, problem: Problem, network: type[ValueFunction] | None = None) -> ValueFunction:
     """V(t, x) with fresh weights drawn from the config's seed, in its precision.
 
     Args:
@@ -177,10 +221,9 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
     Raises:
         UsageError: an option that the network does not have, or a value that it refuses.
     """
-    options = config.network
-    cls = network or resolve(options.name, NETWORKS, "network.name", nn.Module)
-    n, kept = task.system.n, _kept_states(config, task.system)
-    angles = [kept.index(angle) for angle in task.system.angles if angle in kept]
+    options, n = config.network, problem.system.n
+    cls, kept = network or _class_of(config, "network"), _kept_states(config, problem.system)
+    angles = [kept.index(angle) for angle in problem.system.angles if angle in kept]
     chosen: dict[str, Any] = {
         "hidden": options.hidden,
         "activation": options.activation,
@@ -199,19 +242,19 @@ def build_value_function(config: Config, task: Task, network: type[nn.Module] | 
             raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
     with _float64_defaults(), torch.random.fork_rng(devices=[]), _section("network"):
         torch.manual_seed(config.seed)
-        V = cls(scaling=_scaling(config, task, kept), **chosen)
+        V = cls(scaling=_scaling(config, problem, kept), **chosen)
         if options.terminal == "exact":
-            V = TerminalAnchor(V, _terminal_cost(task.cost, kept), task.horizon.duration)
+            V = TerminalAnchor(V, _terminal_cost(problem, kept), problem.horizon.duration)
         if len(kept) < n:
             V = IgnoringStates(V, kept, n)
     return V.to(DTYPES[config.training.precision])
 
 
-def build_rollout(config: Config, task: Task, V: nn.Module) -> Rollout:
+def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout:
     """The closed loop of V under the config's control law, integrator and gradient route.
 
     Raises:
-        UsageError: compile is on for a route that has nothing to compile.
+        UsageError: compile is on for a route that has nothing to compile; or the law does not suit the problem.
     """
     options = config.rollout
     if options.compile == "on" and options.gradient != "discrete":
@@ -219,65 +262,27 @@ def build_rollout(config: Config, task: Task, V: nn.Module) -> Rollout:
             f"Expected rollout.gradient=discrete for rollout.compile=on, got {options.gradient}; only that route "
             "compiles: take it, or leave compile at auto."
         )
-    policy = POLICIES[options.policy](task.system, task.cost, V)
-    return Rollout(
-        task.system, task.cost, policy, task.horizon, options.method, options.gradient, options.rtol, options.atol
-    )
+    with _section("rollout"):
+        policy = POLICIES[options.policy](problem, V)
+        return Rollout(problem, policy, options.method, options.gradient, options.rtol, options.atol)
 
 
 def build_program(config: Config) -> Program:
-    """The program of a config."""
-    options = {key: value for key, value in vars(config.program).items() if key != "name" and value is not None}
-    cls = PROGRAMS[config.program.name]
-    for name in options.keys() - inspect.signature(cls).parameters.keys():
-        raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
-    bound = config.program.bound or 0
-    if config.program.constraint > bound > 0 and config.network.terminal == "free" and bound >= config.program.terminal:
-        raise UsageError(
-            f"Expected program.terminal > program.bound = {bound:g}, got {config.program.terminal:g}; V(T, ·) would "
-            "sink below φ: raise it, or set network.terminal=exact."
-        )
-    with _section("program"):
-        return cls(**options)
-
-
-def build_pointwise(config: Config, task: Task, V: nn.Module, closed_loop: ClosedLoop) -> PointwiseCondition | None:
-    """The program's condition off the closed loops; None without weight.
+    """The program of a config.
 
     Raises:
-        UsageError: a region or a file of counterexamples that does not fit the system.
+        UsageError: an option that the program does not have, or values that contradict each other.
     """
-    options = config.pointwise
-    if not options.weight:
-        return None
-    n, lower = task.system.n, task.initial_states.lower
-    extent = _repeated(options.region, n) or (1.5 * task.initial_states.magnitude).tolist()
-    _require_length("pointwise.region", len(extent), task.system)
-    if min(extent) <= 0:
-        raise UsageError("Expected pointwise.region, got none, and X₀ is thin; give a bound of each |x_i|.")
-    region = Box([-bound for bound in extent], extent).to(lower)
-    further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(lower)
-    margin = (config.program.margin or 0.0) if config.program.name == "lyapunov" else None
-    return PointwiseCondition(closed_loop, V, region, task.horizon.duration, options.points, margin, further)
-
-
-def _points_of(path: Path, n: int) -> Tensor:
-    """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            heading, *lines = csv.reader(file)
-        if heading[:1] != ["t"]:
-            raise ValueError("no heading t, …")
-        rows = [[float(entry) for entry in row] for row in lines]
-        points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
-        if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
-            raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")
-    except (OSError, ValueError) as error:
-        raise UsageError(
-            f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "
-            "see lyapnet certify --refine."
-        ) from error
-    return points
+    section = vars(config.program)
+    options = {key: value for key, value in section.items() if key not in ("name", "parameters") and value is not None}
+    cls = _class_of(config, "program")
+    for name in options.keys() - inspect.signature(cls).parameters.keys():
+        raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
+    _check_parameters(cls, config.program.name, config.program.parameters, "program")
+    with _section("program"):
+        program = cls(**options, **config.program.parameters)
+        program.check_terminal(exact=config.network.terminal == "exact")
+        return program
 
 
 def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> Any:
@@ -294,9 +299,9 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
     except (ImportError, AttributeError, ValueError) as error:
+        choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
         raise UsageError(
-            f"Expected {key} as one of {', '.join(registry)}, or module:Class, got {name!r} ({error}); "
-            "check the spelling and the working directory."
+            f"Expected {key} as {choices}, got {name!r} ({error}); check the spelling and the working directory."
         ) from error
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
@@ -316,26 +321,24 @@ def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
     return [i for i, name in enumerate(names) if name not in ignored]
 
 
-def _terminal_cost(cost: QuadraticCost, kept: list[int]) -> QuadraticCost:
+def _terminal_cost(problem: Problem, kept: list[int]) -> Cost:
     """φ as a function of the kept states alone, which it has to be."""
-    Q_T = cost.Q_T[kept][:, kept]
-    if (cost.Q_T != 0).sum() != (Q_T != 0).sum():
+    n = problem.system.n
+    if not all(problem.cost.ignores_at_end(i, n) for i in range(n) if i not in kept):
         raise UsageError(
             "Expected cost.Q_T without the states in network.ignored_states for terminal=exact, got weights on them."
         )
-    return QuadraticCost(cost.Q[kept][:, kept], torch.eye(1), Q_T)
+    return problem.cost if len(kept) == n else problem.cost.restricted_to(kept, n)
 
 
-def _scaling(config: Config, task: Task, kept: list[int]) -> Scaling:
-    extent = task.initial_states.magnitude.double()
-    given = _repeated(config.network.state_scale, task.system.n)
+def _scaling(config: Config, problem: Problem, kept: list[int]) -> Scaling:
+    extent = problem.initial_states.magnitude.double()
+    given = entry_per_state("network.state_scale", config.network.state_scale, problem.system)
     scale = given or [v if v > 0 else 1.0 for v in extent.tolist()]
-    _require_length("network.state_scale", len(scale), task.system)
     value = config.network.value_scale
     if value is None:
-        state = torch.tensor(scale, dtype=torch.float64)
-        value = float(state @ task.cost.Q_T.double() @ state) or 1.0
-    return Scaling([scale[i] for i in kept], task.horizon.duration, value)
+        value = float(problem.cost.terminal(torch.tensor(scale).to(problem.goal))) or 1.0
+    return Scaling([scale[i] for i in kept], problem.horizon.duration, value)
 
 
 def _rows(name: str, matrix: Any) -> Any:
@@ -345,6 +348,18 @@ def _rows(name: str, matrix: Any) -> Any:
     if isinstance(matrix, list | tuple) and all(isinstance(v, int | float) for v in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix
+
+
+def entry_per_state(key: str, entries: list[float] | None, system: ControlAffineSystem) -> list[float] | None:
+    """A list with an entry for each state, or with one number for all; None where there is none.
+
+    Raises:
+        UsageError: another length; names the key.
+    """
+    repeated = _repeated(entries, system.n)
+    if repeated is not None:
+        _require_length(key, len(repeated), system)
+    return repeated
 
 
 def _repeated(entries: Any, n: int) -> Any:

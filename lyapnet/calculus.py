@@ -1,32 +1,34 @@
-"""The one place that differentiates V: gradients, Lie derivatives, V̇.
+"""V(t, x), and the one place that differentiates it: gradients, Lie derivatives, V̇.
 
 Everything here works under torch.no_grad() too, which Lightning's validation and odeint_adjoint's forward pass switch
 on: gradients are enabled inside, and the result is part of the outer graph only if the caller records one.
 """
 
-import torch
-from torch import Tensor
+from abc import ABC, abstractmethod
 
-from lyapnet.cost import QuadraticCost
+import torch
+from torch import Tensor, nn
+
 from lyapnet.linear_algebra import apply
 from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import Control, PerState, Policy, State, Time, Value
+from lyapnet.types import Control, PerState, State, Time, Value
 
 
-def value_and_state_gradient(V: Value, t: Time, x: State) -> tuple[PerState, State]:
-    """(V(t, x), V_x(t, x)), of shapes (*batch,) and (*batch, n).
+class ValueFunction(nn.Module, ABC):
+    """V(t, x): a value function, a Lyapunov function, or a candidate for one.
 
-    A network that knows its gradient as plain forward operations offers both, which share most of their work, as
-    `V.value_and_state_gradient(t, x)`; any other V is differentiated by autograd.
+    A subclass writes `forward` with torch operations on tensors of any leading shape. Its gradient is found by
+    automatic differentiation; one that knows V_x as plain forward operations overrides `value_and_state_gradient`,
+    which is faster, and compiles and exports everywhere.
     """
-    formula = getattr(V, "value_and_state_gradient", None)
-    return formula(t, x) if formula is not None else (V(t, x), gradients(V, t, x)[1])
 
+    @abstractmethod
+    def forward(self, t: Time, x: State) -> PerState:
+        """V(t, x) for t in s, scalar or one time each, and x (*batch, n); (*batch,), in units of cost."""
 
-def state_gradient(V: Value, t: Time, x: State) -> State:
-    """V_x(t, x), (*batch, n); by the formula of a network that has one, else by autograd."""
-    formula = getattr(V, "value_and_state_gradient", None)
-    return formula(t, x)[1] if formula is not None else gradients(V, t, x)[1]
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """(V, V_x) of shapes (*batch,) and (*batch, n); they share most of their work."""
+        return self(t, x), gradients(self, t, x)[1]
 
 
 def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
@@ -40,12 +42,6 @@ def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
     return V_t, V_x
 
 
-def lie_derivatives(V: Value, system: ControlAffineSystem, t: Time, x: State) -> tuple[PerState, Control]:
-    """(LfV, LgV) = (V_xᵀf, gᵀV_x), of shapes (*batch,) and (*batch, m)."""
-    V_x = state_gradient(V, t, x)
-    return drift_lie_derivative(system, x, V_x), input_lie_derivative(system, x, V_x)
-
-
 def drift_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> PerState:
     """LfV = V_xᵀf(x)."""
     return (V_x * system.f(x)).sum(-1)
@@ -56,15 +52,10 @@ def input_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> C
     return apply(system.g(x).mT, V_x)
 
 
-def time_derivative(V: Value, system: ControlAffineSystem, policy: Policy, t: Time, x: State) -> PerState:
-    """V̇ = V_t + V_xᵀ(f + g u) along the closed loop u = policy(t, x)."""
-    V_t, V_x = gradients(V, t, x)
-    return V_t + (V_x * system.dynamics(x, policy(t, x))).sum(-1)
-
-
-def hamiltonian(system: ControlAffineSystem, cost: QuadraticCost, x: State, u: Control, costate: State) -> PerState:
-    """H(x, u, λ) = ℓ(x, u) + λᵀ(f + g u); the HJB equation is V_t + min_u H(x, u, V_x) = 0."""
-    return cost.running(x, u) + (costate * system.dynamics(x, u)).sum(-1)
+def time_derivative(V: ValueFunction, system: ControlAffineSystem, t: Time, x: State, u: Control) -> PerState:
+    """V̇ = V_t + V_xᵀ(f(x) + g(x)u), with the V_x that control laws read, so that bounds see them cancel."""
+    V_t, V_x = gradients(V, t, x)[0], V.value_and_state_gradient(t, x)[1]
+    return V_t + (V_x * system.dynamics(x, u)).sum(-1)
 
 
 def _differentiable(leaf: Tensor, recording: bool) -> Tensor:

@@ -9,8 +9,8 @@ from typing import Any
 
 import torch
 
-from lyapnet.atomic import write_atomically
 from lyapnet.errors import CheckpointError, UsageError
+from lyapnet.files import write_atomically
 
 # what torch.load raises on files that it cannot read, by their first bytes
 UNREADABLE = (

@@ -4,51 +4,33 @@ A YAML file lists only what differs from these defaults; `key.sub=value` on the 
 """
 
 import dataclasses
-import difflib
-import math
-import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any
 
-import yaml
 from omegaconf import MISSING, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from lyapnet.errors import UsageError, did_you_mean
+from lyapnet.cost import COSTS
 from lyapnet.networks import ACTIVATIONS, NETWORKS
 from lyapnet.policy import POLICIES
 from lyapnet.programs import PROGRAMS
 from lyapnet.rollout import GRADIENTS, METHODS
+from lyapnet.schema import check_values, checked, differences, option, read_yaml
+from lyapnet.sets import CONTROL_SETS
 from lyapnet.systems import SYSTEMS
 
 SWITCH = ("auto", "on", "off")
-
-
-def option(
-    default: Any,
-    doc: str,
-    *,
-    choices: Sequence[str] = (),
-    user_class: bool = False,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-) -> Any:
-    """A field with its sentence and the values it admits; `user_class` also admits module:Class."""
-    bounds = {">": above, "≥": at_least, "<": below}
-    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "bounds": bounds}
-    if isinstance(default, list | dict):
-        return field(default_factory=lambda: type(default)(default), metadata=rule)
-    return field(default=default, metadata=rule)
+LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
 
 
 @dataclass
 class ProgramConfig:
     """What is minimised; see Program for the loss and its units."""
 
-    name: str = option(MISSING, "The value program or the Lyapunov program.", choices=tuple(PROGRAMS))
+    name: str = option(
+        MISSING, "A registered program, or module:Class of your own.", choices=tuple(PROGRAMS), user_class=True
+    )
     constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
     terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
     trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
@@ -56,14 +38,15 @@ class ProgramConfig:
     cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
     bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
+    parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
 
 
 @dataclass
 class PointwiseConfig:
     """The program's condition off the closed loops, as a certificate asks for it; see PointwiseCondition."""
 
-    weight: float = option(0.0, "Of the condition at points of [0, T] × D.", at_least=0)
-    points: int = option(512, "Points of each step.", at_least=2)
+    weight: float = option(0.0, "Weight of the condition at points of [0, T] × D.", at_least=0)
+    points: int = option(512, "Points in each step.", at_least=2)
     region: list[float] | None = option(None, "D, as a bound of each |x_i|; null: 1.5 times the extent of X₀.", above=0)
     counterexamples: str | None = option(
         None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
@@ -82,11 +65,24 @@ class SystemConfig:
 
 @dataclass
 class CostConfig:
-    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (of one number: all alike), rows are a matrix."""
+    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (one number: repeated), rows are a matrix."""
 
-    Q: Any = option(MISSING, "State weight, symmetric positive semidefinite.")
-    R: Any = option(MISSING, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
-    Q_T: Any = option(MISSING, "Terminal weight, symmetric positive semidefinite.")
+    name: str = option("quadratic", "quadratic, or module:Class of your own.", choices=tuple(COSTS), user_class=True)
+    Q: Any = option(None, "State weight, symmetric positive semidefinite.")
+    R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
+    Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
+    parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
+
+
+@dataclass
+class ControlsConfig:
+    """U, the controls that are admitted."""
+
+    name: str = option(
+        "unbounded", "A registered control set, or module:Class of your own.", choices=tuple(CONTROL_SETS),
+        user_class=True,
+    )  # fmt: skip
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
 
 
 @dataclass
@@ -149,7 +145,7 @@ class TrainingConfig:
     final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
     beta1: float = option(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
     beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
-    weight_decay: float = option(0.0, "Of the optimiser.", at_least=0)
+    weight_decay: float = option(0.0, "AdamW weight decay.", at_least=0)
     precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
     threads: int = option(
         1, "CPU threads; in networks this small, more of them mostly wait for each other.", at_least=1
@@ -161,13 +157,13 @@ class TrainingConfig:
 class EvaluationConfig:
     """What is measured on states that training never sees."""
 
-    validation_states: int = option(64, "States of each validation.", at_least=1)
-    test_states: int = option(256, "States of the table at the end of training.", at_least=1)
+    validation_states: int = option(64, "Initial states in each validation.", at_least=1)
+    test_states: int = option(256, "Initial states of the evaluation at the end of training.", at_least=1)
     optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
-    figures_every: int = option(5, "Validations between figures in TensorBoard; the last one always draws.", at_least=1)
-    certify_every: int = option(0, "Validations between statistical bounds in TensorBoard; 0 for none.", at_least=0)
-    certified_states: int = option(1000, "Fresh states of each such bound.", at_least=1)
-    confidence: float = option(1 - 1e-6, "Of each such bound by itself.", above=0, below=1)
+    figures_every: int = option(5, "Validations between figures; the last one always draws.", at_least=1)
+    certify_every: int = option(0, "Validations between statistical bounds; 0 for none.", at_least=0)
+    certified_states: int = option(1000, "Fresh states for each such bound.", at_least=1)
+    confidence: float = option(1 - 1e-6, "Confidence of each such bound by itself.", above=0, below=1)
 
 
 @dataclass
@@ -182,12 +178,15 @@ class Config:
     pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
     system: SystemConfig = field(default_factory=SystemConfig)
     cost: CostConfig = field(default_factory=CostConfig)
+    controls: ControlsConfig = field(default_factory=ControlsConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
+    loggers: list[str] = option(["tensorboard"], "Where curves go besides metrics.csv.", choices=LOGGERS)
+    callbacks: list[str] = option([], "Lightning callbacks of your own, each as module:Class.")
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
@@ -210,31 +209,6 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     return config_from_plain(read_yaml(path, Config), overrides)
 
 
-def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
-    """The content of a YAML file that has some keys of a schema.
-
-    Raises:
-        UsageError: no such file, not YAML, or none of the keys.
-    """
-    try:
-        content = OmegaConf.to_container(
-            OmegaConf.load(path), resolve=False
-        )  # reads 1e-2 as a number; YAML 1.1 does not
-    except OSError as error:
-        raise UsageError(
-            f"Expected a config file, got {str(path)!r} ({error.strerror or error}); see conf/."
-        ) from error
-    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())
-        raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
-    sections = [f.name for f in dataclasses.fields(schema)]
-    if not isinstance(content, Mapping) or not any(name in content for name in sections):
-        raise UsageError(
-            f"Expected a config in {str(path)!r}, got none of its keys ({', '.join(sections)}); see conf/."
-        )
-    return {str(key): value for key, value in content.items()}
-
-
 def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
     """The config of plain nested dictionaries, checked like a file.
 
@@ -245,36 +219,6 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
-    return config
-
-
-Schema = TypeVar("Schema")
-
-
-def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Schema:
-    """An object of a schema from plain nested dictionaries with overrides: its keys and types, not its values.
-
-    Raises:
-        UsageError: an unknown key, a missing one, or a wrong type.
-    """
-    for override in overrides:
-        if "=" not in override.lstrip("="):
-            raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
-    try:
-        layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
-        for layer in layers:
-            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), schema, "")
-        merged = OmegaConf.merge(OmegaConf.structured(schema), *layers)
-        config = OmegaConf.to_object(merged)
-    except OmegaConfBaseException as error:
-        raise UsageError(_explain(error, schema)) from error
-    except TypeError as error:  # a section's field changed from a list to a mapping, or back
-        raise UsageError(
-            f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
-        ) from error
-    except yaml.YAMLError as error:
-        raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
-    assert isinstance(config, schema)
     return config
 
 
@@ -291,92 +235,3 @@ def to_yaml(config: Config) -> str:
 def differing_keys(one: Config, other: Config) -> list[str]:
     """Full names of the fields in which two configs differ."""
     return list(differences(to_plain(one), to_plain(other)))
-
-
-def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Full name ↦ both values, where two nested dictionaries differ; None for one that is missing."""
-    a, b = dict(_leaves(one)), dict(_leaves(other))
-    return {key: (a.get(key), b.get(key)) for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)}
-
-
-def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in content.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
-def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
-    known = {f.name: f for f in dataclasses.fields(schema)}
-    for key, value in content.items():
-        if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-            names = _same_name_elsewhere(str(key), schema) or [prefix + name for name in near]
-            hint = f"did you mean {names[0]}?" if names else f"choose one of {', '.join(known)}."
-            raise UsageError(f"Expected a key of the schema, got unknown key {prefix}{key}; {hint}")
-        section = known[key].type
-        if isinstance(section, type) and dataclasses.is_dataclass(section):
-            if not isinstance(value, Mapping):
-                names = ", ".join(f.name for f in dataclasses.fields(section))
-                raise UsageError(
-                    f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
-                )
-            _refuse_unknown_keys(value, section, f"{prefix}{key}.")
-        for entry in get_args(section)[1:]:  # of dict[str, section]
-            for name, one in value.items() if dataclasses.is_dataclass(entry) else ():
-                _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
-
-
-def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
-    """Full name and type of every field."""
-    found: dict[str, Any] = {}
-    for f in dataclasses.fields(schema):
-        if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
-            found |= _annotations(f.type, f"{prefix}{f.name}.")
-        else:
-            found[f"{prefix}{f.name}"] = f.type
-    return found
-
-
-def _same_name_elsewhere(key: str, schema: type) -> list[str]:
-    """The full names of fields of that name: for a key written in the wrong section."""
-    return [name for name in _annotations(schema) if name.split(".")[-1] == key]
-
-
-def _explain(error: OmegaConfBaseException, schema: type) -> str:
-    key = error.full_key or "a key"
-    if isinstance(error, MissingMandatoryValue):
-        return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
-    annotation = _annotations(schema).get(key.split("[")[0])
-    kind = annotation.__name__ if type(annotation) is type else annotation or "another type"
-    got = str(error).splitlines()[0]
-    return f"Expected {key} as {kind}, got: {got}; correct its value."
-
-
-def check_values(config: Any, prefix: str = "") -> None:
-    """Hold every field, and every entry of a section, against the rule it was declared with."""
-    for f in dataclasses.fields(config):
-        key, value = f"{prefix}{f.name}", getattr(config, f.name)
-        entries = {f"{key}.{name}": entry for name, entry in value.items()} if isinstance(value, dict) else {key: value}
-        for name, entry in entries.items():
-            if dataclasses.is_dataclass(entry):
-                check_values(entry, f"{name}.")
-            elif f.metadata and entry is not None:
-                _check_value(name, entry, f.metadata)
-
-
-def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
-    choices = rule["choices"]
-    if choices and value not in choices and not (rule["user_class"] and ":" in value):
-        hint = did_you_mean(str(value), choices, "choose one of them.")
-        own = ", or module:Class" if rule["user_class"] else ""
-        raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
-    holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}
-    bounds = {symbol: bound for symbol, bound in rule["bounds"].items() if bound is not None}
-    if bounds and value == []:
-        raise UsageError(f"Expected {key} with at least one entry, got none; {rule['doc']}")
-    for symbol, bound in bounds.items():
-        for number in value if isinstance(value, list) else [value]:
-            if not (holds[symbol](number, bound) and math.isfinite(number)):
-                raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")

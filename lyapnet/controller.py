@@ -10,16 +10,26 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from lyapnet.build import Task, build_rollout, build_task, build_value_function
+from lyapnet.build import (
+    REGISTRIES,
+    Parts,
+    build_problem,
+    build_program,
+    build_rollout,
+    build_value_function,
+    parameters_of,
+)
+from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
-from lyapnet.closed_loop import ClosedLoop
 from lyapnet.config import Config, config_from_plain
-from lyapnet.cost import QuadraticCost
+from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
-from lyapnet.networks import NETWORKS
-from lyapnet.rollout import Horizon, Trajectory
-from lyapnet.sets import Box
-from lyapnet.systems import SYSTEMS, ControlAffineSystem
+from lyapnet.policy import HJBPolicy
+from lyapnet.problem import Horizon, Problem
+from lyapnet.programs import Program, ValueProgram
+from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
+from lyapnet.sets import Box, ControlSet
+from lyapnet.systems import ControlAffineSystem
 
 
 class Controller:
@@ -28,35 +38,75 @@ class Controller:
     Tensors in, tensors out (of the controller's dtype); arrays and lists in, NumPy arrays out.
     """
 
-    def __init__(self, config: Config, task: Task, V: nn.Module):
-        self.config = config
-        self._task, self._V = task, V.requires_grad_(False).eval()
-        self._rollout = build_rollout(config, task, V)
+    def __init__(
+        self,
+        problem: Problem,
+        V: ValueFunction,
+        rollout: Rollout | None = None,
+        program: Program | None = None,
+        config: Config | None = None,
+    ):
+        """A controller of parts.
+
+        Args:
+            problem: what it was made for.
+            V: its weights are frozen.
+            rollout: the closed loop of V; None: that of the HJB policy under Euler.
+            program: what V was trained for, and so what a certificate asks of it; None: the value program.
+            config: of the run that trained it, where there was one.
+        """
+        self.problem, self._config = problem, config
+        self.program = ValueProgram() if program is None else program
+        self.V = V.requires_grad_(False).eval()
+        self._rollout = Rollout(problem, HJBPolicy(problem, V), gradient="backprop") if rollout is None else rollout
+        if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
+            raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
+
+    @property
+    def config(self) -> Config:
+        """The config of the run that trained it.
+
+        Raises:
+            UsageError: it was made from parts.
+        """
+        if self._config is None:
+            raise UsageError("Expected a controller that a run left, got one made from parts; it has no config.")
+        return self._config
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The arguments of the system's constructor, as far as they are known."""
+        return {} if self._config is None else parameters_of(self.system, self._config.system)
 
     @property
     def system(self) -> ControlAffineSystem:
         """ẋ = f(x) + g(x)u."""
-        return self._task.system
+        return self.problem.system
 
     @property
-    def cost(self) -> QuadraticCost:
+    def cost(self) -> Cost:
         """ℓ and φ."""
-        return self._task.cost
+        return self.problem.cost
+
+    @property
+    def controls(self) -> ControlSet:
+        """U."""
+        return self.problem.controls
 
     @property
     def horizon(self) -> Horizon:
         """N (`steps`), Δt (`dt`) and T (`duration`)."""
-        return self._task.horizon
+        return self.problem.horizon
 
     @property
     def initial_states(self) -> Box:
         """X₀."""
-        return self._task.initial_states
+        return self.problem.initial_states
 
     @property
-    def V(self) -> nn.Module:
-        """The value function as a module: (t, x) ↦ (*batch,)."""
-        return self._V
+    def method(self) -> str:
+        """The integrator of its rollouts."""
+        return self._rollout.method
 
     @property
     def closed_loop(self) -> ClosedLoop:
@@ -73,7 +123,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones.
         """
-        return self._answer(self._V, t, x)
+        return self._answer(self.V, t, x)
 
     @overload
     def policy(self, t: Tensor | float, x: Tensor) -> Tensor: ...
@@ -131,38 +181,40 @@ def load(
     path: str | Path,
     *,
     system: ControlAffineSystem | None = None,
-    network: type[nn.Module] | None = None,
+    network: type[ValueFunction] | None = None,
+    cost: Cost | None = None,
+    controls: ControlSet | None = None,
+    program: Program | None = None,
     device: str | torch.device = "cpu",
 ) -> Controller:
     """The controller of a checkpoint. Nothing that the file names is imported or run.
 
     Args:
         path: a .ckpt file of a run.
-        system: needed where the run's system is not one of SYSTEMS; it replaces the one in the checkpoint.
+        system, cost, controls, program: each is needed where the run's own is not a registered one, and replaces it.
         network: likewise, the class of a network that is not one of NETWORKS.
         device: where the tensors go.
 
     Raises:
-        UsageError: no such file; or a class of the user's own that was not passed.
+        UsageError: no such file; or a part of the user's own that was not passed.
         CheckpointError: the file is truncated, foreign, or does not fit its own config.
     """
     content = read_checkpoint(path, device)
     config = config_of(content, path)
-    for argument, given, name, registry in (
-        ("system", system, config.system.name, SYSTEMS),
-        ("network", network, config.network.name, NETWORKS),
-    ):
-        if given is None and name not in registry:
+    parts = Parts(system=system, cost=cost, controls=controls, network=network, program=program)
+    for argument, (registry, _) in REGISTRIES.items():
+        name = getattr(config, argument).name
+        if getattr(parts, argument) is None and name not in registry:
             raise UsageError(
                 f"Expected {argument}=… for {str(path)!r}, got none; it was trained with {name}, and loading a file "
                 f"never imports what the file names: pass {argument}=… to load, or --{argument} to lyapnet evaluate."
             )
-    task = build_task(config, system)
-    V = build_value_function(config, task, network)
+    problem = build_problem(config, parts)
+    V = build_value_function(config, problem, network)
     load_value_function(V, content, path)
-    for module in (task.system, task.cost, task.initial_states, V):
-        module.to(device)
-    return Controller(config, task, V)
+    problem, V = problem.to(device), V.to(device)
+    own = build_program(config) if program is None else program
+    return Controller(problem, V, build_rollout(config, problem, V), own, config)
 
 
 def config_of(content: dict[str, Any], path: str | Path) -> Config:
@@ -172,6 +224,11 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
         CheckpointError: there is none that this version understands.
     """
     plain = content[KEY].get("config")
+    if plain is None:
+        raise CheckpointError(
+            f"Expected a checkpoint with a config, got {str(path)!r}, which was trained from Python; read it with "
+            "ValueModule.load_from_checkpoint(path, problem=…, V=…, program=…)."
+        )
     try:
         if not isinstance(plain, dict):
             raise UsageError(f"Expected a config, got {type(plain).__name__}")

@@ -35,7 +35,7 @@ class CompilationError(LyapnetError):
 
 
 class UntraceableError(CompilationError):
-    """The course of a closed loop depends on values; it runs as it is written, which is slower."""
+    """The control flow of a closed loop depends on tensor values; it runs eagerly, which is slower."""
 
 
 class OracleError(LyapnetError):

@@ -5,15 +5,8 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from lyapnet.calculus import (
-    drift_lie_derivative,
-    gradients,
-    input_lie_derivative,
-    state_gradient,
-    value_and_state_gradient,
-)
-from lyapnet.cost import QuadraticCost
-from lyapnet.systems import ControlAffineSystem
+from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
+from lyapnet.problem import Problem
 from lyapnet.types import Control, PerState, State, Time
 
 
@@ -28,29 +21,32 @@ class PolicyOutput(NamedTuple):
 class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
-    def __init__(self, system: ControlAffineSystem, cost: QuadraticCost, V: nn.Module):
+    def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__()
-        self.system, self.cost, self.V = system, cost, V
+        self.system, self.cost, self.controls, self.V = problem.system, problem.cost, problem.controls, V
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
         """u, V and V_x; a law that needs V_x anyway shares it."""
-        return PolicyOutput(self(t, x), *value_and_state_gradient(self.V, t, x))
+        return PolicyOutput(self(t, x), *self.V.value_and_state_gradient(t, x))
 
 
 class HJBPolicy(ValuePolicy):
-    """u*(t, x) = argmin_u H(x, u, V_x) = −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+    """u*(t, x) = argmin over u ∈ U of ℓ(x, u) + V_xᵀ(f + gu); with U = ℝᵐ it is −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
 
     def forward(self, t: Time, x: State) -> Control:
-        return self._minimise(x, state_gradient(self.V, t, x))
+        return self._minimise(x, self.V.value_and_state_gradient(t, x)[1])
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
         if type(self).forward is not HJBPolicy.forward:  # a law derived from this one
             return super().with_value(t, x)
-        value, V_x = value_and_state_gradient(self.V, t, x)
+        value, V_x = self.V.value_and_state_gradient(t, x)
         return PolicyOutput(self._minimise(x, V_x), value, V_x)
 
     def _minimise(self, x: State, V_x: State) -> Control:
-        return -0.5 * self.cost.solve_R(x, input_lie_derivative(self.system, x, V_x))
+        b = input_lie_derivative(self.system, x, V_x)
+        if self.controls.limited:
+            return self.controls.minimise(self.cost.R(x), b)
+        return -0.5 * self.cost.solve_R(x, b)  # with the one inverse of a constant R
 
 
 class SontagPolicy(ValuePolicy):
@@ -62,10 +58,23 @@ class SontagPolicy(ValuePolicy):
     the value function. With the true value function it is the HJB policy. Close to the goal a and σ are small
     differences of rounded numbers: in float32, u chatters within about ‖x‖ = 1e-4.
 
+    It is made for U = ℝᵐ.
+
+    Raises:
+        ValueError: the problem limits its controls.
+
     Sources: Sontag, "A 'universal' construction of Artstein's theorem on nonlinear stabilization", Systems & Control
     Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
     function and receding horizon perspective", Asian Journal of Control 1999 (this form).
     """
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        if problem.controls.limited:
+            raise ValueError(
+                f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
+                "rollout.policy=hjb."
+            )
+        super().__init__(problem, V)
 
     def forward(self, t: Time, x: State) -> Control:
         V_t, V_x = gradients(self.V, t, x)

@@ -1,12 +1,14 @@
-"""Sets of states: X₀, and bounds of controls."""
+"""Sets of states and of controls."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lyapnet.types import State
+from lyapnet.linear_algebra import solve
+from lyapnet.types import Control, ControlMatrix, State
 
 
 class Box(nn.Module):
@@ -62,7 +64,11 @@ class Box(nn.Module):
     @property
     def magnitude(self) -> Float[Tensor, " n"]:
         """max |x_i| over the box, for each component."""
-        return torch.maximum(self.lower.abs(), self.upper.abs())
+        return self.reach_from(torch.zeros_like(self.lower))
+
+    def reach_from(self, point: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """max |x_i − point_i| over the box, for each component."""
+        return torch.maximum((self.lower - point).abs(), (self.upper - point).abs())
 
     def sample(self, count: int, generator: torch.Generator | None = None) -> State:
         """`count` states drawn uniformly and independently; on a CPU generator whatever the box's device,
@@ -75,6 +81,52 @@ class Box(nn.Module):
         """Whether each state lies in the closed box."""
         return ((self.lower <= x) & (x <= self.upper)).all(-1)
 
-    def extreme_point(self, direction: State) -> State:
-        """argmax over the box of directionᵀx: a corner for each direction (the upper bound where it is zero)."""
-        return torch.where(direction >= 0, self.upper, self.lower)
+
+class ControlSet(nn.Module, ABC):
+    """U ⊂ ℝᵐ, the controls that a problem admits: closed and convex.
+
+    A subclass writes its three methods with torch operations on tensors of any leading shape. What it is made of are
+    buffers: they follow the problem's precision and device, and tell its controls apart from those of other problems.
+    """
+
+    @property
+    def limited(self) -> bool:
+        """Whether some control of ℝᵐ is left out."""
+        return True
+
+    @abstractmethod
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        """argmin over u ∈ U of uᵀRu + bᵀu, (*batch, m): the control law, with b = gᵀV_x.
+
+        Args:
+            R: (*batch, m, m), symmetric positive definite.
+            b: (*batch, m).
+        """
+
+    @abstractmethod
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        """Whether each control lies in U."""
+
+    @abstractmethod
+    def project(self, u: Control) -> Control:
+        """The point of U closest to each control."""
+
+
+class Unbounded(ControlSet):
+    """U = ℝᵐ."""
+
+    @property
+    def limited(self) -> bool:
+        return type(self) is not Unbounded  # a set derived from it may leave something out
+
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        return -0.5 * solve(R, b[..., None])[..., 0]
+
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        return torch.isfinite(u).all(-1)
+
+    def project(self, u: Control) -> Control:
+        return u
+
+
+CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}

@@ -30,5 +30,23 @@ ValuePath = Float[Tensor, "nodes *batch"]
 ControlPath = Float[Tensor, "steps *batch m"]
 StepPath = Float[Tensor, "steps *batch"]
 
+# Boxes of points (t, x), one number an axis, time first: 1 + n axes; and a value of any shape on each of them
+Corner = Float[Tensor, " axes"]
+Corners = Float[Tensor, "boxes axes"]
+Points = Float[Tensor, "points axes"]
+PerBox = Float[Tensor, " boxes"]
+OnBoxes = Float[Tensor, "boxes *shape"]
+Terms = Float[Tensor, "terms boxes *shape"]  # the coefficients of a polynomial on each box
+
+# What a discretised closed loop is linearised around: nodes of a block of steps, and the stages of each step.
+Scalar = Float[Tensor, ""]
+StagePath = Float[Tensor, "nodes stages *batch n"]
+StageControls = Float[Tensor, "nodes stages *batch m"]
+StageValues = Float[Tensor, "nodes stages *batch"]
+StageSlopes = Float[Tensor, "nodes stages *batch columns"]  # (ẋ, ℓ): n + 1 columns
+StageJacobians = Float[Tensor, "nodes stages *batch n n"]
+StageInputMatrices = Float[Tensor, "nodes stages *batch n m"]
+Jacobians = Float[Tensor, "nodes *batch n n"]
+
 Value = Callable[[Tensor, Tensor], Tensor]  # V: (t, x) ↦ one number for each state
 Policy = Callable[[Tensor, Tensor], Tensor]  # u: (t, x) ↦ one control for each state

@@ -8,15 +8,15 @@ import hypothesis
 import pytest
 import torch
 from jaxtyping import install_import_hook
-from torch import nn
 
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
 install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
-from lyapnet import discrete_adjoint  # noqa: E402
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
+from lyapnet.rollout import discrete_adjoint  # noqa: E402
 from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
+from tests.problems import Quadratic  # noqa: E402
 
 torch.set_num_threads(1)
 torch.set_warn_always(True)  # else a warning, an error here, would be raised by the first test that earns it only
@@ -102,19 +102,12 @@ def V(system) -> FCN:
     return FCN(Scaling([1.0] * system.n, duration=1.0, value=3.0), hidden=(8, 8))
 
 
-class _Quadratic(nn.Module):
-    def __init__(self, P, dt: float = 1.0):
-        super().__init__()
-        P = torch.as_tensor(P, dtype=torch.get_default_dtype())
-        self.P = nn.Parameter(P if P.ndim == 3 else P[None])
-        self.dt = dt
-
-    def forward(self, t, x):
-        P = self.P[(t / self.dt).round().long().clamp(0, len(self.P) - 1)]
-        return ((P @ x[..., None])[..., 0] * x).sum(-1)
-
-
 @pytest.fixture
 def quadratic():
-    """V = xᵀPx from P (n, n), or xᵀP_n x at the nodes t = n·dt from P (N + 1, n, n); its gradient is autograd's."""
-    return _Quadratic
+    """V = xᵀPx; see problems.Quadratic."""
+    return Quadratic
+
+
+def pytest_collection_modifyitems(items):
+    """What takes minutes comes first, so that no process is left alone with it."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")

@@ -1,76 +1,103 @@
-"""The import rules: Lightning and OmegaConf stay at the edge, imports run one way, and importing lyapnet is light."""
+"""The layout: which room imports which, that Lightning and OmegaConf stay at the edge, and that imports are light."""
 
-import ast
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1] / "lyapnet"
-FLOW = (
-    "errors", "types", "linear_algebra", "sets", "systems", "cost", "calculus", "networks", "policy", "closed_loop",
-    "tracing", "compilation", "runge_kutta", "discrete_adjoint", "rollout", "programs",
-)  # fmt: skip
-CORE = (*FLOW, "oracles", "certification")
-EDGE = ("lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib")
+from tests.layout import files, functions, imports, levels, room, rooms, sources
+
+# Each line imports only lines above it.
+LEVELS = (
+    {"drawing", "errors", "files", "linear_algebra", "provenance", "random_streams", "tables", "types"},
+    {"checkpoint", "cost", "graphs", "schema", "sets", "systems"},
+    {"calculus", "problem"},
+    {"networks", "policy"},
+    {"rollout"},
+    {"programs"},
+    {"config"},
+    {"build"},
+    {"controller"},
+    {"evaluation"},
+    {"certification"},
+    {"bench", "training"},
+    {"comparison"},
+    {"cli"},
+    {"__main__"},
+)
+MATHEMATICS = {
+    "calculus", "cost", "errors", "files", "graphs", "linear_algebra", "networks", "policy", "problem", "programs",
+    "random_streams", "rollout", "sets", "systems", "types",
+}  # fmt: skip
+EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
+SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print
 
 
-def sources(root=ROOT):
-    """Full module name ↦ source of every file of the package."""
-    names = {path: ".".join(path.relative_to(root.parent).with_suffix("").parts) for path in root.rglob("*.py")}
-    return {name.removesuffix(".__init__"): path.read_text(encoding="utf-8") for path, name in names.items()}
-
-
-def imports(source, modules):
-    """Full names that a source imports, wherever in it: a name of `modules` where it is one, else the module's."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert not node.level, "Expected absolute imports, got a relative one; write the full name."
-            for alias in node.names:
-                full = f"{node.module}.{alias.name}"
-                yield full if full in modules else str(node.module)
-
-
-def part(name):
-    """The part of lyapnet that a module belongs to: systems for lyapnet.systems.base."""
-    return name.partition(".")[2].partition(".")[0]
+def upward(modules):
+    """(room, what it imports) for every import of a room from the same line or a later one."""
+    line = {name: number for number, names in enumerate(LEVELS) for name in names}
+    for here, imported in rooms(modules).items():
+        yield from ((here, other) for other in sorted(imported) if line.get(other, 99) >= line.get(here, -1))
 
 
 def edge_imports(modules):
-    """(module, what it imports) for every core module that imports a library of the edge."""
+    """(module, what it imports) for every library of the edge in the mathematics, the oracles or the certificates."""
     for name, source in modules.items():
-        if part(name) in CORE:
-            for imported in imports(source, modules):
-                if imported.partition(".")[0] in EDGE:
-                    yield name, imported
-
-
-def upstream_imports(modules):
-    """(module, what it imports) for every module of the flow that imports what comes later in it."""
-    for name, source in modules.items():
-        if part(name) in FLOW:
-            allowed = FLOW[: FLOW.index(part(name)) + 1]
-            yield from ((name, i) for i in imports(source, modules) if i in modules and part(i) not in allowed)
+        inner = room(name) in MATHEMATICS or name.startswith(("lyapnet.evaluation.oracles", "lyapnet.certification"))
+        if inner and name.rpartition(".")[2] not in SHOWN:
+            yield from ((name, i) for i in imports(source, modules) if i.partition(".")[0] in EDGE)
 
 
 def one_way(modules):
-    """The modules in an order in which each imports only earlier ones.
+    """The modules in an order in which each imports only earlier ones; lyapnet itself imports when it is asked.
 
     Raises:
         CycleError: there is none.
     """
     graph = {name: {i for i in imports(source, modules) if i in modules} for name, source in modules.items()}
-    return list(TopologicalSorter(graph).static_order())
+    graph.pop("lyapnet")
+    return list(TopologicalSorter({name: found - {"lyapnet"} for name, found in graph.items()}).static_order())
 
 
-def test_core_modules_do_not_import_the_edge():
+def test_every_room_stands_on_its_level():
+    assert set().union(*LEVELS) == rooms(sources()).keys()
+    assert not list(upward(sources()))
+    assert max(levels(rooms(sources())).values()) <= 15
+
+
+@pytest.mark.parametrize(
+    ("module", "line"),
+    [
+        ("lyapnet.sets", "from lyapnet.rollout import Rollout"),
+        ("lyapnet.cost", "import lyapnet.problem"),
+        ("lyapnet.training.data", "from lyapnet.comparison.sweep import Point"),
+        ("lyapnet.programs.terms", "def late():\n    from lyapnet.config import Config"),
+    ],
+)
+def test_upward_import_is_found(module, line):
     modules = sources()
-    assert {f"lyapnet.{name}" for name in CORE} <= modules.keys()
-    assert not list(edge_imports(modules))
+    found = list(upward({**modules, module: f"{modules[module]}\n{line}\n"}))
+    assert [here for here, _ in found] == [room(module)]
+
+
+def test_modules_import_one_way():
+    assert len(one_way(sources())) == len(sources()) - 1
+
+
+def test_circle_within_a_room_is_found():
+    modules = sources()
+    circle = {
+        **modules,
+        "lyapnet.systems.base": modules["lyapnet.systems.base"] + "\nfrom lyapnet.systems import SYSTEMS\n",
+    }
+    with pytest.raises(CycleError):
+        one_way(circle)
+
+
+def test_mathematics_does_not_import_the_edge():
+    assert rooms(sources()).keys() >= MATHEMATICS
+    assert not list(edge_imports(sources()))
 
 
 @pytest.mark.parametrize(
@@ -82,54 +109,33 @@ def test_core_modules_do_not_import_the_edge():
         "def late():\n    import omegaconf.errors",
     ],
 )
-def test_core_module_that_imports_the_edge_is_found(line):
-    modules = {**sources(), "lyapnet.programs.new": line}
-    assert [name for name, _ in edge_imports(modules)] == ["lyapnet.programs.new"]
-
-
-def test_imports_run_one_way():
-    assert len(one_way(sources())) == len(sources())
-
-
-def test_imports_follow_the_flow_from_system_to_program():
-    assert not list(upstream_imports(sources()))
-
-
 @pytest.mark.parametrize(
-    ("module", "line"),
-    [
-        ("lyapnet.sets", "from lyapnet.rollout import Rollout"),
-        ("lyapnet.systems.base", "import lyapnet.cost"),
-        ("lyapnet.programs.terms", "def late():\n    from lyapnet.config import Config"),
-    ],
+    "module", ["lyapnet.programs.new", "lyapnet.certification.new", "lyapnet.evaluation.oracles.new"]
 )
-def test_import_against_the_flow_is_found(module, line):
-    modules = sources()
-    assert [name for name, _ in upstream_imports({**modules, module: f"{modules[module]}\n{line}\n"})] == [module]
+def test_mathematics_that_imports_the_edge_is_found(module, line):
+    assert [name for name, _ in edge_imports({**sources(), module: line})] == [module]
 
 
-@pytest.mark.parametrize(
-    ("module", "line"),
-    [
-        ("lyapnet.rollout", "from lyapnet.controller import load"),
-        ("lyapnet.cost", "def late():\n    from lyapnet import programs"),
-        ("lyapnet.systems.base", "from lyapnet.systems import SYSTEMS"),
-    ],
-)
-def test_circle_of_imports_is_found(module, line):
-    modules = sources()
-    with pytest.raises(CycleError):
-        one_way({**modules, module: f"{modules[module]}\n{line}\n"})
+def test_files_and_functions_stay_short():
+    assert [(lines, name) for lines, name in files(sources()) if lines > 400] == []
+    long = [(lines, name) for lines, name in functions(sources()) if lines > 60 and not name.startswith("lyapnet.cli")]
+    assert long == []  # a command's function is its options
 
 
 def loaded(*statements):
-    """Top-level packages that are loaded after the statements, in a fresh interpreter."""
-    program = "\n".join([*statements, "import sys", "print(*{name.partition('.')[0] for name in sys.modules})"])
+    """The modules that are loaded after the statements, in a fresh interpreter."""
+    program = "\n".join([*statements, "import sys", "print(*sys.modules)"])
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
 
 
-def test_importing_lyapnet_loads_neither_lightning_nor_matplotlib():
-    heavy = {"lightning", "matplotlib", "tensorboard"}
+def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
+    heavy = {"torch", "lightning", "matplotlib", "tensorboard", "gymnasium", "casadi"}
     assert not heavy & loaded("import lyapnet", "import lyapnet.cli")
-    assert heavy & loaded("import lyapnet.figures") == {"matplotlib"}
+    assert heavy & loaded("import lyapnet.evaluation.figures") == {"torch", "matplotlib"}
+
+
+def test_training_loads_neither_bench_nor_comparison():
+    found = loaded("import lyapnet", "lyapnet.train")
+    assert "lyapnet.training.experiment" in found
+    assert not {"lyapnet.bench", "lyapnet.comparison", "gymnasium", "casadi", "stable_baselines3"} & found

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.build import build_task, build_value_function
+from lyapnet.build import build_problem, build_value_function
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.config import load_config, to_plain
 from lyapnet.errors import CheckpointError, LyapnetError, UsageError
@@ -28,7 +28,7 @@ SMALL = ["network.hidden=[4, 4]", "horizon.steps=5"]
 
 def content_of(config):
     """What a checkpoint of a run with this config holds, with fresh weights."""
-    V = build_value_function(config, build_task(config))
+    V = build_value_function(config, build_problem(config))
     weights = {f"V.{name}": tensor for name, tensor in V.state_dict().items()}
     return {"state_dict": weights, "global_step": 7, KEY: {"config": to_plain(config), "version": "0"}}
 
@@ -206,7 +206,7 @@ def test_class_that_a_checkpoint_names_is_not_imported(section, cls, trap, tmp_p
     assert not marker.exists()
     # the twin: building what the config names does import it
     config = load_config(CONF / "double_integrator.yaml", [*SMALL, f"{section}.name={module}:{cls}"])
-    build_value_function(config, build_task(config))
+    build_value_function(config, build_problem(config))
     assert marker.exists()
 
 

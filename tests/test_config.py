@@ -7,67 +7,13 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 from omegaconf import MISSING
-from torch.testing import assert_close
 
-from lyapnet.build import build_program, build_rollout, build_task, build_value_function
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
-from lyapnet.programs import LyapunovProgram, ValueProgram
-from lyapnet.systems import Cartpole, DoubleIntegrator, Reacher
-
-CONF = Path(__file__).parents[1] / "conf"
-EXPERIMENTS = [path for path in CONF.rglob("*.yaml") if not path.stem.startswith("compare")]
-PLAIN = """
-experiment: small
-program: {name: lyapunov, margin: 0.1}
-system: {name: double_integrator}
-cost: {Q: [1, 1], R: [1], Q_T: [1, 1]}
-initial_states: {lower: [-1, -1], upper: [1, 1]}
-horizon: {steps: 4, dt: 0.1}
-network: {name: anchored, hidden: [4]}
-training: {iterations: 1, batch_size: 2}
-evaluation: {validation_states: 2, test_states: 2}
-"""
-
-
-HANGAR = """
-import torch
-from torch import nn
-from lyapnet import ControlAffineSystem
-
-class Balloon(ControlAffineSystem):
-    state_names, state_units = ("height", "speed"), ("m", "m/s")
-    control_names, control_units = ("thrust",), ("N",)
-    mass = 1.0
-
-    def f(self, x):
-        return torch.stack([x[..., 1], -x[..., 1] ** 3], -1)
-
-    def g(self, x):
-        return torch.stack([torch.zeros_like(x[..., :1]), torch.ones_like(x[..., :1]) / self.mass], -2)
-
-class Drone(Balloon):
-    def __init__(self, mass=1.0):
-        super().__init__()
-        self.mass = mass
-
-class Squadron(Balloon):
-    def __init__(self, **parameters):
-        super().__init__()
-        self.mass = parameters["mass"]
-
-class Bowl(nn.Module):
-    def __init__(self, scaling, hidden=(4,)):
-        super().__init__()
-        self.width = hidden[0]
-        self.weight = nn.Parameter(torch.ones(()))
-
-    def forward(self, t, x):
-        return self.weight * (x**2).sum(-1) + 0 * t
-"""
+from lyapnet.training.plan import plan_run
+from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
 
 # Many calls of the command line in one process, as a user meets it: without the shape checks of the tests.
 CALLS = """
@@ -105,13 +51,6 @@ def is_refused(outcome, *named):
 @pytest.fixture
 def plain():
     return yaml.safe_load(PLAIN)
-
-
-def objects(config):
-    """Everything that a config names, built."""
-    task = build_task(config)
-    V = build_value_function(config, task)
-    return task, V, build_program(config), build_rollout(config, task, V)
 
 
 # Refusals: the overrides, joined by &, and what their message names.
@@ -241,6 +180,13 @@ IMPOSSIBLE = {
     "network.ignored_states=[speed]": ("network.ignored_states", "position, velocity", "'speed'"),
     "network.ignored_states=[position, velocity]": ("network.ignored_states", "all"),
     "network.ignored_states=[velocity] & network.terminal=exact": ("cost.Q_T", "ignored_states", "terminal=exact"),
+    "loggers=[tensorbord]": ("loggers", "tensorboard?"),
+    "callbacks=[hangar:Drone]": ("callbacks", "Callback", "hangar:Drone"),
+    "callbacks=[nowhere:Thing]": ("callbacks", "module:Class", "nowhere"),
+    "callbacks=[hangar:Greedy]": ("callbacks", "hangar:Greedy", "appetite"),
+    "controls.name=unbound": ("controls.name", "unbounded?", "module:Class"),
+    "program.parameters.greed=1": ("program.parameters.greed", "lyapunov"),
+    "cost.parameters.greed=1": ("cost.parameters",),
     "pointwise.weight=1 & pointwise.region=[1, 2, 3]": ("pointwise.region", "position, velocity", "3"),
     "pointwise.weight=1 & pointwise.counterexamples=nowhere.csv": ("pointwise.counterexamples", "nowhere.csv"),
 }
@@ -302,6 +248,16 @@ def test_file_and_command_line_are_refused_alike(plain):
             config_from_plain(content, overrides)
 
 
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_logger_whose_library_is_missing_is_refused(name, plain, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(
+        UsageError, match=rf"^Expected {name} for loggers=\[{name}\], got none .*; pip install {name}\.$"
+    ):
+        plan_run(config_from_plain(plain, [f"loggers=[{name}]", "logs=nowhere"]))
+    assert not Path("nowhere").exists()
+
+
 def mandatory(schema=Config, prefix=""):
     """Full names of the fields without a default."""
     for f in dataclasses.fields(schema):
@@ -312,11 +268,11 @@ def mandatory(schema=Config, prefix=""):
 
 
 def test_mandatory_keys_are_these():
-    tasks = ["cost.Q", "cost.R", "cost.Q_T", "initial_states.lower", "initial_states.upper", "horizon.steps"]
-    assert list(mandatory()) == ["experiment", "program.name", "system.name", *tasks, "network.name"]
+    task = ["initial_states.lower", "initial_states.upper", "horizon.steps"]
+    assert list(mandatory()) == ["experiment", "program.name", "system.name", *task, "network.name"]
 
 
-@pytest.mark.parametrize("key", list(mandatory()))
+@pytest.mark.parametrize("key", [*mandatory(), "cost.Q", "cost.R", "cost.Q_T"])
 def test_missing_mandatory_key_is_refused(key, plain):
     *sections, name = key.split(".")
     section = plain
@@ -324,7 +280,7 @@ def test_missing_mandatory_key_is_refused(key, plain):
         section = section[part]
     del section[name]
     with pytest.raises(UsageError, match=f"^Expected .*{key}, got none"):
-        config_from_plain(plain)
+        objects(config_from_plain(plain))
 
 
 # Precedence and round trips
@@ -362,115 +318,7 @@ def test_defaults_are_not_shared_between_configs(plain):
     assert config_from_plain(plain).system.parameters == {}
 
 
-# The shipped configs against the task sheet
-
-BALANCING = {"cart_mass": 1, "pole_mass": 0.1, "length": 0.3, "cart_damping": 0.1, "pole_damping": 0.1}
-SWINGUP = {"cart_mass": 1, "pole_mass": 1, "length": 1, "cart_damping": 0, "pole_damping": 0.1}
-DOUBLE_INTEGRATOR = (DoubleIntegrator, {"mass": 1}, 400, [10, 0.1], [10, 0.1], [0, 0], [1, 0.7])
-TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width of X₀
-    "double_integrator": (LyapunovProgram, *DOUBLE_INTEGRATOR),
-    "double_integrator_certified": (LyapunovProgram, *DOUBLE_INTEGRATOR),
-    "double_integrator_value": (ValueProgram, *DOUBLE_INTEGRATOR),
-    "cartpole_balancing": (
-        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
-        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
-    ),
-    "cartpole_balancing_certified": (
-        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
-        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
-    ),
-    "cartpole_swingup": (
-        ValueProgram, Cartpole, SWINGUP, 171, [0, 0, 0, 0], [80, 600, 0.8, 4.5],
-        [0, torch.pi, 0, 0], [0, 0.3, 0, 0],
-    ),
-    "reacher": (
-        ValueProgram, Reacher, {"damping": 0.25}, 170, [1, 1, 0, 0], [100, 100, 1, 1],
-        [0, 0, 0, 0], [3, 3, 0, 0],
-    ),
-}  # fmt: skip
-
-
-PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
-
-
-def test_every_shipped_config_is_a_task_of_the_sheet():
-    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain"}
-    assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(PAPER)
-
-
-@pytest.mark.parametrize("name", PAPER)
-def test_the_papers_literal_program_has_the_task_of_ours(name):
-    """And its loss: the mean sum, without normalisation, margin or a cost term."""
-    ours, literal = load_config(CONF / f"{name}.yaml"), load_config(CONF / "paper" / f"{name}.yaml")
-    for section in ("system", "cost", "initial_states", "horizon"):
-        assert to_plain(literal)[section] == to_plain(ours)[section]
-    program = literal.program
-    assert program.name == ours.program.name
-    assert (program.constraint, program.trajectory_cost, program.normalise) == (1, 0, False)
-    assert (literal.training.batch_size, literal.rollout.gradient) == (12, "adjoint")
-    assert literal.network.hidden == {"cartpole_balancing": [200, 500], "double_integrator": [64, 64]}.get(
-        name, [128, 128]
-    )
-
-
-def test_one_number_stands_for_every_state():
-    config = load_config(CONF / "integrator_chain.yaml", ["system.parameters.length=3", "network.state_scale=[2]"])
-    task, V, _, _ = objects(config)
-    assert_close(task.cost.Q, torch.eye(3, dtype=torch.float64))
-    assert_close(task.initial_states.widths, torch.full((3,), 2.0, dtype=torch.float64))
-    assert_close(V.inputs.state_scale, torch.full((3,), 2.0, dtype=torch.float64))
-    assert_close(task.system.f(torch.tensor([1.0, 2.0, 3.0])), torch.tensor([2.0, 3.0, 0.0]).double())
-
-
-@pytest.mark.parametrize("name", TASKS)
-def test_shipped_config_is_its_task(name):
-    config = load_config(CONF / f"{name}.yaml")
-    task, V, program, rollout = objects(config)
-    program_class, system_class, parameters, N, Q, Q_T, center, half_width = TASKS[name]
-    assert config.experiment == name
-    assert type(program) is program_class
-    assert type(task.system) is system_class
-    assert (task.horizon.steps, task.horizon.dt) == (N, 0.01)
-    assert_close(task.cost.Q, torch.tensor(Q, dtype=torch.float64).diag())
-    assert_close(task.cost.Q_T, torch.tensor(Q_T, dtype=torch.float64).diag())
-    assert_close(task.initial_states.center, torch.tensor(center, dtype=torch.float64))
-    assert_close(task.initial_states.widths, 2 * torch.tensor(half_width, dtype=torch.float64))
-    expected, x = system_class(**parameters), torch.randn(8, task.system.n)
-    assert_close(task.system.f(x), expected.f(x))
-    assert_close(task.system.g(x), expected.g(x))
-    assert_close(task.cost.R(x), expected.inverse_mass(x))
-    assert V(torch.tensor(0.0), x).shape == (8,)
-    assert config.rollout.policy == "hjb"
-    assert rollout.method == "euler"
-
-
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: str(path.relative_to(CONF)))
 def test_first_line_of_a_shipped_config_runs_it(path):
     command = f"# python train.py --config conf/{path.relative_to(CONF)}"
     assert path.read_text().splitlines()[0].startswith(command)
-
-
-# The user's own classes
-
-
-@pytest.fixture
-def own_classes(tmp_path, monkeypatch):
-    """A module of the user's in the working directory; its name."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    (tmp_path / "hangar.py").write_text(HANGAR)
-    yield "hangar"
-    sys.modules.pop("hangar", None)
-
-
-@pytest.mark.parametrize(("name", "mass"), [("Balloon", 1), ("Drone", 4), ("Squadron", 4)])
-def test_classes_of_the_users_own_are_built(name, mass, own_classes, plain):
-    """Also without a constructor, and with one that takes anything."""
-    parameters = {"mass": mass} if name != "Balloon" else {}
-    plain["system"] = {"name": f"{own_classes}:{name}", "parameters": parameters}
-    plain["network"] = {"name": f"{own_classes}:Bowl", "hidden": [6]}
-    task, V, _, rollout = objects(config_from_plain(plain))
-    x = torch.randn(3, 2)
-    assert task.system.mass == mass
-    assert V.width == 6
-    assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / mass)  # −½ R⁻¹gᵀV_x with V = ‖x‖²

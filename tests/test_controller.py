@@ -11,21 +11,24 @@ import torch
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.build import build_task, build_value_function
+from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import Config, load_config
 from lyapnet.controller import Controller
 from lyapnet.errors import CheckpointError, DivergenceError, UsageError
-from lyapnet.evaluation import evaluate
-from lyapnet.oracles import discrete_riccati
-from lyapnet.randomness import TEST, stream
+from lyapnet.evaluation.measurement import evaluate
+from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.policy import HJBPolicy
+from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Rollout
 from lyapnet.systems import DoubleIntegrator
+from tests.problems import Quadratic, problem_of
 
 CONF = Path(__file__).parents[1] / "conf"
 SMALL = [
     *("horizon.steps=10", "training.iterations=2", "training.batch_size=4", "network.hidden=[8, 8]"),
-    *("evaluation.validation_states=4", "evaluation.test_states=4"),
+    *("evaluation.validation_states=4", "evaluation.test_states=4", "loggers=[csv]", "rollout.gradient=adjoint"),
 ]
 N, n, m = 10, 2, 1
 X0 = [0.5, -0.2]
@@ -65,11 +68,26 @@ def test_public_attributes(controller):
     assert {"SYSTEMS", "ControlAffineSystem", "QuadraticCost", "Box", "load"} <= set(lyapnet.__all__)
 
 
+def test_controller_knows_its_problem_its_run_and_what_it_was_trained_for(controller):
+    problem = controller.problem
+    for part in ("system", "cost", "controls", "initial_states", "horizon"):
+        assert getattr(controller, part) is getattr(problem, part)
+    assert controller.parameters == {"mass": 1.0}
+    assert (controller.method, type(controller.program)) == ("euler", lyapnet.LyapunovProgram)
+
+
+def test_controller_of_parts_has_no_config():
+    controller = controller_of(PartlyFalling())
+    assert controller.parameters == {}
+    with pytest.raises(UsageError, match="Expected a controller that a run left, got one made from parts"):
+        _ = controller.config
+
+
 def test_loaded_value_function_is_the_trained_one(controller, path):
     weights = read_checkpoint(path)["state_dict"]
     for name, tensor in controller.V.state_dict().items():
         assert torch.equal(tensor, weights[f"V.{name}"])
-    untrained = build_value_function(controller.config, build_task(controller.config))
+    untrained = build_value_function(controller.config, build_problem(controller.config))
     assert any(not torch.equal(a, b) for a, b in zip(untrained.parameters(), controller.V.parameters(), strict=True))
 
 
@@ -219,12 +237,12 @@ def counted(controller, samples, seed):
     }
 
 
-def controller_of(V, *overrides):
-    config = load_config(CONF / "double_integrator.yaml", [f"horizon.steps={N}", *overrides])
-    return Controller(config, build_task(config), V)
+def controller_of(V):
+    config = load_config(CONF / "double_integrator.yaml", [f"horizon.steps={N}"])
+    return Controller(build_problem(config), V, program=build_program(config))
 
 
-class PartlyFalling(torch.nn.Module):
+class PartlyFalling(lyapnet.ValueFunction):
     """V falls as fast as the cost accrues from some states, not from others; it rises near the goal."""
 
     def forward(self, t, x):
@@ -247,9 +265,10 @@ def test_trained_controller_is_measured_as_by_hand(controller):
 def riccati(quadratic, factor=1.0, steps=100):
     """A controller around factor · xᵀP_n x, where P solves the Riccati equation."""
     config = load_config(CONF / "double_integrator.yaml", [f"horizon.steps={steps}"])
-    task = build_task(config)
-    P = discrete_riccati(task.system, task.cost, task.horizon).P
-    return Controller(config, task, quadratic(factor * P, dt=task.horizon.dt))
+    problem = build_problem(config)
+    P = discrete_riccati(problem.system, problem.cost, problem.horizon).P
+    V = quadratic(factor * P, dt=problem.horizon.dt)
+    return Controller(problem, V, program=build_program(config))
 
 
 def test_exact_value_function_has_no_gap(quadratic):
@@ -275,8 +294,9 @@ def test_satisfied_share_follows_the_slack(quadratic):
 
 def test_task_without_an_oracle_has_no_gap_to_report():
     config = load_config(CONF / "reacher.yaml", ["horizon.steps=3", "network.hidden=[4]", "rollout.method=rk4"])
-    task = build_task(config)
-    result = evaluate(Controller(config, task, build_value_function(config, task)), 4)
+    problem = build_problem(config)
+    V = build_value_function(config, problem)
+    result = evaluate(Controller(problem, V, build_rollout(config, problem, V)), 4)
     assert result.keys() >= DESIGNED_KEYS
     assert result["optimal_cost_mean"] is result["cost_ratio"] is result["value_error"] is None
     assert result["optimum_failures"] is None
@@ -366,3 +386,11 @@ def test_evaluate_command_refuses_a_truncated_checkpoint(path, tmp_path, capsys)
     assert str(cut) in message
     with pytest.raises(CheckpointError):
         main(["evaluate", str(cut), "--debug"])
+
+
+def test_a_rollout_of_another_value_function_is_refused():
+    problem = problem_of(DoubleIntegrator())
+    V, other = (Quadratic(torch.eye(2)) for _ in range(2))
+    lyapnet.Controller(problem, V, Rollout(problem, HJBPolicy(problem, V)))
+    with pytest.raises(ValueError, match="the rollout of this V on this problem"):
+        lyapnet.Controller(problem, V, Rollout(problem, HJBPolicy(problem, other)))

@@ -1,10 +1,12 @@
 """Small matrices by formula against torch's library, derivatives included."""
 
+import math
+
 import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.linear_algebra import SMALL, apply, multiply, solve
+from lyapnet.linear_algebra import SMALL, UNROLLED, apply, multiply, solve
 
 batches = pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
 
@@ -22,9 +24,10 @@ def agree(function, reference, *arguments, tolerance=1e-12):
 
 @batches
 @pytest.mark.parametrize("columns", [1, 2])
-@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("d", [1, 2, 3, UNROLLED, UNROLLED + 1])
 def test_solve(d, columns, batch):
-    A, B = 3 * torch.eye(d) + torch.rand(*batch, d, d), torch.randn(*batch, d, columns)
+    half, B = torch.randn(*batch, d, d), torch.randn(*batch, d, columns)
+    A = half @ half.mT + torch.eye(d)
     agree(solve, torch.linalg.solve, A, B, tolerance=1e-10)
     with pytest.raises(AssertionError):
         agree(lambda A, B: solve(A.mT + 1e-6, B), torch.linalg.solve, A, B, tolerance=1e-10)
@@ -33,6 +36,25 @@ def test_solve(d, columns, batch):
 def test_solve_pivots_where_the_first_entry_is_zero():
     A = torch.tensor([[0.0, 2.0], [4.0, 1.0]])
     assert solve(A, torch.eye(2)).tolist() == [[-0.125, 0.25], [0.5, 0.0]]
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("condition", [1e2, 1e6, 1e10])
+@pytest.mark.parametrize("d", [3, 4, UNROLLED])
+def test_small_definite_systems_are_solved_as_well_as_their_condition_allows(d, condition, scale):
+    """Within a few roundings times the condition number, as the library does; some digits fewer are noticed."""
+    basis = torch.linalg.qr(torch.randn(100, d, d)).Q
+    A = scale * basis @ torch.diag(torch.logspace(0, -math.log10(condition), d)) @ basis.mT
+    A, x = (A + A.mT) / 2, torch.randn(100, d, 1)
+    B = A @ x
+
+    def largest_error(y):
+        return float(((y - x).norm(dim=-2) / x.norm(dim=-2)).max())
+
+    rounding = torch.finfo(A.dtype).eps * condition
+    assert largest_error(solve(A, B)) < 20 * rounding
+    assert largest_error(torch.linalg.solve(A, B)) < 20 * rounding
+    assert not largest_error(solve(A.float(), B.float()).double()) < 20 * rounding
 
 
 SIZES = [(1, 1, 1), (2, 2, 2), (1, 4, 2), (3, 3, 3), (4, 4, 4), (2, 3, SMALL)]  # on both sides of SMALL

@@ -1,4 +1,4 @@
-"""What the README says to type, typed; trainings are cut to two steps."""
+"""What the README and the pages under docs/ say to type, typed; trainings are cut to two steps."""
 
 import re
 import shlex
@@ -10,21 +10,16 @@ import pytest
 import lyapnet
 from lyapnet.cli import main
 from lyapnet.comparison.plan import jobs_of, load_comparison
+from tests.pages import PAGES, README, REPORT, ROOT, blocks
 
-ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
 SHORT = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4"]
-CHECKPOINT = "logs/double_integrator/version_0/checkpoints/best.ckpt"
-
-
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
 
 
 def commands(program: str) -> list[list[str]]:
-    """The arguments of every line of a bash block that calls the program, in the README's order."""
-    lines = [part.strip() for block in blocks("bash") for line in block.splitlines() for part in line.split("&&")]
-    return [shlex.split(line.removeprefix(program)) for line in lines if line.startswith(program)]
+    """The arguments of every line of a bash block that calls the program, in the pages' order, none twice."""
+    joined = [block.replace("\\\n", " ") for block in blocks("bash")]
+    lines = [part.strip() for block in joined for line in block.splitlines() for part in line.split("&&")]
+    return [shlex.split(line.removeprefix(program)) for line in dict.fromkeys(lines) if line.startswith(program)]
 
 
 @pytest.fixture
@@ -41,7 +36,7 @@ def train(arguments: list[str]) -> int:
 
 
 def brief(arguments: list[str]) -> list[str]:
-    """Few states and steps, one value of a sweep, a second for a certificate; any other command as it is."""
+    """Few states and steps, one task or value of several, a second for a proof; any other command as it is."""
     if arguments[0] == "sweep":
         if "--vary" not in arguments:
             return [*arguments[:3], *SHORT]
@@ -53,23 +48,25 @@ def brief(arguments: list[str]) -> list[str]:
     if arguments[0] == "compare":
         config, tasks = "conf/compare_smoke.yaml", ["--tasks", "double_integrator", "--methods", "lyapnet,ppo_tuned"]
         return ["compare", "--config", config, *tasks, "--workers", "2"]
-    if "--seconds" in arguments:
-        at = arguments.index("--seconds")
-        short = SHORT if "--refine" in arguments else []
-        return [*arguments[: at + 1], "1", *arguments[at + 2 :], *short]
+    if arguments[:2] == ["certify", "sound"]:
+        limited = with_option(arguments, "--seconds", "1")
+        return [*with_option(limited, "--refine", "1"), *SHORT] if "--refine" in limited else limited
     if arguments[0] != "bench":
         return arguments
-    at = arguments.index("--batch") if "--batch" in arguments else len(arguments)
+    first = [a.split(",")[0] for a in arguments]  # of several tasks and routes
     return [
-        *arguments[:at],
-        *arguments[at + 2 :],
-        "--batch",
-        "2",
-        "--repeats",
-        "1",
+        *with_option(with_option(first, "--batch", "2"), "--repeats", "1"),
         "horizon.steps=4",
         "rollout.compile=off",
     ]
+
+
+def with_option(arguments: list[str], name: str, value: str) -> list[str]:
+    """The arguments with another value of an option, or with the option."""
+    if name not in arguments:
+        return [*arguments, name, value]
+    at = arguments.index(name)
+    return [*arguments[: at + 1], value, *arguments[at + 2 :]]
 
 
 def test_every_command_runs(workplace, capsys):
@@ -79,19 +76,35 @@ def test_every_command_runs(workplace, capsys):
         if "trainer.strategy=ddp" not in arguments:  # starts this very process again: see test_distributed
             assert train(arguments) == 0, capsys.readouterr().err
     for arguments in commands("lyapnet"):
-        assert main(brief(arguments)) == 0, capsys.readouterr().err
+        assert main(brief(arguments)) == 0, (arguments, capsys.readouterr().err)
 
 
 def test_the_python_example_runs(workplace):
     assert train(["--config", "conf/double_integrator.yaml"]) == 0
-    (example,) = [block for block in blocks("python") if "controller.rollout" in block]
+    (example,) = [block for block in blocks("python") if "lyapnet.load" in block and "controller.rollout" in block]
     names: dict = {}
     exec(example, names)
     assert names["u"].shape == (1,)
     assert names["trajectory"].x.shape == (9, 2)
+
+
+def test_the_oracle_example_runs(workplace):
+    assert train(["--config", "conf/double_integrator.yaml"]) == 0
+    names: dict = {"controller": lyapnet.load("logs/double_integrator/version_0/checkpoints/best.ckpt")}
     (example,) = [block for block in blocks("python") if "oracle_of" in block]
     exec(example, names)
     assert names["optima"].cost.shape == (4,)
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning")  # Lightning's own
+def test_the_examples_from_python_train(workplace):
+    examples = [block for block in blocks("python") if "lightning.Trainer(" in block]
+    assert len(examples) == 2, "one in the README, one on the page from_python"
+    for version, example in enumerate(examples):
+        exec(example.replace("max_epochs=20", "max_epochs=1").replace("steps=100", "steps=4"), {"__name__": "example"})
+        rows = (workplace / f"logs/lightning_logs/version_{version}/metrics.csv").read_text().splitlines()
+        assert "trajectory_cost/val" in rows[0]
+        assert len(rows) > 1
 
 
 def test_the_environment_example_runs(workplace):
@@ -103,16 +116,16 @@ def test_the_environment_example_runs(workplace):
 
 
 def test_the_table_of_the_comparison_is_that_of_its_report():
-    lines = [line for line in README.splitlines() if line.startswith("| ")]
+    lines = [line for line in PAGES[ROOT / "docs" / "compare.md"].splitlines() if line.startswith("| ")]
     start = next(k for k, line in enumerate(lines) if line.startswith("| task | method"))
     shown = [line for line in lines[start:] if line.count("|") == lines[start].count("|")]
-    report = (ROOT / "docs" / "compare" / "report.md").read_text(encoding="utf-8")
+    report = REPORT.read_text(encoding="utf-8")
     assert len(shown) == 2 + 4 * 5
     assert "\n".join(shown) in report
 
 
 def test_a_system_of_your_own(workplace):
-    (source,) = [block for block in blocks("python") if "ControlAffineSystem" in block]
+    (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
     assert len(source.strip().splitlines()) <= 24
     (config,) = [block for block in blocks("yaml") if "experiment:" in block]
     (comparison,) = [block for block in blocks("yaml") if "comparison:" in block]
@@ -134,15 +147,17 @@ def test_a_system_of_your_own(workplace):
         sys.modules.pop("pendulum", None)
 
 
-def test_the_tour_names_every_file():
+def test_the_tour_names_every_file_and_no_other():
     package = ROOT / "lyapnet"
     files = {p.name for p in package.glob("*.py")} | {
         f"{p.name}/" for p in package.iterdir() if (p / "__init__.py").exists()
     }
-    missing = {name for name in files - {"__init__.py"} if f"`{name}`" not in README}
-    assert not missing
+    named = set(re.findall(r"`(\w+(?:\.py|/))`", rows_after(ROOT / "docs" / "architecture.md", "| file |")))
+    assert named == files - {"__init__.py"}
+    assert set(re.findall(r"`(\w+(?:\.py|/))`", rows_after(README, "| where in"))) <= files
 
 
-def test_pictures_exist():
-    for picture in re.findall(r"!\[[^]]*\]\(([^)]+)\)", README):
-        assert (ROOT / picture).is_file(), picture
+def rows_after(page: Path, heading: str) -> str:
+    """The rows of the table whose first row starts so."""
+    _, _, rest = PAGES[page].partition(heading)
+    return rest.partition("\n\n")[0].partition("\n")[2]

@@ -2,15 +2,15 @@
 
 from lyapnet.bench.accuracy import Accuracy, gradient_accuracy
 from lyapnet.bench.cases import Case, is_chain, load_case
-from lyapnet.bench.measurement import Row, time_routes, use_threads
+from lyapnet.bench.measurement import BenchRow, time_routes, use_threads
 from lyapnet.bench.routes import BASELINE, ROUTES, routes_for
 
 __all__ = [
     "BASELINE",
     "ROUTES",
     "Accuracy",
+    "BenchRow",
     "Case",
-    "Row",
     "gradient_accuracy",
     "is_chain",
     "load_case",

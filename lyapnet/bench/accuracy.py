@@ -11,11 +11,11 @@ from lyapnet.bench.cases import Case, derivatives, flat, trained
 from lyapnet.bench.routes import EXACT, REFERENCE
 from lyapnet.programs import ValueProgram
 from lyapnet.rollout import ADAPTIVE_METHODS
-from lyapnet.runge_kutta import TABLEAUX
+from lyapnet.rollout.runge_kutta import TABLEAUX
 from lyapnet.types import State
 
 SLICE = 256  # states whose graph the reference holds at once
-READ_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # of what a loss may read in a trajectory
+READ_AXES = {"x": 1, "running_cost": 1, "terminal_cost": 0, "value": 1}  # what a loss may read ↦ its axis of states
 
 
 def reference_gradient(case: Case, x0: State) -> Tensor:
@@ -49,7 +49,7 @@ class Accuracy(NamedTuple):
 
     route: str
     method: str
-    evaluations: int  # of the closed loop f + gu for each trajectory, forward and backward
+    evaluations: int  # calls of the closed loop f + gu for each trajectory, forward and backward
     discretisation_error: float  # against backpropagation through the same steps
     continuous_error: float  # against the gradient as Δt → 0
 
@@ -62,7 +62,7 @@ def gradient_accuracy(case: Case, batch: int = 4, halvings: int = 4) -> list[Acc
     torchdiffeq makes them; discrete evaluates s stages at N + 1 nodes and linearises each of them once: 2s(N + 1).
     """
     case = case._replace(program=ValueProgram(constraint=0.0, trajectory_cost=1.0, normalise=False))
-    x0, N = case.sample(batch), case.task.horizon.steps
+    x0, N = case.sample(batch), case.problem.horizon.steps
     limit, _ = _counted(case, x0, REFERENCE, method="rk4")
     refinements = sorted({math.ceil(N / 2**k) for k in range(1, halvings + 1)})
     settings: list[tuple[int, dict[str, Any]]] = [

@@ -8,12 +8,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lyapnet.build import Task, build_program, build_rollout, build_task, build_value_function
+from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
+from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, config_from_plain, load_config
 from lyapnet.errors import UsageError
+from lyapnet.problem import Horizon, Problem
 from lyapnet.programs import Program
-from lyapnet.randomness import TEST, stream
-from lyapnet.rollout import Horizon, Rollout
+from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Rollout
 from lyapnet.types import State
 
 CONFIGS, CHAIN = Path("conf"), "chain:"
@@ -24,14 +26,14 @@ class Case(NamedTuple):
 
     name: str
     config: Config
-    task: Task
-    V: nn.Module
+    problem: Problem
+    V: ValueFunction
     program: Program
 
-    def rollout(self, gradient: str, V: nn.Module | None = None, **options: Any) -> Rollout:
+    def rollout(self, gradient: str, V: ValueFunction | None = None, **options: Any) -> Rollout:
         """The closed loop with that rollout.gradient, and further options of the config's section."""
         section = replace(self.config.rollout, gradient=gradient, **options)
-        return build_rollout(replace(self.config, rollout=section), self.task, self.V if V is None else V)
+        return build_rollout(replace(self.config, rollout=section), self.problem, self.V if V is None else V)
 
     def gradient(self, rollout: Rollout, x0: State) -> Sequence[Tensor]:
         """∂loss/∂θ."""
@@ -39,12 +41,12 @@ class Case(NamedTuple):
 
     def sample(self, batch: int) -> State:
         """Initial states, the same at each call."""
-        return self.task.initial_states.sample(batch, stream(self.config.seed, TEST))
+        return self.problem.initial_states.sample(batch, stream(self.config.seed, TEST))
 
     def in_steps(self, steps: int) -> "Case":
         """The same T in another number of steps."""
-        horizon = Horizon(steps, self.task.horizon.duration / steps)
-        return self._replace(task=self.task._replace(horizon=horizon))
+        horizon = Horizon(steps, self.problem.horizon.duration / steps)
+        return self._replace(problem=self.problem.replaced(horizon=horizon))
 
 
 def load_case(name: str, overrides: Sequence[str] = ()) -> Case:
@@ -66,8 +68,8 @@ def load_case(name: str, overrides: Sequence[str] = ()) -> Case:
                 f"{CHAIN}N, got {name!r}; choose one of them."
             )
         config = load_config(CONFIGS / f"{name}.yaml", overrides)
-    task = build_task(config)
-    return Case(name, config, task, build_value_function(config, task), build_program(config))
+    problem = build_problem(config)
+    return Case(name, config, problem, build_value_function(config, problem), build_program(config))
 
 
 def is_chain(name: str) -> bool:

@@ -5,18 +5,20 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
-from lyapnet.certificates import default_delta
+from lyapnet.calculus import ValueFunction
 from lyapnet.certification import DecreaseCondition
-from lyapnet.closed_loop import ClosedLoop
+from lyapnet.certification.sound_certificate import default_delta
 from lyapnet.controller import Controller
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
+from lyapnet.evaluation.oracles import continuous_riccati
 from lyapnet.networks import FCN, GoalAnchor, Scaling
-from lyapnet.oracles import continuous_riccati
 from lyapnet.policy import HJBPolicy
-from lyapnet.rollout import Horizon
+from lyapnet.problem import Horizon, Problem
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.sets import Box, Unbounded
 from lyapnet.systems import DoubleIntegrator, IntegratorChain, Linear
 from lyapnet.types import PerState, State, Time
 
@@ -32,12 +34,12 @@ class Bounded(NamedTuple):
     upper: Tensor
 
 
-class Quadratic(nn.Module):
+class Quadratic(ValueFunction):
     """V(t, x) = xᵀPx, with a network's N(t, x) on top if there is one."""
 
     P: Float[Tensor, "n n"]
 
-    def __init__(self, P: Tensor, network: nn.Module | None = None):
+    def __init__(self, P: Tensor, network: ValueFunction | None = None):
         super().__init__()
         self.register_buffer("P", P)
         self.network = network
@@ -52,10 +54,11 @@ def stationary(system: Linear, cost: QuadraticCost) -> Tensor:
     return continuous_riccati(system, cost, Horizon(200, 0.2)).P[0]
 
 
-def of_network(seed: int = 0) -> Bounded:
-    """On the double integrator, V = xᵀPx + N(t, x): P of Riccati, N a tanh network of 32 and 32, zero at the goal.
+def condition_of_network(seed: int = 0) -> Bounded:
+    """The condition on the double integrator with V = xᵀPx + N(t, x).
 
-    As a trained V is: near the value function, so that the terms of V̇ + αℓ all but cancel, and not quadratic.
+    P is Riccati's, N a tanh network of 32 and 32, zero at the goal. As a trained V is: near the value function, so that
+    the terms of V̇ + αℓ all but cancel, and not quadratic.
     """
     system, cost = DoubleIntegrator().double(), _cost([10.0, 0.1])
     with torch.random.fork_rng(devices=[]):
@@ -66,7 +69,7 @@ def of_network(seed: int = 0) -> Bounded:
     return Bounded("double integrator, Riccati + tanh 32-32", _condition(system, cost, V, 0.02), *sides)
 
 
-def of_controller(controller: Controller) -> Bounded:
+def condition_of_controller(controller: Controller) -> Bounded:
     """The condition that `lyapnet certify` proves of a checkpoint, at α = 0.9 and its default δ, on [0, T] × X₀."""
     closed_loop = copy.deepcopy(controller.closed_loop).double().requires_grad_(False)
     condition, X0 = DecreaseCondition(closed_loop, ALPHA, default_delta(controller)), controller.initial_states
@@ -75,8 +78,10 @@ def of_controller(controller: Controller) -> Bounded:
     return Bounded(controller.config.experiment, condition, lower, upper)
 
 
-def of_chain(n: int, delta: float = 0.5, holds: bool = True) -> Bounded:
-    """V = s xᵀPx on a chain of n integrators, ℓ = ‖x‖² + u², |x_i| ≤ 1: c = xᵀMx − δ with, S = PBR⁻¹BᵀP,
+def condition_of_chain(n: int, delta: float = 0.5, holds: bool = True) -> Bounded:
+    """The condition of V = s xᵀPx on a chain of n integrators.
+
+    With ℓ = ‖x‖² + u², |x_i| ≤ 1 and S = PBR⁻¹BᵀP it is c = xᵀMx − δ with
 
         M = (1 − s)(sS + Q) − (1 − α)(Q + s²S).
 
@@ -117,8 +122,10 @@ def _breaking_factor(Q: Tensor, S: Tensor, slack: float) -> float:
     return low
 
 
-def _condition(system: Linear, cost: QuadraticCost, V: nn.Module, delta: float) -> DecreaseCondition:
-    closed_loop = ClosedLoop(system, cost, HJBPolicy(system, cost, V)).requires_grad_(False)
+def _condition(system: Linear, cost: QuadraticCost, V: ValueFunction, delta: float) -> DecreaseCondition:
+    box = Box([-1.0] * system.n, [1.0] * system.n)
+    problem = Problem(system, cost, Unbounded(), box, Horizon(1, 1.0)).double()  # a condition knows no horizon
+    closed_loop = ClosedLoop(problem, HJBPolicy(problem, V)).requires_grad_(False)
     return DecreaseCondition(closed_loop, ALPHA, delta)
 
 

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import gradients
-from lyapnet.certification import BoundedFunction
-from lyapnet.certification.taylor import box_form, interval_form
 from lyapnet.errors import UsageError
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.taylor import box_form, interval_form
 from lyapnet.types import Value
 
 MEAN_VALUE = "mean value"
@@ -36,7 +36,7 @@ def interval(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
 def mean_value(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
     """c(m) + Σ_k [∂c/∂y_k] (y_k − m_k), m the middle of the box, its gradient on the box by interval arithmetic.
 
-    Of second order, with the interval excess of the gradient as its factor.
+    It is of second order, with the interval excess of the gradient as its factor.
     """
     slopes = BoundedFunction(lambda t, x: gradients(c, t, x), sample)
 
@@ -71,7 +71,10 @@ def enclosure(name: str, c: Value, sample: Sides) -> Enclosure:
 
 
 def enclosures_of(c: Value, sample: Sides, say: Callable[[str], Any]) -> dict[str, Enclosure]:
-    """All of them, of c traced once; `say` hears why the gradient of c, which training never needs, has no bounds.
+    """All enclosures of c, which is traced once; those of its gradient are left out where that has no bounds.
+
+    Args:
+        say: called with the reason why one is left out: training never needs the gradient of c.
 
     Raises:
         UsageError: c itself has an operator without a rule.

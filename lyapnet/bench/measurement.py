@@ -19,7 +19,7 @@ from lyapnet.types import State
 
 
 @dataclass(frozen=True)
-class Row:
+class BenchRow:
     """One route on one task and batch, as `lyapnet bench --json` prints it."""
 
     task: str
@@ -35,12 +35,14 @@ class Row:
     compile_seconds: float | None  # to trace, and to compile or load from disk; None: nothing is compiled
 
 
-def time_routes(case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]) -> list[Row]:
+def time_routes(
+    case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]
+) -> list[BenchRow]:
     """A row for each route, and for each compiled one: all warmed up, then timed in turns, `repeats` times each.
 
     Args:
         case, batch, routes, repeats: what is measured.
-        say: hears why compiled rows are left out.
+        say: called with the reason where compiled rows are left out.
 
     Raises:
         DivergenceError: the closed loop of the fresh V leaves the finite numbers.
@@ -55,9 +57,9 @@ def time_routes(case: Case, batch: int, routes: Sequence[str], repeats: int, say
     for entry, error, peak, times in zip(ready, errors, peaks, zip(*turns, strict=True), strict=True):
         seconds = statistics.median(times)
         rows.append(
-            Row(
-                case.name, case.task.system.n, batch, entry.route, entry.compiled, case.config.training.precision,
-                seconds, batch * case.task.horizon.steps / seconds, peak, error, entry.compile_seconds,
+            BenchRow(
+                case.name, case.problem.system.n, batch, entry.route, entry.compiled, case.config.training.precision,
+                seconds, batch * case.problem.horizon.steps / seconds, peak, error, entry.compile_seconds,
             )
         )  # fmt: skip
     return rows

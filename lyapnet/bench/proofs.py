@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import torch
 
-from lyapnet.bench.conditions import Bounded, of_chain
+from lyapnet.bench.conditions import Bounded, condition_of_chain
 from lyapnet.bench.enclosures import ENCLOSURES, Enclosure, enclosure
 from lyapnet.certification import Budget, prove
 from lyapnet.certification.branch_and_bound import Boxes
@@ -33,10 +33,10 @@ def growth(dimensions: Sequence[int], seconds: float, delta: float = 0.5) -> Ite
     for n in sorted(dimensions):
         for method in METHODS:
             if method not in lost:
-                proof = attempt(of_chain(n, delta), method, seconds)
+                proof = attempt(condition_of_chain(n, delta), method, seconds)
                 lost |= {method} if proof.verdict == "unknown" else set()
                 yield proof
-        yield attempt(of_chain(n, delta, holds=False), CERTIFIER, seconds, holds=False)
+        yield attempt(condition_of_chain(n, delta, holds=False), CERTIFIER, seconds, holds=False)
 
 
 def attempt(case: Bounded, method: str, seconds: float, holds: bool = True) -> Attempt:

@@ -7,11 +7,12 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lyapnet.bench.cases import Case, flat
-from lyapnet.compilation import has_compiler
+from lyapnet.calculus import ValueFunction
 from lyapnet.errors import CompilationError, UsageError
+from lyapnet.graphs.compilation import has_compiler
 from lyapnet.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.types import PerState, State, Time
 
@@ -32,10 +33,10 @@ class Entry(NamedTuple):
     compile_seconds: float | None = None
 
 
-class WithoutFormula(nn.Module):
+class WithoutFormula(ValueFunction):
     """V without its formula for V_x, which leaves V_x to autograd."""
 
-    def __init__(self, V: nn.Module):
+    def __init__(self, V: ValueFunction):
         super().__init__()
         self.V = V
 
@@ -58,7 +59,11 @@ def routes_for(case: Case, asked: Sequence[str] = ()) -> list[str]:
 
 
 def entries(case: Case, x0: State, routes: Sequence[str], say: Callable[[str], Any]) -> Iterator[Entry]:
-    """Each route as written, and then compiled where it can be; `say` hears why not."""
+    """Each route as written, and then compiled where it can be.
+
+    Args:
+        say: called with the reason where it cannot.
+    """
     adaptive = case.config.rollout.method in ADAPTIVE_METHODS
     gradient_of = {**GRADIENT_OF, FLOOR: REFERENCE} if adaptive else GRADIENT_OF
     plain = {gradient: case.rollout(gradient) for gradient in {gradient_of[r] for r in routes if r in gradient_of}}
@@ -103,7 +108,7 @@ def _without_gradient(rollout: Rollout, x0: State) -> Any:
 
 
 def _jax_entry(case: Case, x0: State, route: str) -> Entry:
-    from lyapnet.jax_twin import flat as flat_of_jax
+    from lyapnet.bench.jax_twin import flat as flat_of_jax
 
     twin = _jax_twin(case, route)
     if "rollout" in route:
@@ -114,9 +119,9 @@ def _jax_entry(case: Case, x0: State, route: str) -> Entry:
 
 
 def _jax_twin(case: Case, route: str) -> Any:
-    from lyapnet.jax_twin import JaxTwin  # only where JAX is installed
+    from lyapnet.bench.jax_twin import JaxTwin  # only where JAX is installed
 
-    return JaxTwin(case.task, case.V, case.program, checkpoint=JAX_ROUTES[route])
+    return JaxTwin(case.problem, case.V, case.program, checkpoint=JAX_ROUTES[route])
 
 
 def _obstacle(case: Case, route: str) -> str | None:

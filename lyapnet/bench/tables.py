@@ -12,7 +12,7 @@ from lyapnet.bench.tightness import Tightness
 
 def bench_table(case: Any, rows: list[Any], repeats: int, threads: int) -> Table:
     """What each route to one task's gradient costs, and what it gets wrong."""
-    parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.task.horizon
+    parameters, horizon = sum(p.numel() for p in case.V.parameters()), case.problem.horizon
     columns = [Column(name, justify="right") for name in ("batch", "seconds", "×", "k steps\nper s", "MB", "error")]
     table = Table("route", "com-\npiled", *columns)
     table.title = (

@@ -17,7 +17,7 @@ from lyapnet.types import Value
 SIDES = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 SMALLEST = 3  # sides over which an order is measured
 AT_ONCE = 512  # boxes that are timed, as many as the certifier bounds in one call
-SAMPLES, STEPS = 256, 20  # of the search for a range
+SAMPLES, STEPS = 256, 20  # with which a range is sought
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Tightness:
 
     case: str
     enclosure: str
-    sides: list[float]  # of the boxes, as shares of the axes
+    sides: list[float]  # sides of the boxes, as shares of the axes
     factors: list[float]  # median over boxes of (width of the enclosure) / (width of the range), for each side
     excesses: list[float]  # median of the difference of these widths, in cost per second
     order: float  # p of excess ∝ sideᵖ, over the smallest sides
-    boxes_per_second: float  # median, of 512 at once
+    boxes_per_second: float  # median, 512 at once
 
 
 def tightness(

@@ -3,20 +3,21 @@
 Three claims of growing strength: sampled, statistical, sound. Each class says in its first line what it claims.
 """
 
-from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
-from lyapnet.certification.branch_and_bound import Budget, Counterexample, Progress, Proof, prove, violations
+from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.counterexamples import Counterexample, violations
 from lyapnet.certification.funnel import SoundClaim, enclosing_box, sound_claim
+from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.statistical import (
     SampledClaim,
     StatisticalClaim,
-    Tolerances,
     lower_bound,
     sampled_claim,
     statistical_claim,
 )
+from lyapnet.certification.verdict import Verdict
 
 __all__ = [
-    "BoundedFunction",
     "Budget",
     "Counterexample",
     "DecreaseCondition",
@@ -25,7 +26,7 @@ __all__ = [
     "SampledClaim",
     "SoundClaim",
     "StatisticalClaim",
-    "Tolerances",
+    "Verdict",
     "enclosing_box",
     "lower_bound",
     "prove",

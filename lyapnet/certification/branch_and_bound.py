@@ -1,26 +1,22 @@
-"""Inequalities proved on boxes by bisection: where W = V − δt is low, and least values over boxes.
+"""Branch and bound over boxes of (t, x): one search, and two questions that it answers.
 
-Every box of (t, x) is (1 + n,) long, time first. What is proved is proved by bounds that are sound up to what
-lyapnet.certification.taylor says of rounding; plain evaluations serve to find counterexamples and to guess well.
+What it finds is found by bounds that are sound up to what lyapnet.graphs.taylor says of rounding; plain evaluations
+serve to guess well. The third question, where a condition is proved, is lyapnet.certification.proof.
 """
 
-import hashlib
-import io
 import time
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lyapnet.atomic import write_atomically
-from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
-from lyapnet.certification.statistical import Verdict
-from lyapnet.certification.taylor import TaylorForm, wide_axes
-from lyapnet.errors import UsageError
+from lyapnet.certification.boxes import Boxes, single
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.taylor import TaylorForm, wide_axes
+from lyapnet.types import Corner, Corners, PerBox, Value
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Budget:
     Args:
         seconds, boxes: the work.
         chunk: boxes that are bounded at once by each worker.
-        frontier: undecided boxes that are kept; beyond, those of highest W are given up.
+        frontier: undecided boxes that are kept; beyond, those of highest key are given up.
         workers: threads.
     """
 
@@ -51,226 +47,84 @@ class Budget:
         return self.elapsed >= self.seconds or boxes >= self.boxes
 
 
-class Counterexample(NamedTuple):
-    """A point at which the condition fails, in plain arithmetic and by a lower bound of its value."""
+MARGIN = 1e-9
+"""How far "just below" and "just above" are, relative to the number itself.
 
-    t: float
-    x: list[float]
-    condition: float  # c(t, x) > 0
-    height: float  # W(t, x) = V(t, x) − δt
-
-
-@dataclass(frozen=True)
-class Proof:
-    """c ≤ 0 at every (t, x) of a box with W(t, x) = V(t, x) − δt ≤ `level`; −∞ where nothing is proved.
-
-    What remains undecided lies above that level.
-    """
-
-    level: float
-    wanted: float  # the level up to which it was tried
-    counterexample: Counterexample | None  # the one of lowest W that was found
-    boxes: int
-    seconds: float
-    remaining_volume: float  # share of the box
-    undecided: Tensor  # (k, 1 + n), centres (t, x) of boxes that remain
-
-    @property
-    def verdict(self) -> Verdict:
-        """Of the claim that c ≤ 0 wherever W ≤ `wanted`."""
-        if self.counterexample is not None and self.counterexample.height <= self.wanted:
-            return "falsified"
-        return "certified" if self.level >= self.wanted else "unknown"
+Levels are compared as closed sets are: {W ≤ ρ} against boxes on which W reaches ρ, its boundary against a rim. The
+width is far above the rounding of the few float64 operations in between (1e-15), and far below what a figure shows.
+"""
 
 
-class Boxes(NamedTuple):
-    """Boxes of (t, x), (boxes, 1 + n) each, and a number for each by which they are sorted."""
+def just_below(value: float) -> float:
+    """A number below, by MARGIN."""
+    return value - MARGIN * abs(value)
 
-    lower: Tensor
-    upper: Tensor
-    key: Tensor
 
-    def __getitem__(self, chosen: Tensor) -> "Boxes":  # pyright: ignore[reportIncompatibleMethodOverride]
-        return Boxes(*(y[chosen] for y in tuple(self)))
+def just_above(value: float) -> float:
+    """A number above, by MARGIN."""
+    return value + MARGIN * abs(value)
 
-    def joined(self, other: "Boxes") -> "Boxes":
-        """Both."""
-        return Boxes(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
+
+class Question(ABC):
+    """What is asked of boxes, and what is known of the answer so far."""
+
+    @abstractmethod
+    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        """(the boxes that must be cut, by the key under which their halves wait; the axis to cut each across).
+
+        Calls may run in threads, side by side.
+        """
+
+    def look_at(self, boxes: Boxes) -> None:  # noqa: B027  (most questions learn from bounds alone)
+        """Learn from boxes that stay undecided; in the order of the search, one call at a time."""
 
     @property
-    def center(self) -> Tensor:
-        """(boxes, 1 + n)."""
-        return (self.lower + self.upper) / 2
-
-    def first(self, count: int) -> tuple["Boxes", "Boxes"]:
-        """(those of smallest key, the others)."""
-        if len(self.key) <= count:
-            return self, self[torch.zeros(len(self.key), dtype=torch.bool)]
-        chosen = torch.zeros(len(self.key), dtype=torch.bool)
-        chosen[self.key.topk(count, largest=False).indices] = True
-        return self[chosen], self[~chosen]
+    def highest(self) -> float:
+        """The highest key of boxes that are still of interest."""
+        return float("inf")
 
     @property
-    def least(self) -> float:
-        """The smallest key; ∞ of no boxes."""
-        return float(self.key.min()) if len(self.key) else float("inf")
-
-    def volumes(self, lower: Tensor, upper: Tensor) -> Tensor:
-        """The share of each in the box (lower, upper), (boxes,); axes of no width do not count."""
-        sides = torch.where(upper > lower, upper - lower, 1.0)
-        return torch.where(upper > lower, (self.upper - self.lower) / sides, 1.0).prod(-1)
-
-    def halves(self, axis: Tensor) -> "Boxes":
-        """Each box cut in two in the middle of an axis of its own."""
-        cut = torch.nn.functional.one_hot(axis, self.lower.shape[-1]).bool()
-        lower, upper = torch.where(cut, self.center, self.lower), torch.where(cut, self.center, self.upper)
-        return Boxes(self.lower, upper, self.key).joined(Boxes(lower, self.upper, self.key))
-
-
-BELOW = 1e-2  # of a counterexample's W: how far under it the level goes on, lest ever smaller boxes follow its edge
-
-
-class Progress(NamedTuple):
-    """How far a proof is."""
-
-    boxes: int  # bounded so far
-    remaining: float  # share of the domain that is undecided
-    seconds: float
-
-
-def prove(
-    condition: DecreaseCondition,
-    domain: tuple[Tensor, Tensor],
-    wanted: float = float("inf"),
-    budget: Budget | None = None,
-    stop_at_counterexample: bool = True,
-    generator: torch.Generator | None = None,
-    report: Callable[[Progress], None] | None = None,
-    keep: Path | None = None,
-) -> Proof:
-    """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
-
-    Counterexamples are sought first, by samples and by ascent from the worst of them. Then boxes of lowest W are
-    bounded first. A box is dropped where c ≤ 0 on all of it or W > level on all of it, and else cut in two. A
-    counterexample that turns up among their centres lowers the level, and the search goes on under it.
-
-    Args:
-        condition: in float64.
-        domain: (lower, upper) of (t, x).
-        stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
-        report: hears how far it is, after every few thousand boxes.
-        keep: a file in which an unfinished proof is kept, and from which it goes on.
-
-    Raises:
-        UsageError: the file keeps the proof of something else.
-    """
-    budget = budget or Budget()
-    lower, upper = (side.double() for side in domain)
-    bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), (lower, upper))
-    search = _kept(keep, bounded, lower, upper, wanted)
-    if search is None:
-        worst = find_counterexample(condition, bounded, lower, upper, wanted, generator)
-        everything = Boxes(lower[None], upper[None], torch.full((1,), -torch.inf, dtype=torch.float64))
-        search = Search(everything, wanted if worst is None else _under(worst), worst)
-    earlier, saved = search.seconds, budget.elapsed
-    with ThreadPoolExecutor(budget.workers) as pool:
-        while len(search.frontier.key) and not (search.worst is not None and stop_at_counterexample):
-            search.seconds = earlier + budget.elapsed
-            over = budget.spent(search.boxes)
-            if keep is not None and (over or budget.elapsed > saved + KEEP_EVERY):
-                search.save(keep, bounded.fingerprint, lower, upper, wanted)
-                saved = budget.elapsed
-            if over:
-                break
-            search.advance(condition, bounded, budget, pool.map)
-            if report is not None:
-                report(Progress(search.boxes, search.remaining(lower, upper), search.seconds))
-    stopped = search.worst is not None and stop_at_counterexample
-    proved = -torch.inf if stopped else min(search.level, _just_below(min(search.frontier.least, search.given_up)))
-    remaining = search.remaining(lower, upper)
-    return Proof(
-        proved, wanted, search.worst, search.boxes, earlier + budget.elapsed, remaining, search.frontier.center[:KEPT]
-    )
-
-
-KEEP_EVERY = 30.0  # seconds
-KEPT = 1000  # undecided boxes whose centres a proof names
+    def settled(self) -> bool:
+        """Whether the answer is known, whatever is undecided."""
+        return False
 
 
 @dataclass
 class Search:
-    """A proof on the way: what is undecided, and below which level the rest is proved."""
+    """A search on the way: the boxes that wait, those of lowest key being next."""
 
     frontier: Boxes
-    level: float
-    worst: Counterexample | None
-    boxes: int = 0
-    seconds: float = 0.0
-    given_up: float = float("inf")  # the least W among boxes for which there was no room
+    boxes: int = 0  # bounded so far
+    given_up: float = float("inf")  # the least key among boxes for which there was no room
 
-    def remaining(self, lower: Tensor, upper: Tensor) -> float:
-        """The share of the domain that is undecided."""
-        return float(self.frontier.volumes(lower, upper).sum())
+    @property
+    def least(self) -> float:
+        """The least key among boxes that are undecided; ∞ where none is."""
+        return min(self.frontier.least, self.given_up)
 
-    def advance(
-        self, condition: DecreaseCondition, bounded: BoundedFunction, budget: Budget, run: Callable[..., Any]
-    ) -> None:
-        """Bound the boxes of lowest W, a chunk for each worker; the level they read can only fall meanwhile."""
-        lowest, rest = self.frontier.first(budget.chunk * budget.workers)
-        self.boxes += len(lowest.key)
-        chunks = [lowest[part] for part in torch.arange(len(lowest.key)).split(budget.chunk)]
-        for undecided, axis in run(lambda chunk: _undecided(bounded, chunk, self.level), chunks):
-            found = _lowest_violation(condition, bounded, undecided.center, self.level)
-            if found is not None:
-                self.worst, self.level = found, _under(found)
-            rest = rest.joined(undecided.halves(axis))
-        self.frontier, beyond = rest[rest.key <= self.level].first(budget.frontier)
-        self.given_up = min(self.given_up, beyond.least)
+    def rounds(self, question: Question, budget: Budget, run: Callable[..., Iterable[Any]] = map) -> Iterator[None]:
+        """Bound a chunk for each worker, again and again, until all is decided, settled or the budget is spent.
 
-    def save(self, path: Path, fingerprint: str, lower: Tensor, upper: Tensor, wanted: float) -> None:
-        """Keep it in a file, all or nothing."""
-        content = {
-            "of": _identity(fingerprint, lower, upper, wanted), "frontier": list(self.frontier),
-            "worst": None if self.worst is None else self.worst._asdict(), "level": self.level,
-            "boxes": self.boxes, "seconds": self.seconds, "given_up": self.given_up,
-        }  # fmt: skip
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(path, buffer.getbuffer())
+        Args:
+            run: maps a function over chunks, as `map` does or a pool of threads.
+        """
+        while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):
+            lowest, rest = self.frontier.first(budget.chunk * budget.workers)
+            self.boxes += len(lowest.key)
+            for undecided, axis in run(question.undecided, lowest.split(budget.chunk)):
+                question.look_at(undecided)
+                rest = rest.joined(undecided.halves(axis))
+            self.frontier, beyond = rest[rest.key <= question.highest].first(budget.frontier)
+            self.given_up = min(self.given_up, beyond.least)
+            yield
 
 
-def _identity(fingerprint: str, lower: Tensor, upper: Tensor, wanted: float) -> list[Any]:
-    """What a kept proof is about, and the rules that it was made by: others might not have dropped what it dropped."""
-    rules = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))))
-    return [fingerprint, rules.hexdigest(), lower.tolist(), upper.tolist(), wanted]
-
-
-def _kept(path: Path | None, bounded: BoundedFunction, lower: Tensor, upper: Tensor, wanted: float) -> Search | None:
-    """The search that a file keeps; None where there is no file."""
-    if path is None or not path.exists():
-        return None
-    try:
-        content = torch.load(path, weights_only=True)
-        same = content.pop("of") == _identity(bounded.fingerprint, lower, upper, wanted)
-        found = content.pop("worst")
-        frontier = Boxes(*content.pop("frontier"))
-        search = Search(frontier=frontier, worst=None if found is None else Counterexample(**found), **content)
-    except Exception as error:
-        raise UsageError(f"Expected a proof in {str(path)!r}, got another file; name a new one.") from error
-    if not same:
-        raise UsageError(
-            f"Expected the proof of this V, α, δ, set and version in {str(path)!r}, got another; take a new file."
-        )
+def searched(question: Question, frontier: Boxes, budget: Budget) -> Search:
+    """The search of a question, as far as the budget takes it."""
+    search = Search(frontier)
+    for _ in search.rounds(question, budget):
+        pass
     return search
-
-
-def _undecided(bounded: BoundedFunction, chunk: Boxes, level: float) -> tuple[Boxes, Tensor]:
-    """(the boxes on which c > 0 and W ≤ level are both possible, by their lower bounds of W; the axis to cut each)."""
-    c, W = bounded.forms(chunk.lower, chunk.upper)
-    (_, c_high), (W_low, _) = c.interval(), W.interval()
-    chunk = Boxes(chunk.lower, chunk.upper, torch.maximum(W_low, chunk.key))
-    chosen = ~(c_high <= 0) & (chunk.key <= level)
-    return chunk[chosen], axis_to_cut(bounded, c, chunk, chosen)
 
 
 PROBES = 12  # boxes of a chunk that are cut along every axis
@@ -281,6 +135,10 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
 
     A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, what the
     bounds have beyond it is in the way. About Σ_k m_k w_k² of it is the widths'; m is measured on a few boxes.
+
+    Args:
+        form: the first result on the boxes.
+        chosen: (boxes,) truths.
     """
     widths, excess = boxes.upper - boxes.lower, form.excess.nan_to_num(nan=1e100, posinf=1e100)
     some = torch.nonzero(chosen).flatten()[:: max(1, int(chosen.sum()) // PROBES)]
@@ -298,166 +156,92 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
     return torch.where(widths > 0, m * widths**2 + tie, -1.0)[chosen].argmax(-1)
 
 
-# Counterexamples
-
-
-def find_counterexample(
-    condition: DecreaseCondition,
-    bounded: BoundedFunction,
-    lower: Tensor,
-    upper: Tensor,
-    level: float,
-    generator: torch.Generator | None = None,
-) -> Counterexample | None:
-    """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64."""
-    points = _likely_violations(condition, lower, upper, level, generator)
-    return _lowest_violation(condition, bounded, points, level)
-
-
-def violations(
-    condition: DecreaseCondition,
-    domain: tuple[Tensor, Tensor],
-    level: float,
-    count: int,
-    generator: torch.Generator | None = None,
-) -> Tensor:
-    """The worst points (t, x) found with c > 0 and W ≤ level, in plain arithmetic; (k, 1 + n), k ≤ count."""
-    points = _likely_violations(condition, *domain, level, generator)
-    c, W = _values(condition, points)
-    worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
-    return points[worst.indices[worst.values > 0]]
-
-
-def _likely_violations(
-    condition: DecreaseCondition,
-    lower: Tensor,
-    upper: Tensor,
-    level: float,
-    generator: torch.Generator | None,
-    samples: int = 20_000,
-    steps: int = 40,
-) -> Tensor:
-    """Samples of the box, and what ascent from the worst 64 of them with W ≤ level passes."""
-    points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
-    c, W = _values(condition, points)
-    start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
-    return torch.cat([points, _ascend(condition, start, lower, upper, steps)])
-
-
-def _ascend(condition: DecreaseCondition, points: Tensor, lower: Tensor, upper: Tensor, steps: int) -> Tensor:
-    """Points on the way up c, by the signs of its gradient in units of the box, with shrinking steps."""
-    path = [points]
-    for step in range(steps):
-        with torch.enable_grad():
-            leaf = path[-1].detach().requires_grad_()
-            (slope,) = torch.autograd.grad(condition(leaf[:, 0], leaf[:, 1:]).sum(), leaf)
-        length = 0.05 * 0.9**step * (upper - lower)
-        path.append((path[-1] + length * slope.sign().nan_to_num()).clamp(lower, upper))
-    return torch.cat(path)
-
-
-def _values(condition: DecreaseCondition, points: Tensor) -> tuple[Tensor, Tensor]:
-    with torch.no_grad():
-        t, x = points[:, 0], points[:, 1:]
-        return condition(t, x), condition.height(t, x)
-
-
-def _lowest_violation(
-    condition: DecreaseCondition, bounded: BoundedFunction, points: Tensor, level: float
-) -> Counterexample | None:
-    """Among points at which c > 0 and W ≤ level, by bounds too, the one of lowest W."""
-    c, W = _values(condition, points)
-    candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
-    candidates = candidates[W[candidates].argsort()][:256]
-    if not len(candidates):
-        return None
-    (c_low, _), _ = bounded.bounds(points[candidates], points[candidates])
-    candidates = candidates[c_low > 0]
-    if not len(candidates):
-        return None
-    first = candidates[0]
-    return Counterexample(float(points[first, 0]), points[first, 1:].tolist(), float(c[first]), float(W[first]))
-
-
-def _under(found: Counterexample) -> float:
-    return found.height - BELOW * abs(found.height)
-
-
-def _just_below(value: float) -> float:
-    return value - 1e-12 * abs(value)
-
-
 # Least values
 
 
+@dataclass
+class LeastValue(Question):
+    """A lower bound of min f on boxes, on the part with where(t, x) ≤ level."""
+
+    function: Value
+    where: Value
+    bounded: BoundedFunction  # of (f, where)
+    level: float
+    enough: float
+    unit: float
+    tolerance: float
+    best: float = float("inf")  # the least value of f that was seen
+    found: float = float("inf")  # the least bound among boxes that need no more cutting
+
+    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        f, w = self.bounded.forms(boxes.lower, boxes.upper)
+        f_low, w_low = f.interval()[0], w.interval()[0]
+        t, x = boxes.center[:, 0], boxes.center[:, 1:]
+        with torch.no_grad():
+            at, inside = self.function(t, x), self.where(t, x) <= self.level
+        self.best = min(self.best, _least(at[inside]))
+        close = self.best - self.tolerance * max(abs(self.best), self.unit) if self.best < torch.inf else torch.inf
+        possible, done = w_low <= self.level, f_low >= min(close, self.enough)
+        self.found = min(self.found, _least(f_low[possible & done]))
+        boxes, chosen = Boxes(boxes.lower, boxes.upper, f_low), possible & ~done
+        return boxes[chosen], axis_to_cut(self.bounded, f, boxes, chosen)
+
+
+def _least(values: PerBox) -> float:
+    """The least of some numbers that is not nan; ∞ where there is none."""
+    return min([float("inf"), *values.sort().values[:1].tolist()])
+
+
 def minimum(
-    function: Callable[[Tensor, Tensor], Tensor],
-    lower: Tensor,
-    upper: Tensor,
+    function: Value,
+    lower: Corners,
+    upper: Corners,
     budget: Budget,
-    where: Callable[[Tensor, Tensor], Tensor] | None = None,
+    where: Value | None = None,
     level: float = float("inf"),
     enough: float = float("inf"),
     unit: float = 0.0,
     tolerance: float = 1e-3,
 ) -> float:
-    """A lower bound of min f over boxes (boxes, 1 + n), on the part with where(t, x) ≤ level; ∞ where it is empty.
+    """A lower bound of min f over boxes, on the part with where(t, x) ≤ level; ∞ where it is empty.
 
     Boxes are cut until the bound comes within tolerance · max(|min|, unit) of a value of f or reaches what is enough,
     or the budget is spent.
     """
-    sides = lower.amin(0), upper.amax(0)
-    bounded = BoundedFunction(lambda t, x: (function(t, x), (where or function)(t, x)), sides)
-    frontier = Boxes(lower, upper, torch.full((len(lower),), -torch.inf, dtype=torch.float64))
-    best, boxes = torch.inf, 0
-    settled = torch.inf  # the lowest bound among boxes that need no more cutting
-    while len(frontier.key) and not budget.spent(boxes):
-        chunk, rest = frontier.first(budget.chunk)
-        boxes += len(chunk.key)
-        f, w = bounded.forms(chunk.lower, chunk.upper)
-        f_low, w_low = f.interval()[0], w.interval()[0]
-        center = chunk.center
-        with torch.no_grad():
-            at, inside = (
-                function(center[:, 0], center[:, 1:]),
-                (where or function)(center[:, 0], center[:, 1:]) <= level,
-            )
-        best = min([best, *at[inside].sort().values[:1].tolist()])
-        chunk = Boxes(chunk.lower, chunk.upper, f_low)
-        possible = w_low <= level
-        done = f_low >= min(best - tolerance * max(abs(best), unit) if best < torch.inf else torch.inf, enough)
-        settled = min([settled, *f_low[possible & done].sort().values[:1].tolist()])
-        chosen = possible & ~done
-        frontier = rest.joined(chunk[chosen].halves(axis_to_cut(bounded, f, chunk, chosen)))
-    return min(settled, frontier.least)
+    where = where or function
+    bounded = BoundedFunction(lambda t, x: (function(t, x), where(t, x)), (lower.amin(0), upper.amax(0)))
+    question = LeastValue(function, where, bounded, level, enough, unit, tolerance)
+    everything = Boxes(lower, upper, lower.new_full((len(lower),), -torch.inf))
+    left = searched(question, everything, budget).least
+    return min(question.found, left)
 
 
-def share_below(
-    V: Callable[[Tensor, Tensor], Tensor], lower: Tensor, upper: Tensor, level: float, budget: Budget
-) -> float:
-    """A lower bound of the share by volume of a box (1 + n,) on which V ≤ level; axes of no width do not count."""
-    bounded = BoundedFunction(lambda t, x: (V(t, x),), (lower, upper))
-    frontier = Boxes(lower[None], upper[None], torch.zeros(1, dtype=torch.float64))
-    inside, boxes = 0.0, 0
-    while len(frontier.key) and not budget.spent(boxes):
-        chunk, rest = frontier.first(budget.chunk)  # the largest boxes first
-        boxes += len(chunk.key)
-        (form,) = bounded.forms(chunk.lower, chunk.upper)
+# Shares
+
+
+@dataclass
+class ShareBelow(Question):
+    """A lower bound of the share by volume of a box on which V ≤ level."""
+
+    bounded: BoundedFunction  # of V
+    lower: Corner
+    upper: Corner
+    level: float
+    inside: float = 0.0
+
+    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        (form,) = self.bounded.forms(boxes.lower, boxes.upper)
         low, high = form.interval()
-        volume = chunk.volumes(lower, upper)
-        inside += float(volume[high <= level].sum())
-        chosen = (low <= level) & ~(high <= level) & (volume > 1e-7)
-        chunk = Boxes(chunk.lower, chunk.upper, -volume / 2)
-        frontier = rest.joined(chunk[chosen].halves(axis_to_cut(bounded, form, chunk, chosen)))
-    return min(inside, 1.0)
+        volume = boxes.volumes(self.lower, self.upper)
+        self.inside += float(volume[high <= self.level].sum())
+        chosen = (low <= self.level) & ~(high <= self.level) & (volume > 1e-7)
+        boxes = Boxes(boxes.lower, boxes.upper, -volume / 2)  # the largest halves first
+        return boxes[chosen], axis_to_cut(self.bounded, form, boxes, chosen)
 
 
-def faces(lower: Tensor, upper: Tensor, axes: Iterable[int]) -> tuple[Tensor, Tensor]:
-    """The faces of a box (d,) perpendicular to some of its axes, as boxes (2 · axes, d) without width there."""
-    low, high = [], []
-    for axis in axes:
-        for side in (lower, upper):
-            at = torch.arange(len(lower)) == axis
-            low.append(torch.where(at, side, lower))
-            high.append(torch.where(at, side, upper))
-    return torch.stack(low), torch.stack(high)
+def share_below(V: Value, lower: Corner, upper: Corner, level: float, budget: Budget) -> float:
+    """A lower bound of the share by volume of a box on which V ≤ level; axes without width do not count."""
+    bounded = BoundedFunction(lambda t, x: (V(t, x),), (lower, upper))
+    question = ShareBelow(bounded, lower, upper, level)
+    searched(question, single(lower, upper), budget)
+    return min(question.inside, 1.0)

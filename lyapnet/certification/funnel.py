@@ -7,28 +7,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from lyapnet.certification.bounds import BoundedFunction, DecreaseCondition
-from lyapnet.certification.branch_and_bound import (
-    Budget,
-    Counterexample,
-    Progress,
-    faces,
-    find_counterexample,
-    minimum,
-    prove,
-    share_below,
-)
-from lyapnet.certification.branches import JUMPS
-from lyapnet.certification.invariance import unseen_states
-from lyapnet.certification.statistical import Verdict
-from lyapnet.closed_loop import ClosedLoop
+from lyapnet.certification.boxes import faces
+from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.counterexamples import Counterexample, find_counterexample
+from lyapnet.certification.ignorable_states import ignorable_states
+from lyapnet.certification.proof import Progress, bounded_condition, prove
+from lyapnet.certification.verdict import Verdict
 from lyapnet.errors import UsageError
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.branches import JUMPS
+from lyapnet.problem import Problem
+from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
-from lyapnet.types import PerState, Value
+from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
 LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most
+FINISH = 5.0  # seconds, or a fifth of those for the proof, for the share of X₀ and κ
 
 
 @dataclass(frozen=True)
@@ -64,12 +60,12 @@ class SoundClaim:
     boxes: int
     seconds: float
     remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above the funnel
-    undecided: Tensor  # (k, 1 + n), centres (t, x) of boxes that remain
-    left_out: list[int]  # states on which nothing depends: D has no bounds for them, and is drawn at 0
+    undecided: Points  # centres (t, x) of boxes that remain
+    left_out: list[int]  # ignorable states, on which nothing depends: D has no bounds for them, and is drawn at 0
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim that a funnel holds all of X₀."""
+        """On the claim that a funnel holds all of X₀."""
         if self.rho >= self.wanted:
             return "certified"
         found = self.counterexample
@@ -94,8 +90,7 @@ class SoundClaim:
 
 def sound_claim(
     closed_loop: ClosedLoop,
-    initial_states: Box,
-    duration: float,
+    problem: Problem,
     alpha: float = 0.95,
     delta: float = 1e-2,
     states: Box | None = None,
@@ -108,7 +103,7 @@ def sound_claim(
 
     Args:
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
-        duration: T in s.
+        problem: whose X₀, T and goal are meant.
         states: D; by default a box around where samples of V are low enough.
         report, keep: of prove.
 
@@ -117,30 +112,30 @@ def sound_claim(
     """
     started, budget = time.monotonic(), budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
-    left_out = unseen_states(condition.closed_loop)
-    initial_states = _without(initial_states, left_out)
+    duration, goal = problem.horizon.duration, problem.goal.double()
+    left_out = ignorable_states(condition.closed_loop)
+    initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     _require_continuous(condition.V, x_low, x_high)
     levels = Budget(LEVELS, chunk=budget.chunk)  # of its own: what is proved must not depend on how long it may take
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
     if states is None:
-        states = enclosing_box(condition.height, initial_states, duration, wanted)
+        states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
-    needed = _just_above(wanted)
+    needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
-    rim = minimum(condition.height, *faces(*domain, axes), levels, enough=_just_above(needed))
+    rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
     set_up = time.monotonic() - started
     budget = replace(budget, started=time.monotonic())
-    proof = prove(condition, domain, min(needed, _just_below(rim)), budget, False, generator, report, keep)
+    proof = prove(condition, domain, min(needed, just_below(rim)), budget, False, generator, report, keep)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed:  # the proof was about less than what X₀ needs, and so was its search
-        bounded = BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
-        found = find_counterexample(condition, bounded, *domain, needed, generator)
+        found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
-        finish = Budget(max(5.0, 0.2 * budget.seconds), chunk=budget.chunk)
+        finish = Budget(max(FINISH, 0.2 * budget.seconds), chunk=budget.chunk)
         start_low, start_high = _at(0.0, x_low, x_high)
         inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
@@ -150,14 +145,14 @@ def sound_claim(
     )  # fmt: skip
 
 
-def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) -> Box:
+def enclosing_box(W: Value, initial_states: Box, goal: State, duration: float, level: float) -> Box:
     """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
 
     Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
     of what the first gave. No ray is followed further than 30 times the largest component of X₀.
     """
     generator = torch.Generator().manual_seed(0)
-    inner = initial_states.magnitude.double()
+    inner = initial_states.reach_from(goal).double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
     times = torch.linspace(0, duration, 9, dtype=torch.float64)
@@ -167,11 +162,11 @@ def enclosing_box(W: Value, initial_states: Box, duration: float, level: float) 
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
         points = (radii[:, None, None] * rays).clamp(-30 * largest, 30 * largest)
         with torch.no_grad():
-            above = torch.stack([W(t.expand(points.shape[:-1]), points) > level for t in times])
+            above = torch.stack([W(t.expand(points.shape[:-1]), goal + points) > level for t in times])
         below = above.cumsum(1) == 0  # from the goal to the first crossing
         reach = torch.where(below.any(0)[..., None], points.abs(), 0.0).amax((0, 1)).clamp_min(1e-6 * float(largest))
     reach = 1.15 * torch.maximum(reach, inner)
-    return Box(-reach, reach)
+    return Box(goal - reach, goal + reach)
 
 
 def _largest_seen(V: Value, initial_states: Box) -> float:
@@ -193,7 +188,7 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
 
 
-def _require_continuous(V: Value, x_low: Tensor, x_high: Tensor) -> None:
+def _require_continuous(V: Value, x_low: State, x_high: State) -> None:
     """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
     lower, upper = _at(0.0, x_low, x_high)
     jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
@@ -204,8 +199,8 @@ def _require_continuous(V: Value, x_low: Tensor, x_high: Tensor) -> None:
         )
 
 
-def _at(t: float, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-    """The box {t} × [lower, upper] as one of (t, x), (1, 1 + n) each."""
+def _at(t: float, lower: State, upper: State) -> tuple[Corners, Corners]:
+    """The box {t} × [lower, upper] as one of (t, x)."""
     time = torch.tensor([t], dtype=lower.dtype)
     return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
 
@@ -217,7 +212,7 @@ def _without(states: Box, left_out: Sequence[int]) -> Box:
     return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
 
 
-def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequence[int]) -> tuple[Tensor, Tensor]:
+def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequence[int]) -> tuple[Corner, Corner]:
     """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
     if states.dimension != initial_states.dimension:
         raise UsageError(
@@ -233,11 +228,3 @@ def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequenc
         )
     time = torch.tensor([0.0, duration], dtype=torch.float64)
     return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])
-
-
-def _just_above(value: float) -> float:
-    return value + 1e-9 * abs(value)
-
-
-def _just_below(value: float) -> float:
-    return value - 1e-9 * abs(value)

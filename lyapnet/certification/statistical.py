@@ -2,45 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy.special import betaincinv
 from torch import Tensor
 
+from lyapnet.certification.verdict import Verdict
 from lyapnet.errors import DivergenceError
+from lyapnet.problem import Problem
+from lyapnet.programs import EVENTS, Tolerances
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Trajectory
-from lyapnet.sets import Box
 from lyapnet.types import State
-
-Verdict = Literal["certified", "falsified", "unknown"]
-
-EVENTS = ("decrease", "terminal", "cost", "all")  # one that is not asked for counts as success
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """What counts as success of one closed loop from x₀, on the nodes of the horizon:
-
-        decrease:  Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ decrease · V(0, x₀),
-        terminal:  ‖x_N‖ ≤ radius,
-        cost:      J_N(x₀) ≤ (1 + cost) V(0, x₀),
-        all:       the three together.
-
-    Args:
-        radius: in the norm of the state's components, each in its own unit. None, here and for decrease: not asked for.
-    """
-
-    radius: float | None = None
-    decrease: float | None = 1e-2
-    cost: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None and not 0 <= value < float("inf"):
-                raise ValueError(f"Expected tolerance {name} ≥ 0, got {value}; state what counts as success.")
 
 
 @dataclass(frozen=True)
@@ -71,7 +45,7 @@ class SampledClaim:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim that every state of X₀ succeeds."""
+        """On the claim that every state of X₀ succeeds."""
         return "falsified" if len(self.failures) else "unknown"
 
     @property
@@ -97,13 +71,20 @@ class StatisticalClaim(SampledClaim):
         return {e: lower_bound(count, self.samples, self.confidence) for e, count in self.successes.items()}
 
     @property
+    def named_bounds(self) -> dict[str, float]:
+        """The bounds by the names they are printed under: of success, and of each event that is asked for."""
+        bounds = self.lower_bounds
+        single = {f"{event}_lower_bound": bounds[event] for event in self.tolerances.asked}
+        return {"probability_lower_bound": bounds["all"], **single}
+
+    @property
     def probability_lower_bound(self) -> float:
         """The bound for the three events together."""
         return self.lower_bounds["all"]
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim that at least `share` of X₀ succeeds, at this confidence either way."""
+        """On the claim that at least `share` of X₀ succeeds, at this confidence either way."""
         if self.probability_lower_bound >= self.share:
             return "certified"
         failures = len(self.failures)
@@ -114,7 +95,8 @@ def lower_bound(successes: int, samples: int, confidence: float) -> float:
     """The exact one-sided Clopper-Pearson bound of a probability.
 
     It is the p at which so many successes or more have probability 1 − confidence,
-    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1), the regularised incomplete beta function, solved for p.
+    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1), the regularised incomplete beta function, solved for p. (The
+    binomtest of scipy finds the same p by a search for a root.)
 
     Raises:
         ValueError: successes do not lie between 0 and samples, or the confidence not strictly between 0 and 1.
@@ -131,7 +113,7 @@ def lower_bound(successes: int, samples: int, confidence: float) -> float:
 
 def sampled_claim(
     rollout: Callable[[State], Trajectory],
-    initial_states: Box,
+    problem: Problem,
     tolerances: Tolerances,
     samples: int = 100,
     generator: torch.Generator | None = None,
@@ -140,7 +122,8 @@ def sampled_claim(
     """Count successes among fresh states of X₀; K = 100 as in the paper.
 
     Args:
-        rollout: of a control law that a V defines.
+        rollout: under a control law that a V defines.
+        problem: whose X₀ and goal are meant.
         batch: states that are rolled out at once, which bounds the memory.
 
     Raises:
@@ -148,14 +131,14 @@ def sampled_claim(
     """
     if samples < 1 or batch < 1:
         raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
-    x0 = initial_states.sample(samples, generator)
-    held = torch.cat([_events(rollout, part, tolerances) for part in x0.split(batch)])
+    x0 = problem.initial_states.sample(samples, generator)
+    held = torch.cat([_events(rollout, part, tolerances, problem.goal) for part in x0.split(batch)])
     return SampledClaim(x0.cpu(), held, tolerances)
 
 
 def statistical_claim(
     rollout: Callable[[State], Trajectory],
-    initial_states: Box,
+    problem: Problem,
     tolerances: Tolerances,
     samples: int = 10_000,
     confidence: float = 1 - 1e-6,
@@ -172,7 +155,7 @@ def statistical_claim(
         ValueError: as sampled_claim and lower_bound.
     """
     lower_bound(0, samples, confidence)  # refuse before the work
-    sampled = sampled_claim(rollout, initial_states, tolerances, samples, generator, batch)
+    sampled = sampled_claim(rollout, problem, tolerances, samples, generator, batch)
     return StatisticalClaim(**vars(sampled), confidence=confidence, share=share)
 
 
@@ -180,7 +163,7 @@ FEWEST = 16  # states that are counted as failures together where one of them di
 
 
 def _events(
-    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances
+    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, goal: Float[Tensor, " n"]
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
@@ -193,12 +176,12 @@ def _events(
     except DivergenceError:
         if len(x0) <= FEWEST:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
-        return torch.cat([_events(rollout, half, tolerances) for half in x0.tensor_split(2)])
+        return torch.cat([_events(rollout, half, tolerances, goal) for half in x0.tensor_split(2)])
     values = trajectory.require_value()
     decrease = terminal = torch.ones_like(values[0], dtype=torch.bool)
     if tolerances.decrease is not None:
         decrease = satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease)
     if tolerances.radius is not None:
-        terminal = torch.linalg.vector_norm(trajectory.x[-1], dim=-1) <= tolerances.radius
+        terminal = torch.linalg.vector_norm(trajectory.x[-1] - goal, dim=-1) <= tolerances.radius
     single = torch.stack([decrease, terminal, trajectory.cost <= (1 + tolerances.cost) * values[0]], -1)
     return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

@@ -1,5 +1,6 @@
 """What is compared: the schema of conf/compare.yaml, and the jobs that it consists of."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,13 +8,15 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from lyapnet.baselines.rl import VALIDATIONS, Baseline
-from lyapnet.baselines.settings import SETTINGS
-from lyapnet.baselines.tasks import CONTROL_SCALES, BoundedTask, bounded_task
-from lyapnet.build import build_task
+from lyapnet.build import build_problem
+from lyapnet.comparison.baselines.baseline import VALIDATIONS, Baseline
+from lyapnet.comparison.baselines.settings import SETTINGS
+from lyapnet.comparison.reference_problems import CONTROL_SCALES, BoundedProblem, bounded_problem
 from lyapnet.comparison.results import METHODS, OURS, Result
-from lyapnet.config import Config, check_values, checked, load_config, option, read_yaml
+from lyapnet.comparison.workers import Runnable
+from lyapnet.config import Config, load_config
 from lyapnet.errors import UsageError, did_you_mean
+from lyapnet.schema import check_values, checked, option, read_yaml
 
 RESULT = "result.json"  # written last: its presence says that the job is finished
 
@@ -47,7 +50,7 @@ class ComparisonConfig:
     evaluation_states: int = option(
         256, "States of X₀ on which all methods are measured, the same for all.", at_least=1
     )
-    evaluation_seed: int = option(0, "Of their draw.", at_least=0)
+    evaluation_seed: int = option(0, "Seed with which those states are drawn.", at_least=0)
     tasks: dict[str, ComparedTask] = option({}, "What they are compared on, by name.")
 
     @property
@@ -82,13 +85,14 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
 
 
 @dataclass(frozen=True, eq=False)
-class Job:
+class Job(Runnable):
     """A method trained on a task from a seed, in a folder of its own."""
 
     comparison: ComparisonConfig
     task: str
     method: str
     seed: int
+    origin: Sequence[str] = ()  # the command line of its comparison, after lyapnet
 
     @property
     def name(self) -> str:
@@ -97,14 +101,23 @@ class Job:
 
     @property
     def folder(self) -> Path:
-        """Its event files, checkpoints and result."""
+        """Where its checkpoints, curves and result are."""
         return self.comparison.folder / self.name
+
+    @property
+    def command(self) -> list[str]:
+        """What runs this job alone."""
+        return [sys.executable, "-m", "lyapnet", *self.origin, "--job", self.name]
+
+    @property
+    def finished(self) -> bool:
+        """Whether it has left its result."""
+        return (self.folder / RESULT).is_file()
 
     @property
     def result(self) -> Result | None:
         """What it left, if it is finished."""
-        path = self.folder / RESULT
-        return Result.read(path) if path.is_file() else None
+        return Result.read(self.folder / RESULT) if self.finished else None
 
     @property
     def compared(self) -> ComparedTask:
@@ -123,14 +136,14 @@ class Job:
         return load_config(self.compared.config, self.settings)
 
     @property
-    def bounded(self) -> BoundedTask:
+    def bounded(self) -> BoundedProblem:
         """The task with the action box in which every method is measured.
 
         Raises:
             UsageError: no control scale.
         """
         scale = self.compared.control_scale or CONTROL_SCALES.get(self.task)
-        return bounded_task(build_task(self.config), scale)
+        return bounded_problem(build_problem(self.config), scale)
 
     @property
     def baseline(self) -> Baseline:

@@ -8,13 +8,21 @@ from typing import Any
 
 import torch
 
-from lyapnet.baselines.measurement import Measurement
-from lyapnet.run import write_json
-
-__all__ = ["METHODS", "OURS", "Measurement", "Result", "with_cold_compilation", "with_common_optima"]
+from lyapnet.files import write_json
 
 OURS = "lyapnet"
 METHODS = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")  # the order of tables and figures
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One validation during a training."""
+
+    environment_steps: int  # Euler steps of single trajectories so far
+    seconds: float  # CPU time of training so far, compilation included; without validations, figures, checkpoints
+    cost: float  # mean J_N of the validation states
+    cost_ratio: float | None  # to their optimum, where there is an oracle
+    constraint_loss: float | None  # where the program is a lyapnet program
 
 
 @dataclass(frozen=True)

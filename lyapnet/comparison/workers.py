@@ -1,5 +1,6 @@
 """Jobs side by side: in processes of this machine, or on a Ray cluster. Each is a command of its own."""
 
+import contextlib
 import logging
 import os
 import signal
@@ -7,35 +8,74 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any, Generic, TypeVar
 from urllib.parse import urlsplit
 
-from lyapnet.comparison.plan import RESULT, Job
 from lyapnet.errors import UsageError
 
 LOG = "job.log"
 
 
-class Outcome(NamedTuple):
+class Runnable(ABC):
+    """What can be run side by side: a command, the folder that its output goes to, and whether its work is done."""
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """How users tell it from others."""
+
+    @property
+    @abstractmethod
+    def folder(self) -> Path:
+        """Where job.log is."""
+
+    @property
+    @abstractmethod
+    def command(self) -> Sequence[str]:
+        """What does the work, or goes on with it; asked for when the job starts."""
+
+    @property
+    @abstractmethod
+    def finished(self) -> bool:
+        """Whether the work is done; the command's exit status alone does not say so."""
+
+
+J = TypeVar("J", bound=Runnable)
+
+
+@dataclass(frozen=True)
+class Outcome(Generic[J]):
     """How a job ended."""
 
-    job: Job
+    job: J
     seconds: float
     failure: str  # its last words; empty where it came to its end
 
 
-def run_locally(
-    jobs: Sequence[Job], command: Sequence[str], workers: int, begun: Callable[[Job], Any]
-) -> Iterator[Outcome]:
+def run_jobs(
+    jobs: Sequence[J], workers: int, ray: str | None = None, begun: Callable[[J], Any] = lambda job: None
+) -> Iterator[Outcome[J]]:
+    """The outcomes as they come: of `workers` processes at a time, or of the Ray cluster at an address.
+
+    Args:
+        begun: called with each job that starts.
+
+    Raises:
+        UsageError: Ray is not installed, or there is no cluster at the address.
+    """
+    return run_locally(jobs, workers, begun) if ray is None else run_on_ray(jobs, ray, begun)
+
+
+def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> Iterator[Outcome[J]]:
     """The outcomes as they come, of `workers` processes at a time.
 
     Args:
-        command: what runs a job, but for its name.
-        begun: hears of each job that starts.
+        begun: called with each job that starts.
     """
     processes: list[subprocess.Popen] = []
     stopping = threading.Event()
@@ -45,9 +85,9 @@ def run_locally(
         if stopping.is_set():  # while it started
             process.terminate()
 
-    def run(job: Job) -> Outcome:
+    def run(job: J) -> Outcome[J]:
         begun(job)
-        return Outcome(job, *run_process([*command, job.name], job.folder, started=started))
+        return Outcome(job, *run_process(job, started))
 
     pool = ThreadPoolExecutor(workers)
     waiting = {pool.submit(run, job) for job in jobs}
@@ -63,13 +103,12 @@ def run_locally(
         pool.shutdown()
 
 
-def run_on_ray(
-    jobs: Sequence[Job], command: Sequence[str], address: str, begun: Callable[[Job], Any]
-) -> Iterator[Outcome]:
+def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> Iterator[Outcome[J]]:
     """The outcomes as they come, of a Ray cluster whose machines share this folder; a core for each job.
 
     Args:
-        address: of the cluster, as ray.init takes it: auto, local, or ray://host:port.
+        address: where the cluster is, as ray.init takes it: auto, local, or ray://host:port.
+        begun: called with each job that is handed over.
 
     Raises:
         UsageError: Ray is not installed, or there is no cluster at the address.
@@ -85,12 +124,12 @@ def run_on_ray(
     except Exception as error:  # ConnectionError, or one of its many own
         line = " ".join(str(error).split())
         raise UsageError(f"Expected a Ray cluster at {address!r}, got {type(error).__name__}: {line}") from error
-    remote: Any = ray.remote(num_cpus=1, max_retries=0)(run_process)
-    waiting: dict[Any, Job] = {}
+    remote: Any = ray.remote(num_cpus=1, max_retries=0)(_run_in)
+    waiting: dict[Any, J] = {}
     try:
         for job in jobs:
             begun(job)
-            waiting[remote.remote([*command, job.name], job.folder.absolute(), Path.cwd())] = job
+            waiting[remote.remote(job, Path.cwd())] = job
         while waiting:
             (ended, *_), _ = ray.wait(list(waiting))
             job = waiting.pop(ended)
@@ -100,6 +139,12 @@ def run_on_ray(
                 yield Outcome(job, 0.0, " ".join(str(error).split()))
     finally:
         ray.shutdown()
+
+
+def _run_in(job: Runnable, place: Path) -> tuple[float, str]:
+    """run_process in a working directory, in a process that does nothing else."""
+    with contextlib.chdir(place):
+        return run_process(job)
 
 
 def _require_listening(address: str) -> None:
@@ -114,52 +159,20 @@ def _require_listening(address: str) -> None:
             ) from error
 
 
-def run_process(
-    command: Sequence[str],
-    folder: Path,
-    place: Path | None = None,
-    started: Callable[[subprocess.Popen], Any] = lambda process: None,
-) -> tuple[float, str]:
-    """Run a job's command on one thread, its output appended to job.log; seconds, and its last words if it failed.
-
-    Args:
-        folder: of the job, which has a result when it is finished.
-        place: the working directory.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
+def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lambda process: None) -> tuple[float, str]:
+    """Run a job on one thread, its output appended to job.log; seconds, and its last words if it failed."""
+    job.folder.mkdir(parents=True, exist_ok=True)
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    begun, log = time.perf_counter(), folder / LOG
+    begun, log = time.perf_counter(), job.folder / LOG
     with log.open("ab") as output:
         earlier = output.tell()
-        process = subprocess.Popen(command, cwd=place, stdout=output, stderr=output, env={**os.environ, **threads})
+        process = subprocess.Popen(job.command, stdout=output, stderr=output, env={**os.environ, **threads})
         started(process)
         status = process.wait()
     seconds = time.perf_counter() - begun
-    if (folder / RESULT).is_file():
+    if job.finished:
         return seconds, ""
     words = log.read_bytes()[earlier:].decode(errors="replace").strip().splitlines()
     if status < 0:
         return seconds, f"stopped by {signal.Signals(-status).name}"
     return seconds, words[-1] if words else f"stopped with status {status}"
-
-
-def seconds_left(
-    jobs: Sequence[Job], begun: Mapping[Job, float], took: Mapping[Job, float], workers: int
-) -> float | None:
-    """How long the jobs that are not finished will take, from those that are; None while nothing tells.
-
-    A job takes as long as others of its task and method did, or else of its method, or else of any.
-
-    Args:
-        begun: job ↦ how long ago it started.
-        took: finished job ↦ seconds.
-    """
-    if not took:
-        return None
-    left = 0.0
-    for job in jobs:
-        if job not in took:
-            alike = [s for j, s in took.items() if (j.task, j.method) == (job.task, job.method)]
-            alike = alike or [s for j, s in took.items() if j.method == job.method] or list(took.values())
-            left += max(0.0, fmean(alike) - begun.get(job, 0.0))
-    return left / workers

@@ -1,10 +1,9 @@
-"""Networks for V(t, x); a new one is a module that takes `scaling` and options, and one line here.
+"""Networks for V(t, x); a new one is a ValueFunction that takes `scaling` and options, and one line here.
 
 The options are the fields of the config's network section that the constructor names.
 """
 
-from torch import nn
-
+from lyapnet.calculus import ValueFunction
 from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAnchor
 from lyapnet.networks.base import ACTIVATIONS, Scaling
 from lyapnet.networks.fcn import FCN
@@ -12,7 +11,7 @@ from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.networks.ignoring import IgnoringStates
 from lyapnet.networks.quadratic import QuadraticForm
 
-NETWORKS: dict[str, type[nn.Module]] = {
+NETWORKS: dict[str, type[ValueFunction]] = {
     "fcn": FCN,
     "icnn": ICNN,
     "anchored": AnchoredNetwork,

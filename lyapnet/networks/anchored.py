@@ -3,24 +3,23 @@
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lyapnet.calculus import value_and_state_gradient
-from lyapnet.cost import QuadraticCost
-from lyapnet.linear_algebra import apply
+from lyapnet.calculus import ValueFunction
+from lyapnet.cost import Cost
 from lyapnet.networks.base import Scaling
 from lyapnet.networks.icnn import PartiallyConvexNetwork
 from lyapnet.types import PerState, State, Time
 
 
-class TerminalAnchor(nn.Module):
+class TerminalAnchor(ValueFunction):
     """V(t, x) = φ(x) + (1 − t/T) N(t, x), so that V(T, x) = φ(x) for any network N.
 
     Where N is convex in x, so is V; where N(t, 0) = 0, so is V(t, 0). With N ≥ 0, as an AnchoredNetwork is, V ≥ φ at
     every t: an upper bound of the cost-to-go still fits, the cost-to-go itself need not.
     """
 
-    def __init__(self, network: nn.Module, cost: QuadraticCost, duration: float):
+    def __init__(self, network: ValueFunction, cost: Cost, duration: float):
         super().__init__()
         self.network, self.cost, self.duration = network, cost, duration
 
@@ -28,13 +27,13 @@ class TerminalAnchor(nn.Module):
         return self.cost.terminal(x) + (1 - t / self.duration) * self.network(t, x)
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
-        """V and V_x, with φ_x = 2Q_T x."""
+        """V and V_x."""
         remaining = 1 - t / self.duration
-        N, N_x = value_and_state_gradient(self.network, t, x)
-        return self.cost.terminal(x) + remaining * N, 2 * apply(self.cost.Q_T, x) + remaining[..., None] * N_x
+        N, N_x = self.network.value_and_state_gradient(t, x)
+        return self.cost.terminal(x) + remaining * N, self.cost.terminal_gradient(x) + remaining[..., None] * N_x
 
 
-class GoalAnchor(nn.Module):
+class GoalAnchor(ValueFunction):
     """V(t, x) = N(t, x) − N(t, 0) − N_x(t, 0)ᵀx + ε‖x‖²: the Bregman divergence of N from the goal, plus ε‖x‖².
 
     For N convex in x: V is convex in x, V ≥ ε‖x‖², V(t, 0) = 0 and V_x(t, 0) = 0 at every t. This closes the
@@ -45,12 +44,12 @@ class GoalAnchor(nn.Module):
         epsilon: ε > 0, in cost per squared state unit.
     """
 
-    def __init__(self, network: nn.Module, epsilon: float = 1e-3):
+    def __init__(self, network: ValueFunction, epsilon: float = 1e-3):
         super().__init__()
         self.network, self.epsilon = network, epsilon
 
     def forward(self, t: Time, x: State) -> PerState:
-        at_goal = value_and_state_gradient(self.network, t, x.new_zeros(*t.shape, x.shape[-1]))
+        at_goal = self.network.value_and_state_gradient(t, x.new_zeros(*t.shape, x.shape[-1]))
         return self._divergence(self.network(t, x), *at_goal, x)
 
     def _divergence(self, value: PerState, value_at_goal: Tensor, slope_at_goal: Tensor, x: State) -> PerState:
@@ -59,7 +58,7 @@ class GoalAnchor(nn.Module):
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         """V and V_x = N_x(t, x) − N_x(t, 0) + 2εx."""
         joined = _join_goal(t, x)
-        both = value_and_state_gradient(self.network, t, joined)
+        both = self.network.value_and_state_gradient(t, joined)
         (value, value_at_goal), (slope, slope_at_goal) = (_part_goal(y, t, x) for y in both)
         value = self._divergence(value, value_at_goal, slope_at_goal, x)
         return value, slope - slope_at_goal + 2 * self.epsilon * x

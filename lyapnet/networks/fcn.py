@@ -7,11 +7,12 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from lyapnet.calculus import ValueFunction
 from lyapnet.networks.base import InputScaling, Scaling, activation_named, require_widths
 from lyapnet.types import PerState, State, Time
 
 
-class FCN(nn.Module):
+class FCN(ValueFunction):
     """V(t, x) = s · N(τ, ξ), with N a multilayer perceptron and s the scale of V.
 
     Args:

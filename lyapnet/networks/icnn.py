@@ -10,6 +10,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from lyapnet.calculus import ValueFunction
 from lyapnet.networks.base import InputScaling, Scaling, activation_named, require_widths
 from lyapnet.types import PerState, State, Time
 
@@ -30,7 +31,7 @@ class NonNegativeLinear(nn.Module):
         return z @ self.weight.mT
 
 
-class ICNN(nn.Module):
+class ICNN(ValueFunction):
     """V(t, x) = s · N(τ, ξ) + ε‖x‖², with N convex in (t, x) jointly: the paper's Lyapunov network.
 
     z₁ = σ(A₁y + b₁), z_k = σ(W_k z_{k−1} + A_k y + b_k), N = W z_K + Ay + b with y = (τ, ξ), W ≥ 0 and σ convex
@@ -89,7 +90,7 @@ class ICNN(nn.Module):
         return self._value(N, x), slope
 
 
-class PartiallyConvexNetwork(nn.Module):
+class PartiallyConvexNetwork(ValueFunction):
     """N(t, x) convex in x for every t, with free dependence on t.
 
     h = tanh(Cτ + c), z₁ = σ(A₁ξ + B₁h + b₁), z_k = σ(W_k z_{k−1} + A_kξ + B_kh + b_k),

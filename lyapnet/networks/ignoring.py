@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Int
-from torch import Tensor, nn
+from torch import Tensor
 
-from lyapnet.calculus import value_and_state_gradient
+from lyapnet.calculus import ValueFunction
 from lyapnet.types import PerState, State, Time
 
 
-class IgnoringStates(nn.Module):
+class IgnoringStates(ValueFunction):
     """V(t, x) = N(t, x_kept): the same whatever the other states are.
 
     Where neither dynamics nor cost depends on them either, so does the cost-to-go, and nothing is lost.
@@ -23,7 +23,7 @@ class IgnoringStates(nn.Module):
 
     kept: Int[Tensor, " k"]
 
-    def __init__(self, network: nn.Module, kept: Sequence[int], n: int):
+    def __init__(self, network: ValueFunction, kept: Sequence[int], n: int):
         super().__init__()
         self.network, self.n = network, n
         self.register_buffer("kept", torch.tensor(kept, dtype=torch.long), persistent=False)
@@ -33,5 +33,5 @@ class IgnoringStates(nn.Module):
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         """V, and V_x with zeros for the states that are ignored."""
-        value, gradient = value_and_state_gradient(self.network, t, x[..., self.kept])
+        value, gradient = self.network.value_and_state_gradient(t, x[..., self.kept])
         return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)

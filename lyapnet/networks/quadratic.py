@@ -7,12 +7,13 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from lyapnet.calculus import ValueFunction
 from lyapnet.linear_algebra import apply
 from lyapnet.networks.base import InputScaling, Scaling, activation_named, require_widths
 from lyapnet.types import PerState, State, Time
 
 
-class QuadraticForm(nn.Module):
+class QuadraticForm(ValueFunction):
     """V(t, x) = s‖L(τ)ξ‖² + ε‖x‖², with L(τ) (n, n) a multilayer perceptron of time and s the scale of V.
 
     The value functions of linear-quadratic tasks have this form, V = xᵀP(t)x. For any weights V is convex in x,

@@ -3,8 +3,18 @@
 from lyapnet.programs.base import Program, ProgramOutput
 from lyapnet.programs.lyapunov import LyapunovProgram
 from lyapnet.programs.pointwise import PointwiseCondition
+from lyapnet.programs.tolerances import EVENTS, Tolerances
 from lyapnet.programs.value import ValueProgram
 
 PROGRAMS: dict[str, type[Program]] = {"value": ValueProgram, "lyapunov": LyapunovProgram}
 
-__all__ = ["PROGRAMS", "LyapunovProgram", "PointwiseCondition", "Program", "ProgramOutput", "ValueProgram"]
+__all__ = [
+    "EVENTS",
+    "PROGRAMS",
+    "LyapunovProgram",
+    "PointwiseCondition",
+    "Program",
+    "ProgramOutput",
+    "Tolerances",
+    "ValueProgram",
+]

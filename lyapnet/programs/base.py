@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.errors import DivergenceError
+from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
@@ -84,6 +85,30 @@ class Program(ABC):
             terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
+
+    def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
+        """What this program promises of one closed loop, by default: J within 5 % of V(0, x₀), and ‖x(T) − goal‖
+        within a radius, if one is given."""
+        return Tolerances(radius, None, cost)
+
+    def excess(self, rate: Tensor, running: Tensor) -> Tensor:
+        """By how much the condition fails where V changes by `rate` while `running` accrues: V̇ + ℓ, or the same over
+        a step."""
+        return rate + running
+
+    @abstractmethod
+    def penalty(self, excess: Tensor) -> Tensor:
+        """What an excess costs: zero where the condition holds."""
+
+    def check_terminal(self, exact: bool) -> None:  # noqa: B027  (most programs have nothing to refuse)
+        """Refuse weights that do not suit how V ends.
+
+        Args:
+            exact: whether V(T, ·) = φ by construction.
+
+        Raises:
+            ValueError: they do not.
+        """
 
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
         """Each term of `weighted` for each trajectory."""

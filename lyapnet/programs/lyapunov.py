@@ -2,8 +2,13 @@
 
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
+from lyapnet.errors import UsageError
 from lyapnet.programs.base import Program
 from lyapnet.programs.terms import hinge, terminal_hinge
+from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
@@ -35,6 +40,23 @@ class LyapunovProgram(Program):
         if self.bound and not self.bound < self.constraint:
             raise ValueError(
                 f"Expected bound < constraint, got {self.bound} ≥ {self.constraint}; V would sink below the cost."
+            )
+
+    def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
+        """And that V decreases along the closed loop, within 1 % of V(0, x₀)."""
+        return Tolerances(radius, 1e-2, cost)
+
+    def excess(self, rate: Tensor, running: Tensor) -> Tensor:
+        return rate + (1 + self.margin) * running
+
+    def penalty(self, excess: Tensor) -> Tensor:
+        return torch.relu(excess)
+
+    def check_terminal(self, exact: bool) -> None:
+        if not exact and self.bound >= self.terminal and self.bound:
+            raise UsageError(
+                f"Expected program.terminal > program.bound = {self.bound:g}, got {self.terminal:g}; V(T, ·) would "
+                "sink below φ: raise it, or set network.terminal=exact."
             )
 
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:

@@ -5,9 +5,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.calculus import time_derivative
-from lyapnet.closed_loop import ClosedLoop
+from lyapnet.programs.base import Program
+from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
-from lyapnet.types import PerState, State, Time, Value
+from lyapnet.types import PerState, State, Time
 
 FLOOR = 0.01  # of the mean running cost (and of the mean cost, at T): violations below it count as absolute ones
 SURPLUS = 4  # candidates drawn for each point that is used
@@ -28,27 +29,29 @@ class PointwiseCondition:
     ever denser towards T, where V moves fastest; another half is drawn towards the goal, by a factor that is uniform.
 
     Args:
-        closed_loop: with the law of V.
-        V: what is trained.
+        rollout: of the law that V defines.
+        program: whose condition it is.
         region: D.
-        duration: T in s.
+        weight: of the term.
         points: drawn and sought in each step.
-        margin: of a Lyapunov program; None for the value program.
         further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
     """
 
     def __init__(
         self,
-        closed_loop: ClosedLoop,
-        V: Value,
+        rollout: Rollout,
+        program: Program,
         region: Box,
-        duration: float,
-        points: int,
-        margin: float | None,
+        weight: float = 1.0,
+        points: int = 512,
         further: Float[Tensor, "k columns"] | None = None,
     ):
-        self.closed_loop, self.V, self.region, self.duration = closed_loop, V, region, duration
-        self.points, self.margin, self.further = points, margin, further
+        V = rollout.closed_loop.V
+        if V is None:
+            raise ValueError("Expected a control law that a V defines, got another one; use a ValuePolicy.")
+        self.closed_loop, self.V, self.goal = rollout.closed_loop, V, rollout.problem.goal
+        self.program, self.region, self.duration = program, region, rollout.problem.horizon.duration
+        self.weight, self.points, self.further = weight, points, further
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step.
@@ -59,7 +62,7 @@ class PointwiseCondition:
             largest_value: the largest V(0, x₀) among them.
         """
         floor, ceiling = FLOOR * mean_cost.detach(), CEILING * largest_value.detach()
-        t, x = (y.to(mean_cost) for y in self._draw(generator))
+        t, x = (y.to(mean_cost) for y in self.draw(generator))
         with torch.no_grad():
             worst = self._violation(t, x, floor, ceiling).topk(self.points // 2).indices
         t, x = (torch.cat([y[worst], y[: self.points - len(worst)]]) for y in (t, x))
@@ -68,25 +71,24 @@ class PointwiseCondition:
             t, x = torch.cat([t, further[:, 0]]), torch.cat([x, further[:, 1:]])
         return self._violation(t, x, floor, ceiling).mean() + self._end_violation(x, floor, ceiling).mean()
 
-    def _draw(self, generator: torch.Generator) -> tuple[Time, State]:
-        """More points than a step uses."""
+    def draw(self, generator: torch.Generator) -> tuple[Time, State]:
+        """The points of a step before the worst are chosen: SURPLUS times as many as it uses."""
         x = self.region.sample(SURPLUS * self.points, generator)
         share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64)
-        x = x * torch.where(late < 0.5, 1.0, near)[:, None].to(x)
+        goal = self.goal.to(x)
+        x = goal + (x - goal) * torch.where(late < 0.5, 1.0, near)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)
         return self.duration * (1 - before_end), x
 
     def _violation(self, t: Time, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
         u = self.closed_loop.policy(t, x)
         running = self.closed_loop.cost.running(x, u)
-        paid = (1 + (self.margin or 0.0)) * running
-        excess = time_derivative(self.V, self.closed_loop.system, lambda *_: u, t, x) + paid
-        return self._penalty(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
+        excess = self.program.excess(time_derivative(self.V, self.closed_loop.system, t, x, u), running)
+        return self._relative(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
 
     def _end_violation(self, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
         value, cost = self.V(x.new_full(x.shape[:-1], self.duration), x), self.closed_loop.cost.terminal(x)
-        return self._penalty(cost - value, cost + floor) * (value <= ceiling)
+        return self._relative(cost - value, cost + floor) * (value <= ceiling)
 
-    def _penalty(self, excess: PerState, unit: PerState) -> PerState:
-        relative = excess / unit.detach()
-        return relative**2 if self.margin is None else torch.relu(relative)
+    def _relative(self, excess: PerState, unit: PerState) -> PerState:
+        return self.program.penalty(excess / unit.detach())

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from torch import Tensor
+
 from lyapnet.programs.base import Program
 from lyapnet.programs.terms import cost_to_go_error, residual, terminal_residual
 from lyapnet.rollout import Trajectory
@@ -24,6 +26,9 @@ class ValueProgram(Program):
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
         error = cost_to_go_error(values, trajectory.step_cost, trajectory.terminal_cost)
         return {**super().per_state(values, trajectory), "cost_to_go": error}
+
+    def penalty(self, excess: Tensor) -> Tensor:
+        return excess**2
 
     def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return residual(values, trajectory.step_cost)

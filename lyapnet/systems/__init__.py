@@ -2,7 +2,7 @@
 
 from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
 from lyapnet.systems.cartpole import Cartpole
-from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear
+from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
 from lyapnet.systems.reacher import Reacher
 
 SYSTEMS: dict[str, type[ControlAffineSystem]] = {
@@ -22,4 +22,5 @@ __all__ = [
     "Linear",
     "MechanicalSystem",
     "Reacher",
+    "is_linear",
 ]

@@ -13,10 +13,11 @@ from lyapnet.types import Control, ControlMatrix, Coordinates, InputMatrix, Mass
 
 
 class ControlAffineSystem(nn.Module, ABC):
-    """ẋ = f(x) + g(x)u with n states and m controls; the goal of every task is the origin.
+    """ẋ = f(x) + g(x)u with n states and m controls.
 
     A subclass writes f and g with torch operations on tensors of any leading shape, and declares its coordinates.
-    Physical parameters are constructor arguments; they stay Python floats or become buffers.
+    Physical parameters are constructor arguments; they stay Python floats or become buffers. One that has an energy may
+    say so in a method `energy(x)` of shape (*batch,), in J: constant along u = 0 without friction.
     """
 
     state_names: Sequence[str]
@@ -57,11 +58,6 @@ class ControlAffineSystem(nn.Module, ABC):
         """Names with units, as in "force (N)"."""
         return _with_units(self.control_names, self.control_units)
 
-    @property
-    def equilibrium(self) -> Float[Tensor, " n"]:
-        """A state with f = 0: the origin unless a subclass knows another one."""
-        return torch.zeros(self.n)
-
 
 class MechanicalSystem(ControlAffineSystem):
     """M(q)q̈ = Bu + h(q, q̇) − D q̇ with x = (q, q̇): the manipulator equation.
@@ -88,10 +84,6 @@ class MechanicalSystem(ControlAffineSystem):
     @abstractmethod
     def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         """h(q, q̇), (*batch, d): all forces but control and friction, in N or N·m."""
-
-    @abstractmethod
-    def energy(self, x: State) -> PerState:
-        """Kinetic plus potential energy in J; constant along u = 0 without friction."""
 
     def kinetic_energy(self, q: Coordinates, qdot: Coordinates) -> PerState:
         """½ q̇ᵀM(q)q̇ in J."""

@@ -1,6 +1,7 @@
 """Linear systems, the double integrator and its longer kin."""
 
 from collections.abc import Sequence
+from typing import TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -48,6 +49,13 @@ class Linear(ControlAffineSystem):
 
     def dynamics(self, x: State, u: Control) -> State:
         return apply(self.A, x) + apply(self.B, u)
+
+
+def is_linear(system: ControlAffineSystem) -> TypeGuard[Linear]:
+    """Whether a system is Linear, and no subclass gave it another f or g."""
+    return isinstance(system, Linear) and all(
+        getattr(type(system), name) is getattr(Linear, name) for name in ("f", "g", "dynamics")
+    )
 
 
 class DoubleIntegrator(Linear):

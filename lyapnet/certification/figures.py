@@ -1,0 +1,218 @@
+"""Certificates drawn as matplotlib figures: sampled states, and slices of funnels."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from torch import Tensor
+
+from lyapnet.certification import Counterexample, SampledClaim, SoundClaim
+from lyapnet.certification.tables import floored
+from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
+from lyapnet.evaluation.figures import widest_axes
+from lyapnet.sets import Box
+from lyapnet.types import Value
+
+NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
+
+
+# Sampled states
+
+
+def sampled_states(claim: SampledClaim, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
+    """Which sampled states of X₀ succeed, and in what the others fail, in the plane of its two widest components.
+
+    The other components of the states are left out: a projection. With one free component, numbers of states in bins.
+
+    Args:
+        labels: names of the states with their units.
+        headline: what is claimed.
+    """
+    axes_shown = widest_axes(initial_states)
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    panel = figure.subplots()
+    parts = _outcomes(claim)
+    if len(axes_shown) == 1:
+        x = [numpy_of(states[:, axes_shown[0]]) for states, _, _, _ in parts]
+        low, high = (float(side[axes_shown[0]]) for side in (initial_states.lower, initial_states.upper))
+        colours = [colour for _, _, colour, _ in parts]
+        panel.hist(x, 40, range=(low, high) if high > low else None, stacked=True, color=colours)
+        panel.set_ylabel("states")
+    else:
+        size = 2 + 60 / len(claim.states) ** 0.5
+        for states, _, colour, marker in parts:
+            x, y = (numpy_of(states[:, i]) for i in axes_shown)
+            panel.plot(
+                x, y, marker, color=colour, markersize=size if marker == "." else 4, markeredgewidth=0.8,
+                alpha=0.5 if marker == "." else 0.9, rasterized=True,
+            )  # fmt: skip
+        panel.add_patch(_rectangle(initial_states, axes_shown, linewidth=0.8))
+        panel.set_ylabel(labels[axes_shown[1]])
+    panel.set_xlabel(labels[axes_shown[0]])
+    shape = "s" if len(axes_shown) == 1 else None
+    handles = [
+        Line2D([], [], color=colour, marker=shape or marker, linestyle="none", label=f"{name}: {len(states)}")
+        for states, name, colour, marker in parts
+    ]
+    legend_below(figure, handles, columns=2)
+    hidden = [_name(labels[i]) for i in range(len(labels)) if initial_states.widths[i] > 0 and i not in axes_shown]
+    projected = f"\nprojected along {', '.join(hidden)}" if hidden else ""
+    panel.set_title(f"{headline}{projected}", fontsize=8)
+    return figure
+
+
+def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
+    """(states, what became of them, colour, marker), successes first so that failures are drawn over them.
+
+    A state that fails in more than one event counts for the first of them.
+    """
+    decrease, terminal, cost, success = claim.held.unbind(-1)
+    parts, left = [(claim.states[success], "success", SKY, ".")], ~success
+    limits = claim.tolerances
+    failed = (
+        (f"‖x(T)‖ > {limits.radius}", PURPLE, "v"),
+        ("V does not fall", ORANGE, "s"),
+        (f"J > {1 + limits.cost:g} V(0, x₀)", VERMILION, "x"),
+    )
+    for style, held in zip(failed, (terminal, decrease, cost), strict=True):
+        parts.append((claim.states[left & ~held], *style))
+        left = left & held
+    return [part for part in parts if len(part[0])]
+
+
+# Funnels
+
+
+def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[str]) -> Figure:
+    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
+
+    One state is drawn over time; two at five times; more at t = 0 and t = T in slices through the goal, along the pairs
+    of the four widest states of X₀, all other states 0. States that the claim leaves out are not shown.
+
+    Args:
+        V, initial_states, labels: of the states that the claim is about.
+    """
+    seen = [k for k in range(claim.states.dimension) if k not in claim.left_out]
+    dimension = len(seen)
+    pairs = [(seen[0], seen[-1])] if dimension <= 2 else list(combinations(_telling(initial_states, seen), 2))
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    handles: dict[str, Artist] = {}
+    for panel, pair in zip(figure.subplots(rows, columns, squeeze=False).flat, pairs, strict=True):
+        if dimension == 1:
+            _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
+        else:
+            _draw_slice(panel, claim, V, initial_states, labels, pair, handles)
+    legend_below(figure, [*handles.values()], columns=2 if len(pairs) == 1 else 4)
+    amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
+    share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
+    figure.suptitle(f"{claim.verdict}: {share}, α = {claim.alpha:g}, δ = {claim.delta:.3g}", fontsize=9)
+    return figure
+
+
+def _draw_slice(
+    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[str], pair: tuple[int, int],
+    handles: dict[str, Artist],
+) -> None:  # fmt: skip
+    """One slice; what is new in it is added to the handles of the legend."""
+    i, j = pair
+    others = [k for k in range(len(labels)) if k not in (*pair, *claim.left_out)]
+    grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
+    states = initial_states.lower.new_zeros(201, 201, len(labels))
+    states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
+    axes = [numpy_of(axis) for axis in grid]
+    for t, level, colour, name in _levels(claim, fine=not others):
+        with torch.no_grad():
+            excess = numpy_of(V(states.new_tensor(t).expand(201, 201), states) - level).T
+        proved = level <= claim.rho + claim.delta * t
+        _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
+        handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
+    through = bool(((initial_states.lower <= 0) & (initial_states.upper >= 0))[others].all())
+    name = "X₀" if through else "X₀, projected"
+    box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
+    handles.setdefault(name, box)
+    if len(claim.undecided):
+        name = "undecided, some of it" + (" (projected onto the slice)" if others else "")
+        x, y = (numpy_of(claim.undecided[:, 1 + k]) for k in pair)
+        (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
+        handles.setdefault(name, points)
+    if claim.counterexample is not None:
+        _mark(panel, claim.counterexample, claim.states, pair, handles)
+    goal = panel.plot(0, 0, "*", color=GREEN, markersize=6, label="goal", linestyle="none")
+    handles.setdefault("goal", goal[0])
+    panel.set(xlim=axes[0][[0, -1]], ylim=axes[1][[0, -1]], xlabel=labels[i], ylabel=labels[j])
+    if others:
+        panel.set_title(f"slice: {' = '.join(_name(labels[k]) for k in others)} = 0", fontsize=8)
+
+
+def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]]:
+    """(t, level of V(t, ·), colour, name) of what is drawn: the funnel at some times, and the level that is wanted."""
+    times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
+    at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
+    proved = [(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s") for t, colour in at]
+    wanted = (0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved")
+    return (proved if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+def _draw_sublevel(
+    panel: Axes, grid: Sequence[np.ndarray], excess: np.ndarray, colour: str, filled: bool, style: str = "-"
+) -> None:
+    """The set in which the excess is at most 0."""
+    if filled and excess.min() <= 0:
+        panel.contourf(*grid, excess, levels=[excess.min() - 1, 0], colors=[colour], alpha=0.25)
+    if excess.min() < 0 < excess.max():  # else matplotlib warns that there is no line to draw
+        panel.contour(*grid, excess, levels=[0], colors=[colour], linewidths=1.2, linestyles=style)
+
+
+def _draw_over_time(
+    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, label: str, handles: dict[str, Artist]
+) -> None:
+    low, high = float(claim.states.lower[0]), float(claim.states.upper[0])
+    t, x = (torch.linspace(*ends, 201).to(initial_states.lower) for ends in ((0, claim.duration), (low, high)))
+    if claim.volume_share:
+        with torch.no_grad():
+            excess = V(t[None].expand(201, 201), x[:, None, None].expand(201, 201, 1)) - claim.rho - claim.delta * t
+        _draw_sublevel(panel, [numpy_of(t), numpy_of(x)], numpy_of(excess), BLUE, filled=True)
+        handles["funnel"] = Patch(color=BLUE, alpha=0.4, label="V(t, ·) ≤ ρ + δt")
+    ends = [float(initial_states.lower[0]), float(initial_states.upper[0])]
+    handles["X₀"] = panel.plot([0, 0], ends, color="black", linewidth=4, label="X₀", clip_on=False)[0]
+    if (found := claim.counterexample) is not None:
+        name = "condition fails"
+        handles[name] = panel.plot(found.t, found.x[0], "x", color=VERMILION, label=name, linestyle="none")[0]
+    panel.set(xlim=(0, claim.duration), ylim=(low, high), xlabel="time (s)", ylabel=label)
+
+
+def _mark(panel: Axes, found: Counterexample, states: Box, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
+    """The counterexample: filled near the slice, hollow where only its projection lies in it."""
+    widths = states.widths.tolist()
+    near = all(abs(x) <= NEAR * widths[k] for k, x in enumerate(found.x) if k not in pair)
+    name = f"condition fails, t = {found.t:.3g} s" + ("" if near else " (projected onto the slice)")
+    style = {"markerfacecolor": VERMILION if near else "none", "color": VERMILION, "markersize": 6}
+    (point,) = panel.plot(found.x[pair[0]], found.x[pair[1]], "X", label=name, linestyle="none", **style)
+    handles.setdefault(name, point)
+
+
+def _telling(initial_states: Box, seen: Sequence[int]) -> list[int]:
+    """The four widest states of X₀ among some, in their order."""
+    widest = initial_states.widths.argsort(descending=True, stable=True).tolist()
+    return sorted([i for i in widest if i in seen][:4])
+
+
+def _rectangle(box: Box, axes: Sequence[int], **style) -> Rectangle:
+    (left, bottom), (width, height) = (side[list(axes)].tolist() for side in (box.lower, box.widths))
+    return Rectangle(
+        (left, bottom), width, height, fill=False, edgecolor=GREY if "label" not in style else "black", **style
+    )
+
+
+def _name(label: str) -> str:
+    """A label without its unit."""
+    return label.partition(" (")[0]

@@ -1,0 +1,156 @@
+"""Certificates from sampled closed loops: a share of the samples, or a bound of the share of X₀."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+from lyapnet.certification import figures
+from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.statistical import SampledClaim, StatisticalClaim, sampled_claim, statistical_claim
+from lyapnet.certification.tables import floored
+from lyapnet.controller import Controller
+from lyapnet.random_streams import CERTIFICATION, stream
+
+
+class SampledCertificate(Certificate):
+    """The share of some states whose closed loop succeeds."""
+
+    kind: ClassVar[str] = "sampled"
+    picture: ClassVar[str] = "states.png"
+    labels: ClassVar[Mapping[str, str]] = {
+        "samples": "states",
+        "tolerances": "tolerances",
+        "decrease_share": "condition holds along the closed loop",
+        "terminal_share": "‖x(T)‖ within the radius",
+        "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
+        "all_share": "all that is asked for",
+        "confidence": "confidence",
+        "decrease_lower_bound": "condition holds on at least",
+        "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
+        "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
+        "probability_lower_bound": "all that is asked for on at least",
+        "required_share": "share of X₀ that the verdict is about",
+        "failure": "a state that fails",
+    }
+    claim: SampledClaim
+
+    def numbers(self) -> dict[str, Any]:
+        claim = self.claim
+        asked = (*claim.tolerances.asked, "all")
+        return {
+            "samples": claim.samples,
+            **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
+            "tolerances": asdict(claim.tolerances),
+            "failure": claim.failures[0].tolist() if len(claim.failures) else None,
+        }
+
+    def in_words(self) -> str:
+        return (
+            f"Of {self._drawn}, {self.claim.successes['all']} succeed: their closed loops keep the conditions below on "
+            "the nodes of the horizon. About the other states of X₀ this proves nothing."
+        )
+
+    @property
+    def _drawn(self) -> str:
+        return f"{self.claim.samples} states drawn uniformly from X₀ (seed {self.options['seed']})"
+
+    def in_formulas(self) -> list[str]:
+        limits = asdict(self.claim.tolerances)
+        lines = {
+            "decrease": "Σₙ max(Vₙ₊₁ − Vₙ + Δt ℓₙ, 0) ≤ {:g} V(0, x₀)",
+            "radius": "‖x(T)‖ ≤ {:g}",
+            "cost": "J(x₀) ≤ {:g} V(0, x₀)",
+        }
+        numbers = {**limits, "cost": 1 + limits["cost"]}
+        return [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
+
+    def of_the_verdict(self) -> str:
+        why = "one that fails was found" if self.verdict == "falsified" else "no sample fails, which proves nothing"
+        return f"The verdict is on the claim that every state of X₀ succeeds: {why}."
+
+    def figure(self) -> figures.Figure:
+        controller = self.controller
+        return figures.sampled_states(
+            self.claim, controller.initial_states, controller.system.state_labels, self.headline
+        )
+
+    @property
+    def headline(self) -> str:
+        """The claim in the title of its figure."""
+        return f"sampled, {self.verdict}: {self.claim.successes['all']} of {self.claim.samples} states succeed"
+
+
+class StatisticalCertificate(SampledCertificate):
+    """A share of X₀ that succeeds, with a confidence."""
+
+    kind: ClassVar[str] = "statistical"
+    claim: StatisticalClaim
+
+    def numbers(self) -> dict[str, Any]:
+        claim = self.claim
+        bounds = {"confidence": claim.confidence, "required_share": claim.share, **claim.named_bounds}
+        return {**super().numbers(), **bounds}
+
+    def in_words(self) -> str:
+        bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]
+        return (
+            f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop keeps the "
+            "conditions below on the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound of "
+            f"{successes} successes in {self._drawn}. The confidence is over the draw. Like the rollouts the claim "
+            "speaks of this model, this Δt and this integrator."
+        )
+
+    @property
+    def _confidence(self) -> str:
+        return f"1 − {1 - self.claim.confidence:.2g}"
+
+    def in_formulas(self) -> list[str]:
+        bound = floored(self.claim.probability_lower_bound)
+        return [*super().in_formulas(), f"P(x₀ succeeds) ≥ {bound}  for x₀ uniform on X₀"]
+
+    def of_the_verdict(self) -> str:
+        why = {
+            "certified": "the bound is not below it",
+            "falsified": "the share is below it at the same confidence",
+            "unknown": "these samples do not tell",
+        }[self.verdict]
+        return f"The verdict is on the claim that at least {self.claim.share:.6g} of X₀ succeeds: {why}."
+
+    @property
+    def headline(self) -> str:
+        bound = f"at least {floored(self.claim.probability_lower_bound)} of X₀, confidence {self._confidence}"
+        counted = f"{self.claim.successes['all']} of {self.claim.samples} states succeed"
+        return f"statistical, {self.verdict}: {bound}\n{counted}"
+
+
+def sampled_certificate(
+    controller: Controller, samples: int = 100, radius: float | None = None, seed: int = 0
+) -> SampledCertificate:
+    """The sampled claim about a controller.
+
+    Args:
+        radius: of success at T, in the norm of x; not asked for if None.
+    """
+    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
+    claim = sampled_claim(controller.rollout, controller.problem, tolerances, samples, generator)
+    return SampledCertificate(controller, claim, {"samples": samples, "radius": radius, "seed": seed})
+
+
+def statistical_certificate(
+    controller: Controller,
+    samples: int = 10_000,
+    confidence: float = 1 - 1e-6,
+    share: float = 0.99,
+    radius: float | None = None,
+    seed: int = 0,
+) -> StatisticalCertificate:
+    """The statistical claim about a controller.
+
+    Args:
+        share: of X₀, about which the verdict is.
+        radius: of success at T, in the norm of x; not asked for if None.
+    """
+    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
+    claim = statistical_claim(controller.rollout, controller.problem, tolerances, samples, confidence, share, generator)
+    options = {"samples": samples, "confidence": confidence, "share": share, "radius": radius, "seed": seed}
+    return StatisticalCertificate(controller, claim, options)

@@ -1,0 +1,174 @@
+"""Certificates by proof: a funnel, and the cost that it guarantees."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+
+from lyapnet.certification import figures
+from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.funnel import SoundClaim, sound_claim
+from lyapnet.certification.proof import Progress
+from lyapnet.certification.tables import floored
+from lyapnet.controller import Controller
+from lyapnet.errors import OracleError, UsageError
+from lyapnet.evaluation.optimality import ratio_of_means
+from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
+from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.sets import Box
+
+COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
+SEARCHED = 64  # of them, where each optimum is a search
+
+
+class SoundCertificate(Certificate):
+    """A funnel that no closed loop leaves, and its cost."""
+
+    kind: ClassVar[str] = "sound"
+    picture: ClassVar[str] = "funnel.png"
+    labels: ClassVar[Mapping[str, str]] = {
+        "reason": "why",
+        "alpha": "α",
+        "delta": "δ, cost per second",
+        "set": "D",
+        "states_left_out": "states that nothing depends on",
+        "rho_wanted": "ρ for all of X₀",
+        "rho": "largest ρ proved",
+        "volume_share": "share of X₀ in that funnel, at least",
+        "terminal_excess": "κ, cost at T beyond V(T, ·)/α, at most",
+        "guaranteed_cost_ratio": "guaranteed cost there / optimum, ratio of the means",
+        "counterexample": "counterexample of lowest V − δt",
+        "remaining_volume": "share of [0, T] × D undecided",
+        "boxes": "boxes",
+        "seconds": "seconds",
+    }
+    claim: SoundClaim
+
+    def numbers(self) -> dict[str, Any]:
+        claim, names = self.claim, self.controller.system.state_names
+        return {
+            "alpha": claim.alpha, "delta": claim.delta, "duration": claim.duration,
+            "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
+            "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
+            "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
+            "terminal_excess": claim.terminal_excess if claim.volume_share else None, "reason": claim.reason,
+            "guaranteed_cost_ratio": guaranteed_cost_ratio(self.controller, claim), "boxes": claim.boxes,
+            "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
+            "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
+        }  # fmt: skip
+
+    def in_words(self) -> str:
+        claim = self.claim
+        if not claim.volume_share:
+            return "No level ρ was proved: nothing is claimed. The conditions below were sought."
+        return (
+            f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
+            f"model: no closed loop that starts in it leaves the funnel, or D, up to T = {claim.duration:g} s, and its "
+            f"cost is bounded as below. It holds at least {floored(claim.volume_share)} of X₀ by volume."
+        )
+
+    def in_formulas(self) -> list[str]:
+        claim = self.claim
+        # unrounded, as proved
+        alpha, delta, T = (f"{value!r}".removesuffix(".0") for value in (claim.alpha, claim.delta, claim.duration))
+        rho, kappa = (repr(claim.rho), repr(claim.terminal_excess)) if claim.volume_share else ("ρ", "κ")
+        return [
+            f"V_t + V_xᵀ(f + g u) + {alpha} ℓ(x, u) ≤ {delta}  "
+            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t",
+            f"V(t, x(t)) ≤ {rho} + {delta} t  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}",
+            f"J(x₀) ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
+        ]
+
+    def of_the_verdict(self) -> str:
+        found = self.claim.counterexample
+        why = {
+            "certified": "it does",
+            "falsified": "the condition fails inside the funnel that this would take",
+            "unknown": "undecided within the budget",
+        }[self.verdict]
+        x = "" if found is None else f"({', '.join(f'{entry:.6g}' for entry in found.x)})"
+        where = "" if found is None else f" At t = {found.t:.6g} s, x = {x} it fails by {found.condition:.3g}."
+        return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
+
+    def figure(self) -> figures.Figure:
+        controller = self.controller
+        return figures.funnel(self.claim, controller.V, controller.initial_states, controller.system.state_labels)
+
+
+def sound_certificate(
+    controller: Controller,
+    alpha: float = 0.95,
+    delta: float | None = None,
+    set: str | None = None,
+    seconds: float = 60.0,
+    workers: int = 1,
+    keep: str | None = None,
+    seed: int = 0,
+    report: Callable[[Progress], None] | None = None,
+) -> SoundCertificate:
+    """The sound claim about a controller.
+
+    Args:
+        alpha: the share of ℓ that V pays for.
+        delta: slack in cost per second; default_delta if None.
+        set: D, as parse_set reads it; found if None.
+        seconds: when to stop undecided.
+        keep: a file in which an unfinished proof is kept.
+        report: is told how far the proof is.
+    """
+    claim = sound_claim(
+        controller.closed_loop, controller.problem, alpha,
+        default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
+        Budget(seconds, workers=workers), stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
+    )  # fmt: skip
+    options = {
+        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "keep": keep, "seed": seed,
+    }  # fmt: skip
+    return SoundCertificate(controller, claim, options)
+
+
+def default_delta(controller: Controller) -> float:
+    """0.5 % of the mean running cost on X₀ at t = 0, in cost per second."""
+    x0 = controller.initial_states.sample(COMPARED, stream(0, CERTIFICATION))
+    return 0.005 * float(controller.cost.running(x0, controller.policy(0.0, x0)).mean())
+
+
+def parse_set(text: str) -> Box:
+    """The box that "-1:1,-0.7:0.7" names: bounds of each state, in the order of the system.
+
+    Raises:
+        UsageError: it names none.
+    """
+    try:
+        lower, upper = zip(*((float(low), float(high)) for low, high in _pairs(text)), strict=True)
+        return Box(torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64))
+    except ValueError as error:
+        raise UsageError(
+            f"Expected --set as lower:upper for each state, got {text!r}; for example --set=-1.6:1.6,-2.6:2.6."
+        ) from error
+
+
+def _pairs(text: str) -> Sequence[Sequence[str]]:
+    return [part.split(":") for part in text.split(",")]
+
+
+def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim) -> float | None:
+    """Mean guaranteed cost over the mean optimum of the discretised task, on states of X₀ inside the funnel.
+
+    None where there is no funnel or no oracle. A search by IPOPT takes fewer states, and the controller's help.
+    """
+    x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
+    guaranteed = claim.guaranteed_cost(controller.value(0.0, x0).double())
+    x0, guaranteed = x0[guaranteed.isfinite()], guaranteed[guaranteed.isfinite()]
+    if not len(x0):
+        return None
+    try:
+        oracle = oracle_of(controller.problem, controller.method)
+        if not isinstance(oracle, RiccatiOracle):
+            x0, guaranteed = x0[:SEARCHED], guaranteed[:SEARCHED]
+        optima = oracle.solve(x0, controller.rollout(x0).u)
+    except OracleError:
+        return None
+    return ratio_of_means(guaranteed, optima.cost)

@@ -1,0 +1,61 @@
+"""What certificates show in a terminal."""
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+
+@contextmanager
+def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
+    """A bar in a terminal: how much of [0, T] × D a proof has decided. It is told of Progress."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(f"certifying, {kind}", total=None, state="")
+
+        def report(progress: Any) -> None:
+            state = f"{progress.boxes} boxes, {progress.remaining:.2%} of [0, T] × D undecided"
+            bar.update(task, total=1.0, completed=1 - progress.remaining, state=state)
+
+        yield report
+
+
+def certificate_table(title: str, result: Mapping[str, Any], labels: Mapping[str, str]) -> Table:
+    """A claim, its verdict and its numbers."""
+    table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
+    for label, value in certificate_rows(result, labels):
+        table.add_row(label, value)
+    return table
+
+
+def certificate_rows(result: Mapping[str, Any], labels: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What the numbers of a claim are called, and the numbers; without those that are not known."""
+    known = {key: label for key, label in labels.items() if result.get(key) not in (None, [])}
+    return [(label, _shown(key, result[key])) for key, label in known.items()]
+
+
+def _shown(key: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_shown('', entry)}" for name, entry in value.items() if entry is not None)
+    if isinstance(value, str):
+        return value
+    if key == "states_left_out":
+        return ", ".join(value)
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, list):
+        return f"[{', '.join(_shown('', entry) for entry in value)}]"
+    if key == "confidence":
+        return f"1 − {1 - value:.2g}"
+    if key.endswith(("bound", "volume_share")):
+        return floored(value)
+    return f"{value:.3%}" if key.endswith(("share", "volume")) else f"{value:.4g}"
+
+
+def floored(share: float) -> str:
+    """A lower bound of a share in percent, rounded down so that it stays one."""
+    return f"{math.floor(1e5 * share) / 1e3:.3f}%"

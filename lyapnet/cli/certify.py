@@ -1,0 +1,251 @@
+"""lyapnet certify sampled | statistical | sound."""
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from typer.core import TyperGroup, TyperOption
+
+from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+from lyapnet.errors import UsageError
+
+DEFAULT = "statistical"
+
+
+class ByKind(TyperGroup):
+    """A group of commands, one for each kind of claim; what names none of them is for the default one.
+
+    For one version `certify CKPT --kind KIND` is read as `certify KIND CKPT`, with a note.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or (args[0] not in self.commands and args[0] != "--help"):
+            args = self._with_kind(args)
+        return super().parse_args(ctx, args)
+
+    def _with_kind(self, args: list[str]) -> list[str]:
+        kind, others = _without_option("--kind", args)
+        if kind is None:
+            return [DEFAULT, *others]
+        if kind not in self.commands:
+            raise UsageError(f"Expected --kind as one of {', '.join(self.commands)}, got {kind!r}; choose one.")
+        command = shlex.join(["lyapnet", "certify", kind, *others])
+        print(f"note: --kind will be removed in the next version; from now on: {command}", file=sys.stderr)
+        return [kind, *others]
+
+
+def _without_option(name: str, args: list[str]) -> tuple[str | None, list[str]]:
+    """(the last value of an option, the arguments without it)."""
+    value, others, rest = None, [], iter(args)
+    for argument in rest:
+        if argument == name:
+            value = next(rest, "")
+        elif argument.startswith(f"{name}="):
+            value = argument.partition("=")[2]
+        else:
+            others.append(argument)
+    return value, others
+
+
+app = typer.Typer(cls=ByKind)
+
+
+@app.callback()
+def certify() -> None:
+    """Certify a controller: on how much of X₀ it keeps its promises, and how sure that is.
+
+    Verdicts: certified, falsified (with a state), unknown. Without the name of a kind, statistical.
+    """
+
+
+def _number(holds: Callable[[float], bool], expected: str, remedy: str, help: str) -> Any:
+    """A number of which more than its type is expected."""
+
+    def checked(parameter: TyperOption, value: float | None) -> float | None:
+        if value is not None and not holds(value):
+            raise UsageError(f"Expected {parameter.opts[0]} {expected}, got {value:g}; {remedy}.")
+        return value
+
+    return typer.Option(help=help, callback=checked)
+
+
+Radius = Annotated[
+    float | None,
+    _number(
+        lambda r: 0 <= r < math.inf, "≥ 0", "give it in the norm of x",
+        "Success at T needs ‖x(T) − goal‖ within it; not asked for if none.",
+    ),
+]  # fmt: skip
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
+ReportFolder = Annotated[
+    Path | None, typer.Option(help="Write report.md, report.json and the figure there.", metavar="FOLDER")
+]
+
+
+@app.command()
+def sampled(
+    checkpoint: Checkpoint,
+    samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 100,
+    radius: Radius = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+    figure: FigureFile = None,
+    report: ReportFolder = None,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    program: Program = None,
+    debug: Debug = False,
+) -> None:
+    """The share of some states whose closed loop succeeds. It proves no more."""
+    from lyapnet.certification.report import require_writable
+    from lyapnet.certification.sampling_certificates import sampled_certificate
+
+    require_writable(figure, report)
+    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    certificate = sampled_certificate(load_controller(checkpoint, **own), samples, radius, seed)
+    _show(certificate, checkpoint, as_json)
+    _write(certificate, checkpoint, own, as_json, figure, report)
+
+
+@app.command()
+def statistical(
+    checkpoint: Checkpoint,
+    samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 10_000,
+    confidence: Annotated[
+        float,
+        _number(lambda c: 0 < c < 1, "strictly between 0 and 1", "for example 0.999999", "Confidence of the bound."),
+    ] = 1 - 1e-6,
+    share: Annotated[
+        float,
+        _number(lambda p: 0 < p <= 1, "in (0, 1]", "for example 0.99", "Share of X₀ that the verdict is about."),
+    ] = 0.99,
+    radius: Radius = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+    figure: FigureFile = None,
+    report: ReportFolder = None,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    program: Program = None,
+    debug: Debug = False,
+) -> None:
+    """A share of X₀ that succeeds, with a confidence."""
+    from lyapnet.certification.report import require_writable
+    from lyapnet.certification.sampling_certificates import statistical_certificate
+
+    require_writable(figure, report)
+    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    controller = load_controller(checkpoint, **own)
+    certificate = statistical_certificate(controller, samples, confidence, share, radius, seed)
+    _show(certificate, checkpoint, as_json)
+    _write(certificate, checkpoint, own, as_json, figure, report)
+
+
+@app.command()
+def sound(
+    checkpoint: Checkpoint,
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
+    ] = None,
+    alpha: Annotated[
+        float,
+        _number(
+            lambda a: 0 < a <= 1, "in (0, 1]", "V can pay for no more than the whole running cost",
+            "Share of ℓ that V pays for.",
+        ),
+    ] = 0.95,
+    delta: Annotated[
+        float | None,
+        _number(
+            lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second",
+            "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
+        ),
+    ] = None,
+    states: Annotated[
+        str | None, typer.Option("--set", help="The set D, as lower:upper,…; found if none.", metavar="BOX")
+    ] = None,
+    seconds: Annotated[
+        float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
+    ] = 60.0,
+    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
+    keep: Annotated[
+        str | None, typer.Option(help="Keep an unfinished proof there, and go on from it.", metavar="FILE")
+    ] = None,
+    refine: Annotated[
+        int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
+    ] = 0,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+    figure: FigureFile = None,
+    report: ReportFolder = None,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    program: Program = None,
+    debug: Debug = False,
+) -> None:  # fmt: skip
+    """A funnel that no closed loop leaves, and its cost: proved."""
+    if refine and keep is not None:
+        raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
+    if overrides and not refine:
+        raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
+    from lyapnet.certification.report import require_writable
+    from lyapnet.certification.sound_certificate import parse_set, sound_certificate
+    from lyapnet.certification.tables import proof_progress
+
+    if states is not None:
+        parse_set(states)
+    require_writable(figure, report, keep)
+    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    notes = Console(stderr=True, highlight=False)
+
+    def certified(path: Path) -> Any:
+        controller = load_controller(path, **own)
+        with proof_progress(notes, "sound") as progress:
+            certificate = sound_certificate(controller, alpha, delta, states, seconds, workers, keep, seed, progress)
+        _show(certificate, path, as_json)
+        return certificate
+
+    if refine:
+        from lyapnet.training.refinement import refine as train_on
+
+        checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes)
+    else:
+        certificate = certified(checkpoint)
+    _write(certificate, checkpoint, own, as_json, figure, report)
+
+
+def _show(certificate: Any, checkpoint: Path, as_json: bool) -> None:
+    """The certificate as a table, unless JSON is asked for."""
+    from lyapnet.certification.tables import certificate_table
+
+    if not as_json:
+        table = certificate_table(str(checkpoint), certificate.result, certificate.labels)
+        Console(highlight=False).print(table)
+
+
+def _write(
+    certificate: Any, checkpoint: Path, own: dict[str, str | None], as_json: bool, figure: Path | None,
+    report: Path | None,
+) -> None:  # fmt: skip
+    """The certificate as JSON, and its figure and report, where they are asked for."""
+    from lyapnet.certification.report import write_outputs
+
+    if as_json:
+        print(json.dumps(certificate.result, allow_nan=False))
+    command = certificate.command(str(checkpoint), **own)
+    for path in write_outputs(certificate, checkpoint, command, figure, report):
+        Console(stderr=True, highlight=False).print(f"wrote {path}", soft_wrap=True)

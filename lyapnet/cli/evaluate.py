@@ -1,0 +1,75 @@
+"""lyapnet evaluate."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+
+
+def evaluate(
+    checkpoint: Checkpoint,
+    samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 256,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    optimum: Annotated[bool, typer.Option(help="Compare with the optimum, where there is an oracle.")] = True,
+    table: Annotated[Path | None, typer.Option(help="Write a row for each state.", metavar="FILE.csv")] = None,
+    figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
+    disturbed: Annotated[
+        bool, typer.Option("--robustness", help="Also outside X₀, on other plants, under noise, with half the Δt.")
+    ] = False,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    program: Program = None,
+    debug: Debug = False,
+) -> None:
+    """Measure a controller on fresh initial states of X₀.
+
+    The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
+    once for each state: the next evaluation of any controller of the task reads it.
+    """
+    from lyapnet.evaluation.measurement import evaluation
+    from lyapnet.evaluation.robustness import robustness
+    from lyapnet.evaluation.tables import evaluation_table, robustness_table
+
+    controller = load_controller(
+        checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
+    )
+    notes = Console(stderr=True, highlight=False)
+    with notes.status("measuring …") as status:
+        measured = evaluation(
+            controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
+        )
+        result = measured.result()
+        if disturbed:
+            count = min(samples, 64)
+            rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
+            result["robustness"] = [row._asdict() for row in rows]
+    if as_json:
+        print(json.dumps(result))
+    else:
+        Console(highlight=False).print(evaluation_table(str(checkpoint), result))
+        if disturbed:
+            Console(highlight=False).print(robustness_table(result["robustness"], min(samples, 64)))
+    if table is not None:
+        measured.write(table)
+        notes.print(f"wrote {table}", soft_wrap=True)
+    if figures is not None:
+        notes.print(_write_optimality(figures, measured), soft_wrap=True)
+
+
+def _write_optimality(folder: Path, measured: Any) -> str:
+    """Draw cost and V(0, x₀) against the optimum; what there is to say about it."""
+    from lyapnet.evaluation import figures
+
+    if measured.result()["cost_ratio"] is None:
+        return "No figure optimality.png: there is no optimum to draw against."
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "optimality.png"
+    figures.optimality(measured.table).savefig(path, dpi=150)
+    return f"wrote {path}"

@@ -1,0 +1,57 @@
+"""lyapnet train."""
+
+import shlex
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from lyapnet.cli.options import Debug
+from lyapnet.errors import UsageError
+
+
+def train(
+    overrides: Annotated[list[str] | None, typer.Argument(help="Changes to the config, as key.sub=value.")] = None,
+    config: Annotated[Path | None, typer.Option(help="The experiment, a YAML file.")] = None,
+    resume: Annotated[
+        str | None, typer.Option(help="Continue a run: last, or a checkpoint.", metavar="last|PATH")
+    ] = None,
+    finetune: Annotated[Path | None, typer.Option(help="Start a new run from the weights of a checkpoint.")] = None,
+    debug: Debug = False,
+) -> None:
+    """Train one experiment; python train.py is the same command."""
+    from lyapnet.config import load_config
+    from lyapnet.training.experiment import fit  # Lightning takes seconds to import: only where it is needed
+    from lyapnet.training.plan import plan_run
+
+    if config is None:
+        raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
+    console = Console(highlight=False)
+    command = shlex.join(["python", "train.py", "--config", str(config), *(overrides or [])])
+    plan = plan_run(load_config(config, overrides or []), resume, finetune)
+    if plan.finished:
+        console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
+        return
+    result = fit(plan, console, f"{command} --resume last")
+    if result:
+        _print_result(console, plan, result, command)
+
+
+def _print_result(console: Console, plan: Any, result: dict[str, Any], command: str) -> None:
+    from lyapnet.evaluation.tables import evaluation_table, table_over_seeds
+
+    title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
+    console.print(
+        evaluation_table(title, result) if len(members) == 1 else table_over_seeds(f"{title} of each seed", result)
+    )
+    best = members[0].best
+    for what, shown in (
+        ("run", plan.run.folder),
+        ("watch", f"tensorboard --logdir {plan.config.logs}"),
+        ("measure", f"lyapnet evaluate {best}"),
+        ("certify", f"lyapnet certify {best}"),
+        ("fine-tune", f"{command} --finetune {best}"),
+        ("use", f'lyapnet.load("{best}")'),
+    ):
+        console.print(f"{what:<10}{shown}", soft_wrap=True, markup=False)

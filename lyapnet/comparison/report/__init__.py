@@ -1,0 +1,6 @@
+"""The report of a comparison, from whatever results there are: tables, figures, every number, and TensorBoard."""
+
+from lyapnet.comparison.report.details import summary
+from lyapnet.comparison.report.writing import write_report
+
+__all__ = ["summary", "write_report"]

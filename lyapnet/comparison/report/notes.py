@@ -1,0 +1,39 @@
+"""What the numbers of a comparison mean, sentence by sentence, below its tables."""
+
+NOTES = (
+    "Every method is scored by one evaluator on the same evaluation states of X₀, which no training saw, with its "
+    "best checkpoint: a baseline's of least validation cost, ours of least validation loss, in which the cost is a "
+    "term.",
+    "Environment steps are Euler steps of single trajectories: steps times batch. Validations are not counted. A "
+    "baseline's budget is also given as a multiple of our steps in all and to 2 %, and of our seconds in all.",
+    "Seconds are CPU time of training alone, on one thread, which is wall-clock time on a core of its own: "
+    "validations, figures and checkpoints are left out. Compilation is not: every seed of ours is charged with the "
+    "longest that a seed took, although machine code is kept from one to the next.",
+    "Validations: the fewest of any seed. Steps and seconds to 10 % and 2 % are those of a validation, and so upper "
+    "bounds.",
+    "Best validation: of least cost; median over the seeds of its environment steps. At 0 it is the untrained "
+    "network. Of ours it is not what is scored. Last validation: what a training without kept checkpoints would have "
+    "ended with; mean over the seeds. The best of many noisy validations is also a lucky one: on the evaluation "
+    "states it may cost more.",
+    "mean ± std: over the seeds, of their means over the states, with n − 1. IQM: mean of the middle half of all "
+    "seeds × states, with its 95 % percentile bootstrap interval by resampling seeds (2,000 times, generator seed 0); "
+    "of three seeds that is about their range. It leaves out the costliest states of X₀ and so can lie below the mean "
+    "optimum; that of J/J*, state by state, does not. Agarwal et al., NeurIPS 2021.",
+    "cost / J*: mean cost over mean optimum of the states whose optimum is known. The optimum is that of J_N; of the "
+    "sum form it is not computed.",
+    "To 10 % and 2 %: the first validation whose cost on the validation states is within that of their optimum; later "
+    "ones may be worse again. Median over all the seeds, known where more than half of them got there.",
+    "Our convergence: the median over our seeds of the environment steps to 2 %; their mean there may be above. "
+    "There, or where its training ended if that was sooner, a method counts with the least cost / optimum so far of "
+    "each seed's validation states, a baseline also with its next validation; / ours: over ours at the same step. "
+    "Nothing is extrapolated.",
+    "Seconds / ours: a baseline's seconds to 10 % over ours. >: too few of its seeds got there within their budget; "
+    "one that did not counts with all its training, which bounds the factor from below; a bound below 1 says nothing.",
+    "diverged: in some state of so many seeds the closed loop left the finite numbers; inf in the CSV files, ∞ as a "
+    "factor.",
+    "The sum form weighs the running cost 1/Δt times as much as J_N, which every method here minimises: it stands "
+    "beside the paper's numbers and ranks nothing.",
+    "Clipped: share of controls at the bounds of the action box, in the evaluation.",
+    "The paper's rows are those of its Table I (arXiv 2305.15244), their factors computed from its costs. Absolute "
+    "costs do not compare with ours: its model and terminal cost differ where its sources do.",
+)

@@ -1,0 +1,245 @@
+"""Tables drawn as matplotlib figures: what a controller does, and where its condition holds."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+from torch import Tensor
+
+from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.evaluation.states import StateTable
+from lyapnet.problem import Problem
+from lyapnet.programs.terms import hinge, satisfied
+from lyapnet.rollout import Trajectory
+from lyapnet.sets import Box
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.types import State, Value
+
+
+class Slice(NamedTuple):
+    """A grid in X₀ over its widest components, the others at the centre."""
+
+    axes: Sequence[int]  # one or two state indices
+    grid: Sequence[Tensor]  # the coordinates along each axis
+    states: State  # (b, n), the last axis running fastest
+
+
+def widest_slice(initial_states: Box, points: int) -> Slice:
+    """The slice of X₀ through its centre along its two widest components, or its only one that is not fixed."""
+    axes, widths = widest_axes(initial_states), initial_states.widths
+    # midpoints of equal cells, so that a share of cells is a share of X₀
+    middles = (torch.arange(points).to(widths) + 0.5) / points
+    grid = [initial_states.lower[i] + widths[i] * middles for i in axes]
+    mesh = torch.meshgrid(*grid, indexing="ij")
+    states = initial_states.center.repeat(mesh[0].numel(), 1)
+    states[:, axes] = torch.stack([component.flatten() for component in mesh], -1)
+    return Slice(axes, grid, states)
+
+
+def widest_axes(initial_states: Box) -> list[int]:
+    """The two widest components of X₀, or its only one that is not fixed; the first if all are."""
+    widths = initial_states.widths
+    return sorted(int(i) for i in widths.argsort(descending=True, stable=True)[:2] if widths[i] > 0) or [0]
+
+
+def certified_region(rollout: Callable[[State], Trajectory], problem: Problem, tolerance: float = 1e-2) -> Figure:
+    """Which initial states of a slice of X₀ satisfy the Lyapunov condition along their whole closed loop.
+
+    The condition is the paper's, on samples: Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ tolerance · V(0, x₀). Level sets of
+    V(0, ·) and some closed-loop trajectories are drawn over it; with one free component, the sum itself.
+    """
+    system, initial_states = problem.system, problem.initial_states
+    region = widest_slice(initial_states, 41 if _free_components(initial_states) > 1 else 101)
+    with torch.no_grad():
+        trajectory = rollout(region.states)
+    values = trajectory.require_value()
+    violation = hinge(values, trajectory.step_cost)
+    holds = satisfied(violation, values[0], tolerance)
+    share = float(holds.double().mean())
+    figure = Figure(figsize=(5.6, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(
+        f"holds on {share:.1%} of {len(holds)} states: Σₙ max(ΔVₙ + Δt ℓₙ, 0) ≤ {tolerance:.0%} of V(0, x₀)",
+        fontsize=8,
+    )
+    if len(region.axes) == 1:
+        _draw_line_region(figure, axes, region, system, violation, values[0], tolerance)
+    else:
+        _draw_plane_region(figure, axes, region, problem, holds, values[0], trajectory)
+    return figure
+
+
+def _draw_plane_region(
+    figure: Figure,
+    axes: Axes,
+    region: Slice,
+    problem: Problem,
+    holds: Tensor,
+    V0: Tensor,
+    trajectory: Trajectory,
+) -> None:
+    system, initial_states = problem.system, problem.initial_states
+    first, second = (numpy_of(g) for g in region.grid)
+    shape = (len(first), len(second))
+    levels = ["#E8A06A", "#CFE6F3"]  # they also differ as greys
+    axes.pcolormesh(
+        first, second, numpy_of(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
+        shading="nearest", rasterized=True,
+    )  # fmt: skip
+    contour = axes.contour(first, second, numpy_of(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
+    axes.clabel(contour, fontsize=7, fmt="%.3g")
+    i, j = region.axes
+    corners = _spread(region)
+    paths = numpy_of(trajectory.x[:, corners])
+    axes.plot(paths[..., i], paths[..., j], color=BLUE, linewidth=1)
+    axes.plot(paths[0, :, i], paths[0, :, j], "o", color=BLUE, markersize=3)
+    axes.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10)
+    (left, bottom), (width, height) = (
+        side[region.axes].tolist() for side in (initial_states.lower, initial_states.widths)
+    )
+    outline = axes.add_patch(
+        Rectangle((left, bottom), width, height, fill=False, edgecolor="black", linewidth=0.8, label="X₀")
+    )
+    axes.set_xlabel(system.state_labels[i])
+    axes.set_ylabel(system.state_labels[j])
+    axes.set_title(_others_at_center(system, initial_states, region.axes), fontsize=7, loc="right", y=-0.16, color=GREY)
+    handles: list[Artist] = [
+        outline,
+        Patch(color=levels[1], label="holds"),
+        Patch(color=levels[0], label="does not hold"),
+    ]
+    handles += axes.plot([], [], color=GREY, linewidth=0.8, label="level sets of V(0, x)")
+    handles += axes.plot([], [], color=BLUE, linewidth=1, label="closed loop")
+    handles += axes.plot([], [], "*", color=VERMILION, label="goal")
+    legend_below(figure, handles, columns=6)
+
+
+def _draw_line_region(
+    figure: Figure,
+    axes: Axes,
+    region: Slice,
+    system: ControlAffineSystem,
+    violation: Tensor,
+    V0: Tensor,
+    tolerance: float,
+) -> None:
+    x = numpy_of(region.grid[0])
+    relative = torch.where(V0 > 0, violation / V0, torch.inf)
+    axes.semilogy(x, np.clip(numpy_of(relative), 1e-9, 1e9), color=BLUE, label="summed violation / V(0, x₀)")
+    axes.axhline(tolerance, color=VERMILION, linestyle="--", linewidth=1, label="tolerance")
+    axes.set_xlabel(system.state_labels[region.axes[0]])
+    axes.set_ylabel("summed violation / V(0, x₀)", color=BLUE)
+    twin = axes.twinx()
+    twin.plot(x, numpy_of(V0), color=ORANGE, linestyle="-.", label="V(0, x₀)")
+    twin.set_ylabel("V(0, x₀) (cost)", color=ORANGE)
+    legend_below(figure, [*axes.get_legend_handles_labels()[0], *twin.get_legend_handles_labels()[0]], columns=3)
+
+
+def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
+    """States, controls, and V with the cost still to come, over time, of a batch (b,) of closed loops."""
+    to_go = trajectory.cost - trajectory.running_cost
+    t = numpy_of(trajectory.t)
+    curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
+    curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
+    columns = 1 if len(curves) < 4 else 2
+    rows = -(-(len(curves) + 1) // columns)
+    figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
+    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    panels = list(grid.flatten(order="F"))
+    for panel, (label, values_over_time, color) in zip(panels, curves, strict=False):
+        panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
+        panel.axhline(0, color=GREY, linewidth=0.6, linestyle=":")
+        panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
+    last = panels[len(curves)]
+    for name, paths, style in (
+        ("cost to go", to_go, {"color": ORANGE}),
+        ("V(t, x)", trajectory.require_value(), {"color": BLUE, "ls": "--"}),
+    ):
+        lines = last.plot(t, numpy_of(paths), linewidth=0.9, **style)
+        lines[0].set_label(name)
+    last.set_ylabel("cost", fontsize=8)
+    last.legend(fontsize=7, frameon=False)
+    for spare in panels[len(curves) + 1 :]:
+        spare.set_visible(False)
+    for panel in panels:
+        panel.tick_params(labelsize=7)
+    for column in grid.T:
+        lowest = [panel for panel in column if panel.get_visible()][-1]
+        lowest.set_xlabel("time (s)", fontsize=8)
+        lowest.tick_params(labelbottom=True)
+    return figure
+
+
+def value_slices(V: Value, problem: Problem) -> Figure:
+    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon."""
+    system, initial_states, duration = problem.system, problem.initial_states, problem.horizon.duration
+    region = widest_slice(initial_states, 61)
+    times = [0.0, duration / 2, 0.95 * duration]
+    with torch.no_grad():
+        values = [V(torch.tensor(t).to(region.states), region.states) for t in times]
+    figure = Figure(figsize=(9, 3.1), layout="constrained")
+    if len(region.axes) == 1:
+        axes = figure.subplots()
+        for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN), strict=True):
+            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=f"t = {t:.2f} s")
+        axes.set_xlabel(system.state_labels[region.axes[0]])
+        axes.set_ylabel("V(t, x) (cost)")
+        axes.legend(frameon=False)
+        return figure
+    first, second = (numpy_of(g) for g in region.grid)
+    panels = figure.subplots(1, 3, sharey=True)
+    for panel, t, value in zip(panels, times, values, strict=True):
+        surface = numpy_of(value).reshape(len(first), len(second)).T
+        filled = panel.contourf(first, second, surface, levels=12, cmap="cividis")
+        figure.colorbar(filled, ax=panel)
+        panel.set_title(f"V(t, x) at t = {t:.2f} s", fontsize=9)
+        panel.set_xlabel(system.state_labels[region.axes[0]])
+    panels[0].set_ylabel(system.state_labels[region.axes[1]])
+    return figure
+
+
+def optimality(table: StateTable) -> Figure:
+    """Cost and V(0, x₀) of each initial state against its optimum; on the line, they are the optimum."""
+    assert table.optimal_cost is not None
+    known = torch.isfinite(table.optimal_cost)
+    optimal = numpy_of(table.optimal_cost[known])
+    figure = Figure(figsize=(8.6, 4.3), layout="constrained")
+    panels = figure.subplots(1, 2)
+    measured = (("J(x₀), closed loop (cost)", table.cost, BLUE, "o"), ("V(0, x₀) (cost)", table.value, VERMILION, "^"))
+    for panel, (label, values, color, marker) in zip(panels, measured, strict=True):
+        y = numpy_of(values[known])
+        ends = [min(optimal.min(), y.min()), max(optimal.max(), y.max())]
+        panel.plot(ends, ends, color=GREY, linewidth=0.9, label="equal to the optimum")
+        panel.plot(optimal, y, marker, color=color, markersize=3.5, alpha=0.6, label="an initial state")
+        panel.set_xlabel("optimum J*(x₀) (cost)")
+        panel.set_ylabel(label)
+        panel.grid(color=GREY, alpha=0.25, linewidth=0.5)
+        panel.legend(frameon=False, fontsize=8)
+    left_out = f", {len(known) - len(optimal)} without optimum left out" if len(optimal) < len(known) else ""
+    summary = table.against_optimum()
+    panels[0].set_title(f"cost / optimum, ratio of the means: {summary['cost_ratio']:.4f}", fontsize=9)
+    panels[1].set_title(f"mean |V(0, x₀) − J*| / mean J*: {summary['value_error']:.1%}", fontsize=9)
+    figure.suptitle(f"{len(optimal)} initial states{left_out}", fontsize=9)
+    return figure
+
+
+def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Sequence[int]) -> str:
+    center = initial_states.center.tolist()
+    return ", ".join(f"{system.state_names[i]} = {center[i]:.3g}" for i in range(system.n) if i not in axes)
+
+
+def _spread(region: Slice) -> list[int]:
+    """Flat indices of a few states along the slice's border and middle."""
+    a, b = (len(g) - 1 for g in region.grid)
+    places = [(0, 0), (0, b), (a, 0), (a, b), (0, b // 2), (a, b // 2), (a // 2, 0), (a // 2, b)]
+    return [i * (b + 1) + j for i, j in places]
+
+
+def _free_components(box: Box) -> int:
+    return int((box.widths > 0).sum())

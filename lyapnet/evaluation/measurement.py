@@ -1,0 +1,116 @@
+"""Measurements of a controller, one number for each initial state, and their summary."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from lyapnet.controller import Controller
+from lyapnet.errors import OracleError
+from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
+from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.random_streams import TEST, stream
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.tables import csv_text
+from lyapnet.types import ControlPath, State
+
+PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
+
+
+class Evaluation(NamedTuple):
+    """What a controller does from fresh states of X₀."""
+
+    table: StateTable
+    paper: StateTable  # K = 100 further states
+    notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
+    seed: int
+    system: ControlAffineSystem
+
+    def result(self) -> dict[str, Any]:
+        """The summary, as `lyapnet evaluate --json` prints it.
+
+        Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
+        """
+        paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
+        terminal = dict(zip(self.system.state_labels, self.table.terminal_state.abs().mean(0).tolist(), strict=True))
+        counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
+        return {**self.table.summary(), **paper, "terminal_errors": terminal, **counts, **self._note()}
+
+    def write(self, path: Path) -> None:
+        """The table as comma-separated values with a line of names and units.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        table, states = self.table, self.system.state_labels
+        optimal = torch.full_like(table.cost, torch.nan) if table.optimal_cost is None else table.optimal_cost
+        columns = {
+            **dict(zip(states, table.x0.unbind(-1), strict=True)),
+            "cost": table.cost, "optimal_cost": optimal, "cost_ratio": table.cost / optimal, "value": table.value,
+            "value_error": (table.value - optimal) / optimal, "constraint_loss": table.constraint_loss,
+            "hinge": table.hinge, "decreasing": table.decreasing.int(), "terminal_error": table.terminal_error,
+            **{f"terminal {name}": x for name, x in zip(states, table.terminal_state.unbind(-1), strict=True)},
+        }  # fmt: skip
+        values = zip(*(column.tolist() for column in columns.values()), self.notes, strict=True)
+        rows = [dict(zip([*columns, "no_optimum"], row, strict=True)) for row in values]
+        path.write_text(csv_text(rows), encoding="utf-8")
+
+    def _note(self) -> dict[str, str]:
+        missing = [note for note in self.notes if note]
+        if not missing:
+            return {}
+        if len(set(missing)) == 1 and len(missing) == len(self.notes):
+            return {"no_optimum": missing[0]}
+        return {
+            "no_optimum": f"{len(missing)} of {len(self.notes)} states have no optimum and are left out: {missing[0]}"
+        }
+
+
+def evaluate(
+    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+) -> dict[str, Any]:
+    """The summary of a controller on fresh states of X₀; see Evaluation.result.
+
+    Raises:
+        ValueError: fewer than one sample.
+        DivergenceError: the closed loop leaves the finite numbers.
+    """
+    return evaluation(controller, samples, seed, optimum, progress).result()
+
+
+def evaluation(
+    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+) -> Evaluation:
+    """The measurements of a controller on fresh states of X₀, as many as `samples`, and on K = 100 further ones.
+
+    Args:
+        optimum: whether the first ones are compared with the optimum, where there is an oracle.
+        progress: of the oracle.
+
+    Raises:
+        ValueError: fewer than one sample.
+        DivergenceError: the closed loop leaves the finite numbers.
+    """
+    if samples < 1:
+        raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
+    trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
+    with torch.no_grad():
+        table = measure(controller.problem, controller.program, trajectory)
+    first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
+    if not optimum:
+        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.system)
+    try:
+        optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
+    except OracleError as reason:
+        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.system)
+    return Evaluation(
+        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.system
+    )
+
+
+def _optima(controller: Controller, x0: State, known: ControlPath, progress: Report) -> Optima:
+    """The optima from the states of X₀; the controller's own controls are starts of the oracle."""
+    oracle = oracle_of(controller.problem, controller.method)
+    return oracle.solve(x0, known, progress)

@@ -1,0 +1,74 @@
+"""Ground truth: optima known by another route than learning. Never used in training."""
+
+import importlib.util
+
+from lyapnet.cost import QuadraticCost
+from lyapnet.errors import OracleError
+from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.evaluation.oracles.riccati import (
+    RiccatiOracle,
+    RiccatiSolution,
+    continuous_riccati,
+    discrete_riccati,
+)
+from lyapnet.problem import Problem
+from lyapnet.systems import is_linear
+
+__all__ = [
+    "Optima",
+    "Oracle",
+    "Report",
+    "RiccatiOracle",
+    "RiccatiSolution",
+    "continuous_riccati",
+    "discrete_riccati",
+    "optimal_cost",
+    "oracle_of",
+    "silent",
+]
+
+
+def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
+    """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
+
+    With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear` and
+    R a matrix, else by direct transcription. With any other integrator it is that of the continuous task, by the
+    Riccati equation alone.
+
+    Raises:
+        OracleError: there is none; says why, and what to do.
+        ValueError: a weight of the cost does not fit the system's dimensions.
+    """
+    if problem.controls.limited:
+        raise OracleError(
+            f"Expected controls without limits for an optimum, got {type(problem.controls).__name__}; costs stand "
+            "alone."
+        )
+    system, cost, horizon = problem.system, problem.cost, problem.horizon
+    if is_linear(system) and isinstance(cost, QuadraticCost) and cost.R_constant is not None:
+        solve = discrete_riccati if method == "euler" else continuous_riccati
+        return RiccatiOracle(solve(system, cost, horizon))
+    if method != "euler":
+        raise OracleError(
+            f"Expected rollout.method=euler for the optimum of a nonlinear task, got {method}; the transcription has "
+            "Euler's steps."
+        )
+    if importlib.util.find_spec("casadi") is None:
+        raise OracleError(
+            "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."
+        )
+    from lyapnet.evaluation.oracles.transcription import Transcription  # needs the extra
+
+    return Transcription(problem)
+
+
+def optimal_cost(problem: Problem, method: str = "euler") -> Oracle | None:
+    """The oracle of a task, or None where there is none.
+
+    Raises:
+        ValueError: a weight of the cost does not fit the system's dimensions.
+    """
+    try:
+        return oracle_of(problem, method)
+    except OracleError:
+        return None

@@ -1,0 +1,64 @@
+"""Optimal controls kept on disk from run to run: one small file for each task and initial state."""
+
+import contextlib
+import hashlib
+import io
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.fx import GraphModule
+
+from lyapnet.files import write_atomically
+from lyapnet.graphs.compilation import cache_folder, constants_of
+from lyapnet.sets import ControlSet
+from lyapnet.types import Control
+
+
+class OptimaCache:
+    """(task, x₀) ↦ the best controls found so far, (N, m).
+
+    A task is what its trace says: the operations and constants of dynamics, cost and Δt, N, and the control set. What
+    cannot be read is not there; what cannot be written is not kept.
+    """
+
+    def __init__(self, graphs: Sequence[GraphModule], steps: int, m: int, controls: ControlSet):
+        parts: list[Any] = [(graph.code, constants_of(graph)) for graph in graphs]
+        facts = [(name, buffer.tolist()) for name, buffer in controls.named_buffers()]
+        parts.append((f"{type(controls).__module__}:{type(controls).__qualname__}", facts))
+        self.shape = steps, m
+        self.folder = cache_folder() / "optima" / _hash(repr([self.shape, *parts]).encode())
+
+    def read(self, x0: Tensor) -> Tensor | None:
+        """The controls kept for a state (n,)."""
+        try:
+            # the archive's checksums tell a damaged file
+            with np.load(io.BytesIO(self._file(x0).read_bytes()), allow_pickle=False) as entries:
+                u = torch.from_numpy(entries["u"])
+        except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile):
+            return None
+        fits = u.dtype == torch.float64 and u.shape == self.shape and bool(torch.isfinite(u).all())
+        return u if fits else None
+
+    def write(self, x0: Tensor, u: Control) -> None:
+        """Keep the controls of a state (n,), in place of what was kept."""
+        content = io.BytesIO()
+        np.savez(content, u=u.numpy())
+        with contextlib.suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with tempfile.TemporaryDirectory(dir=self.folder, prefix=".new_") as draft:  # of this process alone
+                path = Path(draft) / "optimum"
+                write_atomically(path, content.getvalue())
+                path.replace(self._file(x0))
+
+    def _file(self, x0: Tensor) -> Path:
+        return self.folder / f"{_hash(x0.numpy().tobytes())}.npz"
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:32]

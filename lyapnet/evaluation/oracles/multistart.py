@@ -1,0 +1,87 @@
+"""Local minima of one problem for each initial state, each from several starts and from its neighbours' ends."""
+
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lyapnet.evaluation.oracles.base import Report
+
+NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
+SAME = 1e-6  # relative difference of two costs that are the same
+
+
+class Candidate(NamedTuple):
+    """A trajectory from an initial state: a start, or the local minimum that one led to."""
+
+    x: np.ndarray  # (N, n), from x₁ on
+    u: np.ndarray  # (N, m)
+    cost: float
+
+
+def is_better(one: Candidate | None, other: Candidate | None) -> bool:
+    """Whether one costs less than the other, by more than rounding; anything is better than none."""
+    if one is None or other is None:
+        return one is not None
+    return one.cost < other.cost - SAME * abs(other.cost)
+
+
+class MultiStart:
+    """The best candidate of each initial state, improved start by start.
+
+    Which local minimum a start leads to is luck, but the least cost is continuous in x₀: what was found from one state
+    is tried from the states around it, and from theirs, as long as that improves any.
+
+    Args:
+        x0: (b, n).
+        best: what is known already, one entry for each state.
+        minimise: (x₀, start) ↦ the local minimum, or why there is none.
+    """
+
+    def __init__(
+        self,
+        x0: np.ndarray,
+        best: Sequence[Candidate | None],
+        minimise: Callable[[np.ndarray, Candidate], Candidate | str],
+    ):
+        self.x0, self.best, self.minimise = x0, list(best), minimise
+        self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
+
+    def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
+        """Try the starts of some states, given by their indices, then what that found from the states around."""
+        for done, (i, own) in enumerate(starts.items()):
+            progress(done, len(starts))
+            for start in own:
+                self._try(i, start)
+        nearest = [self._nearest(i) for i in range(len(self.x0))]
+        followers = defaultdict(list)
+        for i, neighbours in enumerate(nearest):
+            for j in neighbours:
+                followers[j].append(i)
+        pairs = deque((i, j) for i in starts for j in nearest[i])
+        while pairs:
+            i, j = pairs.popleft()
+            if self._try(i, self.best[j]):
+                pairs.extend((k, i) for k in followers[i])
+        progress(len(starts), len(starts))
+
+    def _try(self, i: int, start: Candidate | None) -> bool:
+        """Whether a start improves a state's best."""
+        if start is None:
+            return False
+        end = self.minimise(self.x0[i], start)
+        if isinstance(end, str):
+            self.reasons[i] = end
+            return False
+        improved = is_better(end, self.best[i])
+        if improved:
+            self.best[i] = end
+        return improved
+
+    def _nearest(self, i: int) -> list[int]:
+        """The nearest other states, nearest first, each component measured against its spread in the batch."""
+        spread = np.ptp(self.x0, axis=0)
+        distance = (((self.x0 - self.x0[i]) / np.where(spread > 0, spread, 1)) ** 2).sum(1)
+        distance[i] = np.inf
+        return [int(j) for j in np.argsort(distance, kind="stable")[: min(NEIGHBOURS, len(distance) - 1)]]

@@ -1,0 +1,164 @@
+"""The optimum of any task by direct transcription: all states and controls at once, by CasADi and IPOPT.
+
+Ground truth for tests and tables, never used in training. The model is the torch system itself, read by `symbolic`.
+"""
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+
+import casadi
+import numpy as np
+import torch
+from torch import Tensor
+
+from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.evaluation.oracles.cache import OptimaCache
+from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
+from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.problem import Problem
+from lyapnet.types import Control, ControlPath, PerState, State, StatePath
+
+RANDOM_STARTS = 2  # for each initial state
+AT_LEAST = 8  # random starts in all, however few states
+
+
+class Transcription(Oracle):
+    """min over x₁ … x_N, u₀ … u_{N−1} of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu).
+
+    The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
+    the goal, random curves, the controls that the caller knows, and the optima of its neighbours in the batch. The
+    least cost counts, as a rollout of its controls in torch has it, and is kept on disk. What no start leads to, or
+    the rollout does not confirm, is NaN.
+
+    Args:
+        problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
+        iterations: of IPOPT from one start, at most.
+
+    Raises:
+        OracleError: dynamics or cost are not in torch operations that CasADi has too.
+
+    Source: Betts, Practical Methods for Optimal Control Using Nonlinear Programming, ch. 4; Wächter, Biegler, "On the
+    implementation of an interior-point filter line-search algorithm", Mathematical Programming 2006 (IPOPT).
+    """
+
+    def __init__(self, problem: Problem, iterations: int = 500):
+        self.problem = copy.deepcopy(problem).double().cpu()
+        system, horizon = self.problem.system, self.problem.horizon
+        x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
+        graphs = traced(self.step, (x, u)), traced(self.end, (x,))
+        step, end = symbolic(graphs[0], (x, u)), symbolic(graphs[1], (x,))
+        require_equal(step, self.step, (x, u))
+        require_equal(end, self.end, (x,))
+        self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
+        self._solver = _solver(step, end, horizon.steps, iterations)
+
+    def step(self, x: State, u: Control) -> tuple[State, PerState]:
+        """(x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
+        problem, dt = self.problem, self.problem.horizon.dt
+        return x + dt * problem.system.dynamics(x, u), dt * problem.cost.running(x, u)
+
+    def end(self, x: State) -> tuple[PerState]:
+        """(φ(x_N),)."""
+        return (self.problem.cost.terminal(x),)
+
+    def rollout(self, x0: State, u: ControlPath) -> tuple[StatePath, PerState]:
+        """(x, J_N) under given controls, by the torch system."""
+        x, J = [x0], torch.zeros_like(x0[..., 0])
+        for control in u:
+            following, step_cost = self.step(x[-1], control)
+            x, J = [*x, following], J + step_cost
+        return torch.stack(x), J + self.end(x[-1])[0]
+
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+        """The optima of a batch (b, n): from disk, unless `known` controls cost less than those."""
+        states = x0.detach().double().cpu()
+        nothing: list[Tensor | None] = [None] * len(states)
+        stored = self._replayed(states, [self.cache.read(x) for x in states])
+        given = self._replayed(states, nothing if known is None else known.detach().double().cpu().unbind(1))
+        search = MultiStart(states.numpy(), stored, self.minimise)
+        pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
+        if pending:
+            search.run(dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
+        optima = self._verified(states, search, given)
+        for i, best in enumerate(search.best):
+            if best is not None and best is not stored[i] and not optima.reasons[i]:
+                self.cache.write(states[i], torch.from_numpy(best.u))
+        return Optima(optima.cost.to(x0), optima.reasons, None if optima.u is None else optima.u.to(x0))
+
+    def _replayed(self, states: Tensor, controls: Sequence[Tensor | None]) -> list[Candidate | None]:
+        """The trajectories of the controls that there are, and that keep the state finite."""
+        candidates: list[Candidate | None] = [None] * len(states)
+        some = [i for i, u in enumerate(controls) if u is not None]
+        if some:
+            u = torch.stack([controls[i] for i in some], 1)  # pyright: ignore[reportArgumentType]
+            with torch.no_grad():
+                x, J = self.rollout(states[some], u)
+            for i, path, control, cost in zip(some, x.unbind(1), u.unbind(1), J.tolist(), strict=True):
+                if math.isfinite(cost) and torch.isfinite(path).all():
+                    candidates[i] = Candidate(path[1:].numpy(), control.numpy(), cost)
+        return candidates
+
+    def _starts(
+        self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None]
+    ) -> Iterator[list[Candidate]]:
+        """For each pending state: what the caller knows, the line to the goal without control, and curves around it."""
+        N, random = self.problem.horizon.steps, np.random.default_rng(0)
+        goal = self.problem.goal.numpy()
+        s = np.arange(1, N + 1)[:, None] / N
+        waves = np.stack([np.sin(k * np.pi * s) / k for k in (1, 2, 3)])  # smooth, and zero at both ends
+        extent = states.abs().amax(0).numpy()
+        scale = np.where(extent > 0, extent, 1.0)
+        curves = max(RANDOM_STARTS, math.ceil(AT_LEAST / len(pending)))
+        for i in pending:
+            line = goal + (1 - s) * (states[i].numpy() - goal)
+            bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
+            cold = [Candidate(x, np.zeros((N, self.problem.system.m)), math.inf) for x in (line, *(line + bends))]
+            known = given[i]
+            yield cold if known is None else [known, *cold]
+
+    def minimise(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
+        """The local minimum that IPOPT finds from a start, or its reason for none."""
+        result = self._solver(x0=np.concatenate([start.u.ravel(), start.x.ravel()]), p=x0, lbg=0, ubg=0)
+        status = self._solver.stats()["return_status"]
+        if status != "Solve_Succeeded":
+            return f"IPOPT: {status}"
+        u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
+        return Candidate(x.reshape(start.x.shape), u.reshape(start.u.shape), float(result["f"]))
+
+    def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
+        """The costs of the best controls in a rollout, where that confirms them."""
+        replayed = self._replayed(states, [None if b is None else torch.from_numpy(b.u) for b in search.best])
+        reasons = list(map(_doubt, search.best, replayed, given, search.reasons))
+        cost = torch.full((len(states),), math.nan, dtype=torch.float64)
+        u = torch.full((self.problem.horizon.steps, len(states), self.problem.system.m), math.nan, dtype=torch.float64)
+        for i, candidate in enumerate(replayed):
+            if candidate is not None and not reasons[i]:
+                cost[i], u[:, i] = candidate.cost, torch.from_numpy(candidate.u)
+        return Optima(cost, reasons, u)
+
+
+def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str) -> str:
+    """Why a cost is not to be taken for the optimum; empty where it is."""
+    if best is None:
+        return reason
+    if replayed is None or abs(replayed.cost - best.cost) > SAME * abs(best.cost) + 1e-9:
+        got = "no finite number" if replayed is None else f"{replayed.cost:.9g}"
+        return f"IPOPT's cost {best.cost:.9g} is {got} in a rollout of its controls"
+    if is_better(given, replayed):
+        return f"known controls cost less than the {best.cost:.6g} of every local minimum that was found"
+    return ""
+
+
+def _solver(step: casadi.Function, end: casadi.Function, steps: int, iterations: int) -> casadi.Function:
+    """IPOPT for the transcribed task, with exact sparse derivatives: variables (u, x), parameter x₀."""
+    n, m = step.size1_in(0), step.size1_in(1)
+    x0, x, u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
+    following, step_cost = step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
+    J = casadi.sum2(step_cost) + end(x[:, -1])
+    problem = {"x": casadi.veccat(u, x), "p": x0, "f": J, "g": casadi.vec(following - x)}
+    quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    # acceptable_iter 0: only what meets the tolerances themselves has converged
+    return casadi.nlpsol(
+        "transcription", "ipopt", problem, {**quiet, "ipopt.max_iter": iterations, "ipopt.acceptable_iter": 0}
+    )

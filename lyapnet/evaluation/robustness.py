@@ -1,0 +1,150 @@
+"""What a controller costs where its assumptions fail: other initial states, another plant, noise, a finer grid."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.build import physical_parameters, with_parameters
+from lyapnet.controller import Controller
+from lyapnet.errors import DivergenceError, OracleError
+from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
+from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.problem import Horizon, Problem
+from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Rollout
+from lyapnet.sets import Box
+from lyapnet.types import Control, State, Time
+
+BEYOND = 0.2  # relative to X₀'s extent, and to each physical parameter
+NOISE = 0.01  # standard deviation at each evaluation of the policy, relative to the undisturbed loop's largest |x_i|
+
+
+class Disturbance(NamedTuple):
+    """One way in which the task at hand is not the task of the training."""
+
+    name: str
+    problem: Problem  # with the plant
+    policy: nn.Module  # u(t, x), which knows nothing of it
+    x0: State
+
+
+class DisturbanceRow(NamedTuple):
+    """The cost of a closed loop under a disturbance."""
+
+    disturbance: str
+    cost_mean: float | None  # None: the closed loop diverged
+    optimal_cost_mean: float | None  # the disturbed task's, without noise; None: no oracle
+    cost_ratio: float | None
+    optimum_failures: int | None  # states without an optimum, left out of the ratio
+    terminal_error: float | None  # mean ‖x(T)‖
+
+
+class NoisyPolicy(nn.Module):
+    """u(t, x + w) with w ~ N(0, diag(σ²)), drawn anew at each call.
+
+    Args:
+        policy: u(t, x).
+        deviation: σ (n,), in state units.
+        generator: of the draws.
+    """
+
+    def __init__(self, policy: nn.Module, deviation: Tensor, generator: torch.Generator):
+        super().__init__()
+        self.policy, self.deviation, self.generator = policy, deviation, generator
+
+    def forward(self, t: Time, x: State) -> Control:
+        noise = torch.randn(x.shape, generator=self.generator, dtype=x.dtype).to(x)
+        return self.policy(t, x + self.deviation * noise)
+
+
+def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Disturbance]:
+    """The task itself, and every disturbance of it, each from `samples` initial states.
+
+    Those are: initial states up to 20 % outside X₀ and none inside; each positive physical parameter of the system 20 %
+    lower and higher, gravity aside, while the policy and the cost keep the old one; noise of 1 % on the state that the
+    policy reads; and half the Δt.
+    """
+    X0 = controller.initial_states
+    x0 = X0.sample(samples, stream(seed, TEST))
+    problem = controller.problem
+    undisturbed = Disturbance("none", problem, controller.closed_loop.policy, x0)
+    yield undisturbed
+    yield undisturbed._replace(name=f"x₀ up to {BEYOND:.0%} outside X₀", x0=_outside(X0, samples, stream(seed, TEST)))
+    known = controller.parameters
+    for name, value in physical_parameters(controller.system, known).items():
+        for share in (-BEYOND, BEYOND):
+            system = with_parameters(controller.system, {**known, name: value * (1 + share)}, x0)
+            yield undisturbed._replace(
+                name=f"{name.replace('_', ' ')} {share:+.0%}", problem=problem.replaced(system=system)
+            )
+    policy = NoisyPolicy(undisturbed.policy, NOISE * magnitude(controller, x0), stream(seed, TEST))
+    yield undisturbed._replace(name=f"noise of {NOISE:.0%} on the state", policy=policy)
+    halved = Horizon(2 * problem.horizon.steps, problem.horizon.dt / 2)
+    yield undisturbed._replace(name="half the Δt", problem=problem.replaced(horizon=halved))
+
+
+def robustness(
+    controller: Controller,
+    samples: int = 64,
+    seed: int = 0,
+    optimum: bool = True,
+    say: Callable[[str], object] = lambda name: None,
+) -> list[DisturbanceRow]:
+    """What each disturbance costs, against the optimum of the disturbed task.
+
+    Args:
+        samples: initial states for each.
+        seed: of every draw.
+        optimum: whether the costs are compared with optima, where there is an oracle.
+        say: called with the name of the disturbance that is measured next.
+
+    Raises:
+        ValueError: fewer than one sample.
+    """
+    if samples < 1:
+        raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
+    rows = []
+    for disturbance in disturbances(controller, samples, seed):
+        say(disturbance.name)
+        rows.append(_row(controller, disturbance, optimum))
+    return rows
+
+
+def _row(controller: Controller, disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
+    name, problem, policy, x0 = disturbance
+    try:
+        with torch.no_grad():
+            trajectory = Rollout(problem, policy, controller.method, "backprop")(x0)
+    except DivergenceError:
+        return DisturbanceRow(name, None, None, None, None, None)
+    cost = float(trajectory.cost.mean())
+    error = float(torch.linalg.vector_norm(trajectory.x[-1] - problem.goal, dim=-1).mean())
+    without_optimum = DisturbanceRow(name, cost, None, None, None, error)
+    if not optimum:
+        return without_optimum
+    try:
+        optima = oracle_of(problem, controller.method).solve(x0, trajectory.u)
+    except OracleError:
+        return without_optimum
+    return without_optimum._replace(
+        optimal_cost_mean=mean_optimum(optima.cost),
+        cost_ratio=ratio_of_means(trajectory.cost, optima.cost),
+        optimum_failures=optima.failures,
+    )
+
+
+def _outside(X0: Box, samples: int, generator: torch.Generator) -> State:
+    """States of the box 20 % larger than X₀, moved out along the ray from its centre where they are inside."""
+    enlarged = Box(X0.center - (1 + BEYOND) * X0.widths / 2, X0.center + (1 + BEYOND) * X0.widths / 2)
+    offset = enlarged.sample(samples, generator).to(X0.center) - X0.center
+    half = torch.where(X0.widths > 0, X0.widths / 2, 1.0)
+    reach = (offset / half).abs().amax(-1, keepdim=True)  # 1 on the boundary of X₀
+    stretched = 1 + BEYOND * (reach / (1 + BEYOND))  # (0, 1.2] onto (1, 1.2]
+    return X0.center + offset * torch.where(reach > 0, stretched / reach, 0.0)
+
+
+def magnitude(controller: Controller, x0: State) -> Tensor:
+    """The largest |x_i| of the undisturbed closed loop, (n,)."""
+    return controller.rollout(x0).x.abs().flatten(0, -2).amax(0)

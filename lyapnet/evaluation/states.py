@@ -1,0 +1,93 @@
+"""A row for each initial state of a batch of closed loops, and what the rows add up to."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
+from lyapnet.problem import Problem
+from lyapnet.programs import Program
+from lyapnet.programs.terms import hinge, satisfied
+from lyapnet.rollout import Trajectory
+from lyapnet.types import PerState, State
+
+
+@dataclass(frozen=True)
+class StateTable:
+    """One row for each initial state."""
+
+    x0: State
+    cost: PerState  # J_N(x₀)
+    value: PerState  # V(0, x₀)
+    optimal_cost: PerState | None  # J*(x₀), where there is an oracle; NaN where it found none
+    constraint_loss: PerState  # the program's sum along the trajectory
+    hinge: PerState  # Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0)
+    decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
+    terminal_state: State  # x_N
+    terminal_error: PerState  # ‖x_N − goal‖
+
+    def rows(self, chosen: slice) -> "StateTable":
+        """The table of some of the states."""
+        columns: dict[str, Any] = {
+            key: None if column is None else column[chosen] for key, column in vars(self).items()
+        }
+        return StateTable(**columns)
+
+    def satisfied(self, tolerance: float) -> Tensor:
+        """Whether the summed hinge is at most `tolerance` · V(0, x₀)."""
+        return satisfied(self.hinge, self.value, tolerance)
+
+    def summary(self) -> dict[str, float | None]:
+        """The means and shares over the rows, under the names of `lyapnet evaluate --json`."""
+        return {
+            "cost_mean": float(self.cost.mean()),
+            "cost_max": float(self.cost.max()),
+            **self.against_optimum(),
+            "value_mean": float(self.value.mean()),
+            "value_to_cost": float(self.value.mean() / self.cost.mean()),
+            "constraint_loss": float(self.constraint_loss.mean()),
+            "terminal_error": float(self.terminal_error.mean()),
+            "bounded_fraction": _share(self.cost <= self.value),
+            "decreasing_fraction": _share(self.decreasing),
+            "satisfied_fraction": _share(self.satisfied(1e-2)),
+            "satisfied_fraction_1e-3": _share(self.satisfied(1e-3)),
+            "satisfied_fraction_1e-6": _share(self.satisfied(1e-6)),
+        }
+
+    def against_optimum(self) -> dict[str, float | None]:
+        """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""
+        optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
+        return {
+            "optimal_cost_mean": mean_optimum(optimal),
+            "cost_ratio": ratio_of_means(self.cost, optimal),
+            "value_error": ratio_of_means((self.value - optimal).abs(), optimal),
+            "optimum_failures": None if self.optimal_cost is None else int((~optimal.isfinite()).sum()),
+        }
+
+
+def measure(
+    problem: Problem, program: Program, trajectory: Trajectory, optimal_cost: PerState | None = None
+) -> StateTable:
+    """The table of a batch (b,) of trajectories under the control law of a V.
+
+    Args:
+        optimal_cost: J* of each, where it is known.
+    """
+    values = trajectory.require_value()
+    return StateTable(
+        x0=trajectory.x[0],
+        cost=trajectory.cost,
+        value=values[0],
+        optimal_cost=optimal_cost,
+        constraint_loss=program.constraint_loss(values, trajectory),
+        hinge=hinge(values, trajectory.step_cost),
+        decreasing=(values.diff(dim=0) <= 0).all(0),
+        terminal_state=trajectory.x[-1],
+        terminal_error=torch.linalg.vector_norm(trajectory.x[-1] - problem.goal.to(trajectory.x), dim=-1),
+    )
+
+
+def _share(holds: Tensor) -> float:
+    return float(holds.double().mean())

@@ -1,0 +1,84 @@
+"""What evaluations show in a terminal."""
+
+from typing import Any
+
+from rich.table import Column, Table
+from rich.text import Text
+
+ROWS = {
+    "cost_mean": "cost J, mean",
+    "cost_max": "cost J, worst",
+    "optimal_cost_mean": "optimal cost, mean",
+    "cost_ratio": "cost / optimum",
+    "value_mean": "V(0, x₀), mean",
+    "value_to_cost": "V(0, x₀) / cost J, ratio of the means",
+    "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
+    "constraint_loss": "constraint loss, mean",
+    "terminal_error": "terminal error, mean ‖x(T)‖",
+    "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
+    "decreasing_fraction": "V decreases at every step, share of states",
+    "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
+    "satisfied_fraction_1e-3": "… within 0.1 %",
+    "satisfied_fraction_1e-6": "… within 1e-6",
+}
+
+
+def evaluation_table(title: str, result: dict[str, Any]) -> Table:
+    """What a controller reaches, as evaluation.Evaluation.result has it."""
+    table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
+    for key, label in ROWS.items():
+        if result[key] is None:
+            table.add_row(label, "–")
+        else:
+            table.add_row(label, measured(key, result[key]))
+    for name, error in result["terminal_errors"].items():
+        table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
+    table.caption = _caption([result])
+    return table
+
+
+def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
+    """What several seeds reach, as experiment.over_seeds has it: mean, spread and both ends."""
+    seeds = result["seeds"]
+    table = Table("measure", *(Column(name, no_wrap=True) for name in ("mean ± spread", "least (seed)", "most (seed)")))
+    table.title = f"{title}\n{len(seeds)} seeds, {seeds[0]['samples']} unseen states of X₀ each"
+    for key, label in ROWS.items():
+        if key not in result["mean"]:
+            table.add_row(label, "–", "–", "–")
+            continue
+        ends = [choose(seeds, key=lambda one, key=key: one[key]) for choose in (min, max)]
+        mean, spread = (measured(key, result[name][key]) for name in ("mean", "spread"))
+        table.add_row(label, f"{mean} ± {spread}", *(f"{measured(key, end[key])} ({end['seed']})" for end in ends))
+    table.caption = _caption(seeds)
+    return table
+
+
+def _caption(results: list[dict[str, Any]]) -> Text | None:
+    """Why some optimum is missing."""
+    notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
+    return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
+
+
+def robustness_table(rows: list[dict[str, Any]], samples: int) -> Table:
+    """What a controller costs where its assumptions fail."""
+    headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
+    columns = [Column(heading, justify="right") for heading in headings]
+    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{samples} states each")
+    for row in rows:
+        keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
+        cost, *others = (measured_or_not(key, row[key]) for key in keys)
+        table.add_row(row["disturbance"], "diverged" if row["cost_mean"] is None else cost, *others)
+    table.caption = "J*: of the disturbed task, without noise"
+    return table
+
+
+def measured_or_not(key: str, value: float | None) -> str:
+    """A measure of an evaluation as text, a dash where it is not known."""
+    return "–" if value is None else measured(key, value)
+
+
+def measured(key: str, value: float) -> str:
+    """A measure of an evaluation as text: ratios with four decimals, shares in percent."""
+    if key == "cost_ratio":
+        return f"{value:.4f}"
+    return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"

@@ -1,0 +1,148 @@
+"""Bounds of a function on boxes: its operator graph, interpreted with Taylor forms.
+
+The function is the one that training and control use, traced at one point (t, x). What is done with each operator is in
+lyapnet.graphs.bound_rules; an operator without a rule is refused by name. The arithmetic of forms, and what is covered
+of rounding, is in lyapnet.graphs.taylor. Numbers that do not depend on the point (weights, W → softplus(W), a constant
+mass matrix) are computed once, in float64: bounds are those of the function with these numbers.
+"""
+
+import hashlib
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import Node
+from torch.utils._pytree import tree_map
+
+from lyapnet.errors import UsageError
+from lyapnet.graphs import taylor
+from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES, SUMS
+from lyapnet.graphs.simplification import with_known_truths, without_copies
+from lyapnet.graphs.taylor import TaylorForm, box_form
+from lyapnet.graphs.tracing import trace
+from lyapnet.types import Corner, Corners, OnBoxes
+
+
+class BoundedFunction:
+    """(t, x) ↦ some numbers, with bounds of each on boxes of (t, x).
+
+    Args:
+        function: of t () and x (n,), with tensors of any shape as results; in float64, from torch operations; its
+            control flow does not depend on their values.
+        sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
+        degree: of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
+
+    Raises:
+        UsageError: the function cannot be traced; or it has an operator without a rule, which is named.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
+        sample: tuple[Corner, Corner],
+        degree: int = 2,
+    ):
+        lower, upper = sample
+        self.degree = degree
+        generator = torch.Generator().manual_seed(0)
+        points = [lower + (upper - lower) * torch.rand(len(lower), generator=generator).to(lower) for _ in range(2)]
+        try:
+            first, other = [(y[0].clone(), y[1:].clone()) for y in points]
+            self._graph = trace(function, first, other)
+        except UsageError:
+            raise
+        except Exception as error:
+            raise UsageError(
+                f"Expected f, g, the cost and V in torch operations, with control flow that does not depend on values, "
+                f"got {error}"
+            ) from error
+        self._nodes = list(with_known_truths(without_copies(self._graph.graph)).nodes)
+        self._fold_constants()
+        self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
+        self.forms(lower[None], upper[None])  # an operator without a rule is found here
+
+    def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
+        """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box."""
+        return self.image(box_form(lower, upper, self.degree))
+
+    def image(self, box: TaylorForm) -> list[TaylorForm]:
+        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""
+        inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
+        values: dict[Node, Any] = dict(self._constants)
+        for node in self._nodes:
+            if node.op == "placeholder":
+                values[node] = next(inputs)
+            elif node.op == "output":
+                results = tree_map(values.__getitem__, node.args[0], is_leaf=lambda leaf: isinstance(leaf, Node))
+                return [y if isinstance(y, TaylorForm) else taylor.constant_form(y, box) for y in results]
+            elif node not in values:
+                values[node] = _apply(node, values)
+            for source in node.all_input_nodes:
+                if self._last_use[source] is node and source not in self._constants:
+                    del values[source]
+        raise AssertionError("a graph ends with its output")
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of the function: its operations and every number in them."""
+        found = hashlib.sha256(str(self._graph.graph).encode())
+        for node in self._nodes:
+            if node.op == "get_attr":
+                found.update(self._constants[node].contiguous().numpy().tobytes())
+        return found.hexdigest()
+
+    def bounds(self, lower: Corners, upper: Corners) -> list[tuple[OnBoxes, OnBoxes]]:
+        """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where there are none."""
+        return [form.interval() for form in self.forms(lower, upper)]
+
+    @property
+    def operators(self) -> set[Any]:
+        """The operators that depend on the point; the others are folded to constants."""
+        return {node.target for node in self._nodes if node.op == "call_function" and node not in self._constants}
+
+    def _fold_constants(self) -> None:
+        self._constants: dict[Node, Any] = {}
+        for node in self._nodes:
+            if node.op == "get_attr":
+                value = _attribute(self._graph, str(node.target))
+                self._constants[node] = value.double() if value.is_floating_point() else value
+            elif node.op == "call_function" and all(source in self._constants for source in node.all_input_nodes):
+                arguments, keywords = _values(node, self._constants)
+                self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+
+
+def _apply(node: Node, values: dict[Node, Any]) -> Any:
+    arguments, keywords = _values(node, values)
+    if not any(isinstance(values[source], TaylorForm | list) for source in node.all_input_nodes):
+        return node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+    found = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
+    if found is None or (found in SUMS and _of_truths(node)):
+        raise UsageError(
+            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
+            "lyapnet.graphs.bound_rules.RULES."
+        )
+    return found(*arguments, **keywords)
+
+
+def _of_truths(node: Node) -> bool:
+    """Whether torch reads 1 + 1 as true there."""
+    return getattr(node.meta.get("val"), "dtype", None) == torch.bool
+
+
+def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
+    return tree_map(
+        lambda leaf: values[leaf] if isinstance(leaf, Node) else leaf,
+        (tuple(node.args), dict(node.kwargs)),
+        is_leaf=lambda leaf: isinstance(leaf, Node),
+    )
+
+
+def _rows(form: TaylorForm, rows: int | slice) -> TaylorForm:
+    return form.with_parts(form.terms[:, :, rows], form.radius[:, rows])
+
+
+def _attribute(module: Any, path: str) -> Tensor:
+    for name in path.split("."):
+        module = getattr(module, name)
+    return module.detach()

@@ -1,0 +1,139 @@
+"""Traced functions as machine code, kept on disk from run to run (torch.export and AOTInductor)."""
+
+import hashlib
+import os
+import platform
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.fx import GraphModule
+
+from lyapnet.errors import CompilationError, LyapnetError
+
+
+class Scan(nn.Module):
+    """(*state, t, Δt, x₀) ↦ what step(*state, t_n, Δt_n, x_n, *prepare(*state)) keeps at each node, stacked over time.
+
+    Args:
+        prepare: what all steps share.
+        step: returns the next x and, after it, what is kept.
+        tensors: number of tensors in `state`.
+    """
+
+    def __init__(self, prepare: Callable[..., Sequence[Tensor]], step: Callable[..., Sequence[Tensor]], tensors: int):
+        super().__init__()
+        self.prepare, self.step, self.tensors = prepare, step, tensors
+
+    def loop(self, *arguments: Tensor) -> list[Tensor]:
+        """The scan as a loop, for a step of any kind."""
+        state, (t, dt, x) = arguments[: self.tensors], arguments[self.tensors :]
+        shared, kept = self.prepare(*state), []
+        for grid in zip(t, dt, strict=True):
+            x, *node = self.step(*state, *grid, x, *shared)
+            kept.append(node)
+        return [torch.stack(column) for column in zip(*kept, strict=True)]
+
+    def forward(self, *arguments: Tensor) -> list[Tensor]:
+        """The scan as one operation, for the compiler."""
+        from torch._higher_order_ops.scan import scan
+
+        state, (t, dt, x0) = arguments[: self.tensors], arguments[self.tensors :]
+        shared = self.prepare(*state)
+
+        def body(x: Tensor, grid: tuple[Tensor, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
+            following, *kept = self.step(*state, *grid, x, *shared)
+            return following, tuple(kept)
+
+        return list(scan(body, x0, (t, dt))[1])
+
+
+def is_on_disk(module: nn.Module, arguments: Sequence[Tensor]) -> bool:
+    """Whether the function of a traced module was compiled before for arguments like these."""
+    return file_of(module, arguments).is_file()
+
+
+def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
+    """The function of a traced module for arguments like these, from disk, or compiled now.
+
+    Raises:
+        CompilationError: there is no C++ compiler.
+        Exception: of torch or the compiler, of any kind.
+    """
+    from torch._inductor import aoti_compile_and_package, aoti_load_package
+
+    path = file_of(module, arguments)
+    if path.is_file():
+        try:
+            return aoti_load_package(str(path))
+        except Exception:  # of any kind: a file that was cut short or exchanged
+            path.unlink(missing_ok=True)
+    if not has_compiler():
+        raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, about itself
+            program = torch.export.export(module, tuple(arguments))
+            package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
+        Path(package).replace(path)
+    return aoti_load_package(str(path))
+
+
+@contextmanager
+def compilation_errors() -> Iterator[None]:
+    """Turn whatever compiling raises into a CompilationError; what lyapnet itself says stays as it is."""
+    try:
+        yield
+    except LyapnetError:
+        raise
+    except Exception as error:
+        line = " ".join(str(error).split())[:200]
+        raise CompilationError(f"Expected a closed loop to compile, got {type(error).__name__}: {line}") from error
+
+
+def has_compiler() -> bool:
+    """Whether there is a C++ compiler: $CXX, g++ or clang++."""
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    try:
+        get_cpp_compiler()
+    except (InvalidCxxCompiler, OSError):
+        return False
+    return True
+
+
+def cache_folder() -> Path:
+    """Where compiled functions are kept: $LYAPNET_CACHE, else lyapnet in the user's cache folder."""
+    chosen = os.environ.get("LYAPNET_CACHE")
+    return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "lyapnet"
+
+
+def constants_of(graph: GraphModule) -> list[tuple[str, Any]]:
+    """Name and entries of every tensor that a graph holds."""
+    constants = {**vars(graph), **dict(graph.named_buffers())}
+    return [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]
+
+
+def file_of(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
+    """Where machine code is kept: one file for each function, shapes of arguments, machine and torch."""
+    parts = [
+        torch.__version__, platform.machine(), _processors(arguments), torch.get_num_threads(), type(module).__name__,
+        *((tuple(a.shape), a.stride(), a.dtype, a.device.type) for a in arguments),
+    ]  # fmt: skip
+    for graph in module.modules():
+        if isinstance(graph, GraphModule):
+            parts += [graph.code, *constants_of(graph)]
+    return cache_folder() / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt2"
+
+
+def _processors(arguments: Sequence[Tensor]) -> list[Any]:
+    """What machine code is written for: the instructions of the CPU, and of each GPU that holds an argument."""
+    devices = {argument.device for argument in arguments if argument.device.type == "cuda"}
+    return [sorted(torch.cpu.get_capabilities().items()), *map(torch.cuda.get_device_capability, devices)]

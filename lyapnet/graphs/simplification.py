@@ -1,0 +1,74 @@
+"""Operator graphs made ready for bounds: the same function, written so that less is lost."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._functorch.compile_utils import fx_graph_cse
+from torch.fx import Graph, Node
+
+aten = torch.ops.aten
+
+COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view.default, aten.reshape.default}
+
+
+def without_copies(graph: Graph) -> Graph:
+    """The graph without nodes that hand on what they get, and without what is then computed twice."""
+    constants: dict[str, Node] = {}
+    for node in list(graph.nodes):
+        if node.op == "get_attr":  # which CSE leaves apart
+            node.replace_all_uses_with(constants.setdefault(str(node.target), node))
+        elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
+            node.replace_all_uses_with(node.args[0])
+            graph.erase_node(node)
+    graph = fx_graph_cse(graph)
+    graph.eliminate_dead_code()
+    return graph
+
+
+def with_known_truths(graph: Graph) -> Graph:
+    """where(c, x, y) with c = 1 inside x and c = 0 inside y, for truths c of one number: the same function.
+
+    Code that is differentiated guards each branch, as in where(c, p/where(c, d, 1), y). Where c is undecided, the guard
+    would be the hull of d and 1, however small the box.
+    """
+    for node in list(graph.nodes):
+        if node.target is aten.where.self and isinstance(node.args[0], Node) and _shape(node.args[0]) == ():
+            truth, *branches = node.args
+            known = [
+                _assuming(graph, truth, value, y, before=node) for value, y in zip((True, False), branches, strict=True)
+            ]
+            node.args = (truth, *known)
+    graph.eliminate_dead_code()
+    return graph
+
+
+def _assuming(graph: Graph, truth: Node, value: bool, result: Any, before: Node) -> Any:
+    """A copy of what leads from a truth to a result, in which the truth has a known value."""
+    copies: dict[Node, Any] = {}
+    with graph.inserting_before(before):
+        for node in _between(truth, result):
+            if not copies:
+                copies[truth] = graph.call_function(aten.full.default, ([], value), {"dtype": torch.bool})
+            copies[node] = graph.node_copy(node, lambda source: copies.get(source, source))
+    return copies.get(result, result)
+
+
+def _between(start: Node, end: Any) -> list[Node]:
+    """The nodes that depend on the start and on which the end depends, in order."""
+    if not isinstance(end, Node):
+        return []
+    below, above = {start}, {end}
+    nodes = list(start.graph.nodes)
+    for node in nodes:
+        if below.intersection(node.all_input_nodes):
+            below.add(node)
+    for node in reversed(nodes):
+        if node in above:
+            above.update(node.all_input_nodes)
+    return [node for node in nodes if node in below & above and node is not start]
+
+
+def _shape(node: Any) -> Any:
+    """The shape of the node's value; the node itself where that was not recorded."""
+    return node.meta["val"].shape if isinstance(node.meta.get("val"), Tensor) else node

@@ -1,0 +1,181 @@
+"""Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._functorch.compile_utils import fx_graph_cse
+from torch.func import functionalize, vmap
+from torch.fx import Graph, GraphModule, Node
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.testing import assert_close
+
+from lyapnet.errors import UsageError
+
+Tensors = tuple[Tensor, ...]
+
+
+def trace(
+    function: Callable[..., Tensors],
+    arguments: Sequence[Tensor],
+    elsewhere: Sequence[Tensor] = (),
+    decompositions: Mapping[Any, Any] | None = None,
+) -> GraphModule:
+    """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
+
+    No Python of the function is left, nothing is computed twice, and nothing records a graph: run it under no_grad.
+    The function must be one of its arguments alone; whatever else it reads is frozen as it is now.
+
+    Args:
+        elsewhere: other values of its last arguments, on which the trace is held against the function: code that
+            leaves torch (x.numpy(), say) is frozen without a word.
+        decompositions: operator ↦ the same in simpler operators, for a reader that knows only those.
+
+    Raises:
+        UsageError: the function draws random numbers.
+        Exception: of any kind, where control flow depends on tensor values.
+    """
+    options = {"decomposition_table": decompositions, "_allow_non_fake_inputs": True}
+    graph_module = make_fx(function, **options)(*arguments)
+    if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
+        graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
+    if any(_depends_on_values(node) for node in graph_module.graph.nodes):
+        raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
+    for node in list(graph_module.graph.nodes):
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise UsageError(
+                f"Expected f, g, the cost and V without random numbers, got {node.target}; leave dropout and noise "
+                "out, or train with rollout.gradient=backprop."
+            )
+        if node.op == "call_function" and node.target is torch.ops.aten.detach.default:
+            node.replace_all_uses_with(node.args[0])
+            graph_module.graph.erase_node(node)
+    graph_module = _tidied(graph_module, graph_module.graph)
+    if elsewhere:
+        _require_same(graph_module, function, [*arguments[: -len(elsewhere)], *elsewhere])
+    return graph_module
+
+
+def batched(
+    function: Callable[..., Tensors],
+    arguments: Sequence[Tensor],
+    axes: Sequence[int | None],
+    out_axes: Sequence[int],
+    elsewhere: Sequence[Tensor] = (),
+) -> GraphModule:
+    """The trace of a function over an axis of some of its arguments: each of its operations on all members at once."""
+    one, other = _first_member(arguments, axes), _first_member(elsewhere, axes[len(axes) - len(elsewhere) :])
+    # traced before it is batched: by then no autograd is left that vmap could not enter
+    return trace(vmap(trace(function, one, other), tuple(axes), tuple(out_axes)), arguments)
+
+
+def cut(
+    graph_module: GraphModule, late: int, early_outputs: int, repeat: bool = True
+) -> tuple[GraphModule, GraphModule]:
+    """(early, rest): a graph cut where its last `late` arguments enter.
+
+    early(*arguments[:-late]) gives the first `early_outputs` results, which must not need the late arguments, and after
+    them the intermediate results that the rest needs; rest(*arguments, *intermediate) gives the other results.
+
+    Args:
+        repeat: whether the rest repeats arithmetic that is cheaper than to hand its result over.
+    """
+    nodes = list(graph_module.graph.nodes)
+    arguments, results = [node for node in nodes if node.op == "placeholder"], _results(graph_module.graph)
+    after = set(arguments[-late:])
+    for node in nodes:
+        if after.intersection(node.all_input_nodes):
+            after.add(node)
+    repeated = after | _repeatable(nodes, POINTWISE if repeat else set())  # what the rest computes itself
+
+    wanted = set(results[early_outputs:])
+    for node in reversed(nodes):
+        if node in wanted and node in repeated:
+            wanted.update(node.all_input_nodes)
+    handed = [node for node in nodes if node in wanted and node not in repeated]
+
+    early, rest = Graph(), Graph()
+    copies = {node: early.placeholder(node.name) for node in arguments[:-late]}
+    for node in nodes:
+        if node.op in COMPUTED and node not in after:
+            copies[node] = early.node_copy(node, copies.__getitem__)
+    early.output(tuple(copies[node] for node in (*results[:early_outputs], *handed)))
+
+    copies = {node: rest.placeholder(node.name) for node in (*arguments, *handed)}
+    for node in nodes:
+        if node in wanted and node not in copies:
+            copies[node] = rest.node_copy(node, copies.__getitem__)
+    rest.output(tuple(copies[node] for node in results[early_outputs:]))
+    return _tidied(graph_module, early), _tidied(graph_module, rest)
+
+
+COMPUTED = ("call_function", "get_attr")
+
+
+# cheap enough to be computed again: what they give is as large as what they take
+POINTWISE = {"add", "sub", "rsub", "neg", "mul", "div", "pow", "sigmoid_backward", "tanh_backward"}
+
+
+def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
+    """What is cheaper to compute again than to hand over: arguments, constants, views, and what is called cheap."""
+    return {
+        node
+        for node in nodes
+        if node.op in ("placeholder", "get_attr")
+        or (node.op == "call_function" and (is_view(node.target) or name_of(node.target) in cheap))
+    }
+
+
+def _first_member(arguments: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
+    return [a if axis is None else a.select(axis, 0).clone() for a, axis in zip(arguments, axes, strict=True)]
+
+
+def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> None:
+    """Hold a trace against its function, up to half the digits: they may add in another order."""
+    with torch.no_grad():
+        results, expected = graph_module(*arguments), function(*arguments)
+    for result, value in zip(results, expected, strict=True):
+        half = torch.finfo(value.dtype).eps ** 0.5
+        try:
+            assert_close(result, value.detach(), rtol=half, atol=half * float(value.abs().max()), equal_nan=True)
+        except AssertionError as error:
+            raise ValueError(
+                "Expected f, g, the cost and V to compute with torch alone, got code that leaves it (x.numpy(), "
+                "float(x), …) or that computes something else each time."
+            ) from error
+
+
+def name_of(target: Any) -> str:
+    """An operator's name without its overload."""
+    return getattr(target, "__name__", "").split(".")[0]
+
+
+def _depends_on_values(node: Node) -> bool:
+    """Whether the values of its arguments decide the shape of its result: nonzero, or indexing by a mask."""
+    if node.target is torch.ops.aten.index.Tensor:  # by integers it does not
+        return any(source.meta["val"].dtype == torch.bool for source in node.all_input_nodes[1:])
+    return torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ())
+
+
+def _mutates(node: Node) -> bool:
+    schema = getattr(node.target, "_schema", None)
+    return schema is not None and schema.is_mutable
+
+
+def is_view(target: Any) -> bool:
+    """Whether an operator's result shares its argument's memory."""
+    schema = getattr(target, "_schema", None)
+    return schema is not None and any(result.alias_info is not None for result in schema.returns)
+
+
+def _results(graph: Graph) -> tuple[Node, ...]:
+    (output,) = (node for node in graph.nodes if node.op == "output")
+    result = output.args[0]
+    return tuple(result) if isinstance(result, list | tuple) else (result,)  # pyright: ignore
+
+
+def _tidied(root: GraphModule, graph: Graph) -> GraphModule:
+    graph = fx_graph_cse(graph)
+    graph.eliminate_dead_code()
+    return GraphModule(root, graph)

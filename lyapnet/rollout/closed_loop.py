@@ -1,0 +1,36 @@
+"""The closed loop as one vector field of the state and its running cost."""
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.policy import PolicyOutput, ValuePolicy
+from lyapnet.problem import Problem
+from lyapnet.types import Control, State, Time
+
+
+class ClosedLoop(nn.Module):
+    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
+
+    def __init__(self, problem: Problem, policy: nn.Module):
+        super().__init__()
+        self.system, self.cost, self.policy = problem.system, problem.cost, policy
+
+    @property
+    def V(self) -> ValueFunction | None:
+        """The V that defines the control law; None where no V does."""
+        return self.policy.V if isinstance(self.policy, ValuePolicy) else None
+
+    def forward(self, t: Time, y: Tensor) -> Tensor:
+        x = y[..., :-1]
+        return self.slope(x, self.policy(t, x))
+
+    def slope(self, x: State, u: Control) -> Tensor:
+        """(f + g u, ℓ), (*batch, n + 1)."""
+        return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
+
+    def control(self, t: Time, x: State) -> PolicyOutput:
+        """u, V and V_x; with a law that no V defines, V = 0."""
+        if isinstance(self.policy, ValuePolicy):
+            return self.policy.with_value(t, x)
+        return PolicyOutput(self.policy(t, x), torch.zeros_like(x[..., 0]), torch.zeros_like(x))

@@ -1,0 +1,308 @@
+"""The exact gradient of a discretised closed loop: Pontryagin's estimator in discrete time.
+
+The closed loop is integrated without a graph. Backwards, block by block of time steps, it is linearised at all states
+of the block at once; the costate runs through the block; and one product gives the block's share of the parameters'
+gradient (lyapnet.rollout.runge_kutta has the equations). Memory is that of the path and of one block.
+"""
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.func import functional_call
+
+from lyapnet.errors import LyapnetError, UntraceableError
+from lyapnet.graphs.compilation import Scan, compilation_errors, compiled, is_on_disk
+from lyapnet.graphs.tracing import batched, cut, trace
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
+from lyapnet.rollout.runge_kutta import TABLEAUX, Linearise, Step
+from lyapnet.types import ControlPath, Jacobians, StagePath, State, StatePath, ValuePath
+
+_LOG = logging.getLogger(__name__)
+Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
+BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
+
+
+class DiscreteAdjoint:
+    """x₀ ↦ the path of the discretised closed loop, with its exact gradient in x₀ and the loop's parameters.
+
+    The work is traced for one batch shape at its first use (lyapnet.graphs.tracing). Parameters and buffers of the
+    system, the cost and V are arguments of what is traced and may change between rollouts; what else f, g and V read is
+    frozen. A loop that cannot be traced, since its control flow depends on tensor values or leaves torch, runs eagerly;
+    the log says why.
+
+    With an axis of members before the batch, x₀ (E, b, n) and parameters (E, *shape), it is E closed loops at once.
+
+    Args:
+        loop: the closed loop.
+        steps, dt: N and Δt in s.
+        method: a key of TABLEAUX.
+    """
+
+    def __init__(self, loop: ClosedLoop, steps: int, dt: float, method: str):
+        self.loop, self.steps, self.dt, self.stages = loop, steps, dt, len(TABLEAUX[method].b)
+        self._step, self._linearise = Step(loop, TABLEAUX[method]), Linearise(loop, TABLEAUX[method])
+        self._traced: dict[tuple[Any, ...], TracedRoutines] = {}
+        self._routines: dict[tuple[Any, ...], Routines] = {}
+        self._compiled: Tensor | None = None  # an x₀ of the batches that run as machine code
+        self._told = False  # whether the log has said why the loop runs as it is written
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the work, which belongs to these very tensors: a copy does its own."""
+        return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None}
+
+    def __call__(self, x0: State, theta: Sequence[Tensor] | None = None) -> Rolled:
+        """(x, ∫ℓ, V, u) at the nodes.
+
+        Args:
+            x0: (b, n), or (E, b, n) with members.
+            theta: the members' parameters, in the order of `trained`; None for the loop's own.
+
+        Raises:
+            ValueError: parameters without an axis of members in x₀.
+            UsageError: the loop draws random numbers, which the way back could not repeat.
+        """
+        if theta is not None and x0.ndim != 3:
+            raise ValueError(f"Expected x0 (E, b, n) with the members' parameters, got {tuple(x0.shape)}; stack them.")
+        x0 = x0.contiguous()  # as machine code takes it, which does not check
+        theta = self.trained() if theta is None else theta
+        if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
+            x, running_cost, value, u = _Rollout.apply(self, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
+            return x, running_cost, value, u
+        return _read(self._integrate_any(x0, theta))
+
+    def trained(self) -> list[Tensor]:
+        """The loop's parameters that ask for a gradient."""
+        return [p for p in self.loop.parameters() if p.requires_grad]
+
+    def compile(self, x0: State, theta: Sequence[Tensor] | None = None) -> None:
+        """Compile the work for batches like x₀, or take it from disk.
+
+        Rollouts of other batches, where no gradient is asked for, then run in slices of that size.
+
+        Raises:
+            UntraceableError: the loop cannot be traced.
+            CompilationError: there is no compiler, or it failed.
+        """
+        work = self._work(x0, self.trained() if theta is None else theta)
+        with compilation_errors():
+            integrate, linearise, product = (compiled(*piece) for piece in work.pieces())
+        self._compiled = x0.detach()
+        self._routines[self._key(x0)] = Routines(integrate, linearise, product, work.block)
+
+    def is_on_disk(self, x0: State, theta: Sequence[Tensor] | None = None) -> bool:
+        """Whether `compile` would find everything on disk.
+
+        Raises:
+            UntraceableError: the loop cannot be traced.
+        """
+        work = self._work(x0, self.trained() if theta is None else theta)
+        return all(is_on_disk(*piece) for piece in work.pieces())
+
+    def routines(self, x0: State, theta: Sequence[Tensor]) -> Routines:
+        """The work for batches like x₀: compiled, else traced, else as written."""
+        key = self._key(x0)
+        if key not in self._routines:
+            try:
+                self._routines[key] = self._work(x0, theta).routines()
+            except UntraceableError as error:
+                if x0.ndim > 2:  # members exist in a trace alone
+                    raise
+                if not self._told:
+                    _LOG.warning("%s It runs as it is written, which is slower.", error)
+                    self._told = True
+                self._routines[key] = self._as_written(x0)
+        return self._routines[key]
+
+    def integrate(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> Nodes:
+        """The path from x₀; its last node takes a step of length zero, which makes it a node like the others."""
+        with torch.no_grad():
+            return Nodes(*routines.integrate(*self._state(theta), *self._grid(x0, self.steps + 1), x0))
+
+    def gradient(
+        self, routines: Routines, theta: Sequence[Tensor], stages: StagePath, bars: Sequence[Tensor]
+    ) -> tuple[State, list[Tensor]]:
+        """(x̄₀, θ̄) from the loss's derivatives by x, ∫ℓ and V at the nodes."""
+        x_bar, running_cost_bar, value_bar = bars
+        # a step's cost is part of the running cost of every later node
+        cost_bar = running_cost_bar.flip(0).cumsum(0).flip(0)[1:]
+        K, nodes, state = routines.block, len(stages), self._state(theta)
+        length = K * math.ceil(nodes / K)
+        t, dt = self._grid(stages, length)
+        stages = torch.cat([stages, stages[-1:].expand(length - nodes, *stages.shape[1:])])
+        node_bars = (padded(column, length).contiguous() for column in (x_bar, cost_bar, value_bar))
+        columns = [t, dt, stages, *node_bars]
+        costate, gradient = torch.zeros_like(x_bar[0]), [torch.zeros_like(p) for p in theta]
+        for start in reversed(range(0, length, K)):
+            block = [column[start : start + K] for column in columns]
+            transition, source, *intermediate = routines.linearise(*state, *block)
+            costate, after = _run_costate(transition, source, costate)
+            share = routines.product(*state, *block, after, *intermediate)
+            gradient = [total + part for total, part in zip(gradient, share, strict=True)]
+        return costate, gradient
+
+    def _integrate_any(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
+        """The path without a gradient: by compiled routines, in slices if need be; else without a trace."""
+        if self._key(x0) in self._routines:
+            return self.integrate(self._routines[self._key(x0)], x0, theta)
+        if (
+            not x0.numel()
+            or self._compiled is None
+            or self._key(self._compiled) not in self._routines  # other parameters were trained then
+            or self._key(self._compiled[..., 0, :]) != self._key(x0[..., 0, :])
+        ):
+            routines = self._as_written(x0) if x0.ndim == 2 else self.routines(x0, theta)
+            return self.integrate(routines, x0, theta)
+        size, batch = self._compiled.shape[-2], x0.shape[-2]
+        full = torch.cat([x0, x0[..., -1:, :].expand(*x0.shape[:-2], -batch % size, x0.shape[-1])], -2)
+        routines = self._routines[self._key(self._compiled)]
+        paths = [self.integrate(routines, part.contiguous(), theta) for part in full.split(size, -2)]
+        columns = zip(zip(*paths, strict=True), BATCH_AXES, strict=True)
+        return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
+
+    def _key(self, x0: Tensor) -> tuple[Any, ...]:
+        """What the work is done for: a shape, and parameters that are trained."""
+        return tuple(x0.shape), x0.dtype, x0.device, tuple(p.requires_grad for p in self.loop.parameters())
+
+    def _state(self, theta: Sequence[Tensor]) -> list[Tensor]:
+        """The tensors that the loop is made of, the trained ones first."""
+        return [tensor.detach() for tensor in (*theta, *self.facts().values())]
+
+    def facts(self) -> dict[str, Tensor]:
+        """What the loop is made of besides its trained parameters."""
+        frozen = {name: p for name, p in self.loop.named_parameters() if not p.requires_grad}
+        return {**frozen, **dict(self.loop.named_buffers())}
+
+    def _with_state(self, module: nn.Module) -> Callable[..., tuple[Tensor, ...]]:
+        """(*state, *arguments) ↦ module(*arguments) with the loop made of `state`, its first part leaves of a graph."""
+        trained = [name for name, p in self.loop.named_parameters() if p.requires_grad]
+        names = [f"loop.{name}" for name in (*trained, *self.facts())]
+
+        def function(*tensors: Tensor) -> tuple[Tensor, ...]:
+            leaves = [p.detach().requires_grad_() for p in tensors[: len(trained)]]
+            state = dict(zip(names, (*leaves, *tensors[len(trained) : len(names)]), strict=True))
+            return functional_call(module, state, tuple(tensors[len(names) :]))
+
+        return function
+
+    def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
+        """The work for batches like x₀ as graphs, traced once.
+
+        Raises:
+            UntraceableError: its control flow depends on tensor values, or it leaves torch.
+        """
+        key = self._key(x0)
+        if key not in self._traced:
+            try:
+                self._traced[key] = self._trace(x0, theta)
+            except LyapnetError:
+                raise
+            except Exception as error:  # of any kind, from inside the user's own functions
+                reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
+                raise UntraceableError(
+                    f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."
+                ) from error
+        return self._traced[key]
+
+    def _trace(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
+        """The work for batches like x₀ as graphs; raises whatever the loop's own functions raise."""
+        x0, state, block = x0.detach().contiguous(), self._state(theta), self._block(x0)
+        t, dt = self._grid(x0, block)
+        nodes = x0.expand(block, *x0.shape)
+        stages = nodes.unsqueeze(1).repeat(1, self.stages, *[1] * x0.ndim)
+        bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
+        grid = self._grid(x0, self.steps + 1)
+        node_arguments, block_arguments = [*state, t[0], dt[0], x0], [*state, t, dt, stages, *bars, nodes.clone()]
+        elsewhere = [t[0] + self.dt, dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]
+        step, joint = self._with_state(self._step), self._with_state(self._linearise)
+        if x0.ndim == 2:
+            step, joint = trace(step, node_arguments, elsewhere), trace(joint, block_arguments)
+        else:
+            axes = [*[0] * len(theta), *[None] * (len(state) - len(theta)), None, None]
+            step = batched(step, node_arguments, [*axes, 0], [0, 1, 0, 0, 0], elsewhere)
+            joint = batched(joint, block_arguments, [*axes, 2, 1, 1, 1, 1], [1, 1, *[0] * len(theta)])
+        prepare, step = cut(step, late=3, early_outputs=0, repeat=False)
+        linearise, product = cut(joint, late=1, early_outputs=2)
+        return TracedRoutines(prepare, step, linearise, product, block, [*state, *grid, x0], block_arguments)
+
+    def _as_written(self, x0: Tensor) -> Routines:
+        """The work in Python, on the loop's own tensors."""
+        skipped = len(self._state(self.trained()))
+
+        def step(*arguments: Tensor) -> tuple[Tensor, ...]:
+            return self._step(*arguments[skipped:])
+
+        def linearise(*arguments: Tensor) -> tuple[Any, ...]:
+            linearisation = self._linearise.linearise(*arguments[skipped:])
+            return linearisation.transition, linearisation.source, linearisation
+
+        def product(*arguments: Any) -> tuple[Tensor, ...]:
+            *block, linearisation = arguments[skipped:]
+            return self._linearise.product(linearisation, *block)
+
+        return Routines(Scan(lambda *_: (), step, skipped).loop, linearise, product, self._block(x0))
+
+    def _block(self, x0: Tensor) -> int:
+        """K: blocks of equal length with about BLOCK states in each."""
+        nodes, states = self.steps + 1, max(1, x0[..., 0].numel())
+        return math.ceil(nodes / math.ceil(nodes * self.stages * states / BLOCK))
+
+    def _grid(self, like: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+        """(t, Δt) of the first nodes; from the last one of the horizon on, t = T and Δt = 0."""
+        index = torch.arange(nodes, device=like.device)
+        t = index.clamp(max=self.steps).to(like.dtype) * self.dt
+        return t, (index < self.steps).to(like.dtype) * self.dt
+
+
+class _Rollout(torch.autograd.Function):
+    """(adjoint, x₀, *θ) ↦ (x, ∫ℓ, V, u), where u is a record without a gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, adjoint: DiscreteAdjoint, x0: Tensor, *theta: Tensor) -> tuple[Tensor, ...]:
+        routines = adjoint.routines(x0, theta)
+        path = adjoint.integrate(routines, x0, theta)
+        result = _read(path)
+        ctx.adjoint, ctx.routines = adjoint, routines
+        ctx.save_for_backward(path.stages, *theta, *adjoint.facts().values())
+        ctx.mark_non_differentiable(result[-1])
+        return result
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
+        stages, *state = ctx.saved_tensors  # torch refuses tensors that were changed in between
+        theta, facts = state[: len(ctx.needs_input_grad) - 2], state[len(ctx.needs_input_grad) - 2 :]
+        now = [tensor.data_ptr() for tensor in ctx.adjoint.facts().values()]
+        if now != [tensor.data_ptr() for tensor in facts]:
+            raise RuntimeError(
+                "Expected the closed loop as it was rolled out, got another buffer; replace it afterwards."
+            )
+        x0_bar, theta_bar = ctx.adjoint.gradient(ctx.routines, theta, stages, bars[:3])
+        return None, x0_bar, *theta_bar
+
+
+def _read(nodes: Nodes) -> Rolled:
+    """(x, ∫ℓ, V, u) at the nodes."""
+    running_cost = torch.cat([torch.zeros_like(nodes.step_cost[:1]), nodes.step_cost[:-1].cumsum(0)])
+    return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]
+
+
+def _run_costate(transition: Jacobians, source: StatePath, costate: State) -> tuple[State, StatePath]:
+    """λ = Φᵀλ' + source backwards through a block: (λ before its first step, λ' after each of its steps)."""
+    K, n = len(source), source.shape[-1]
+    transition, source = transition.reshape(K, -1, n, n), source.reshape(K, -1, n, 1)
+    after, running = torch.empty_like(source), costate.reshape(-1, n, 1)
+    for k in reversed(range(K)):
+        after[k] = running
+        running = torch.baddbmm(source[k], transition[k], running)
+    return running.reshape(costate.shape), after.reshape(K, *costate.shape)
+
+
+def padded(column: Tensor, length: int) -> Tensor:
+    """The column with zeros after it: steps that no loss depends on."""
+    return torch.cat([column, column.new_zeros(length - len(column), *column.shape[1:])])

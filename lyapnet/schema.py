@@ -1,0 +1,182 @@
+"""The generic half of a config: dataclasses with one sentence a field, read from YAML, with clear refusals."""
+
+import dataclasses
+import difflib
+import math
+import operator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import field
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+
+from lyapnet.errors import UsageError, did_you_mean
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    choices: Sequence[str] = (),
+    user_class: bool = False,
+    above: float | None = None,
+    at_least: float | None = None,
+    below: float | None = None,
+) -> Any:
+    """A field with its sentence and the values it admits; `user_class` also admits module:Class."""
+    bounds = {">": above, "≥": at_least, "<": below}
+    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "bounds": bounds}
+    if isinstance(default, list | dict):
+        return field(default_factory=lambda: type(default)(default), metadata=rule)
+    return field(default=default, metadata=rule)
+
+
+def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
+    """The content of a YAML file that has some keys of a schema.
+
+    Raises:
+        UsageError: no such file, not YAML, or none of the keys.
+    """
+    try:
+        content = OmegaConf.to_container(
+            OmegaConf.load(path), resolve=False
+        )  # reads 1e-2 as a number; YAML 1.1 does not
+    except OSError as error:
+        raise UsageError(
+            f"Expected a config file, got {str(path)!r} ({error.strerror or error}); see conf/."
+        ) from error
+    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())
+        raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
+    sections = [f.name for f in dataclasses.fields(schema)]
+    if not isinstance(content, Mapping) or not any(name in content for name in sections):
+        raise UsageError(
+            f"Expected a config in {str(path)!r}, got none of its keys ({', '.join(sections)}); see conf/."
+        )
+    return {str(key): value for key, value in content.items()}
+
+
+Schema = TypeVar("Schema")
+
+
+def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Schema:
+    """An object of a schema from plain nested dictionaries with overrides: its keys and types, not its values.
+
+    Raises:
+        UsageError: an unknown key, a missing one, or a wrong type.
+    """
+    for override in overrides:
+        if "=" not in override.lstrip("="):
+            raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
+    try:
+        layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
+        for layer in layers:
+            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), schema, "")
+        merged = OmegaConf.merge(OmegaConf.structured(schema), *layers)
+        config = OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        raise UsageError(_explain(error, schema)) from error
+    except TypeError as error:  # a section's field changed from a list to a mapping, or back
+        raise UsageError(
+            f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
+        ) from error
+    except yaml.YAMLError as error:
+        raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
+    assert isinstance(config, schema)
+    return config
+
+
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Full name ↦ both values, where two nested dictionaries differ; None for one that is missing."""
+    a, b = dict(_leaves(one)), dict(_leaves(other))
+    return {key: (a.get(key), b.get(key)) for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)}
+
+
+def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in content.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
+    known = {f.name: f for f in dataclasses.fields(schema)}
+    for key, value in content.items():
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            names = _same_name_elsewhere(str(key), schema) or [prefix + name for name in near]
+            hint = f"did you mean {names[0]}?" if names else f"choose one of {', '.join(known)}."
+            raise UsageError(f"Expected a key of the schema, got unknown key {prefix}{key}; {hint}")
+        section = known[key].type
+        if isinstance(section, type) and dataclasses.is_dataclass(section):
+            if not isinstance(value, Mapping):
+                names = ", ".join(f.name for f in dataclasses.fields(section))
+                raise UsageError(
+                    f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
+                )
+            _refuse_unknown_keys(value, section, f"{prefix}{key}.")
+        for entry in get_args(section)[1:]:  # of dict[str, section]
+            for name, one in value.items() if dataclasses.is_dataclass(entry) else ():
+                _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
+
+
+def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
+    """Full name and type of every field."""
+    found: dict[str, Any] = {}
+    for f in dataclasses.fields(schema):
+        if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
+            found |= _annotations(f.type, f"{prefix}{f.name}.")
+        else:
+            found[f"{prefix}{f.name}"] = f.type
+    return found
+
+
+def _same_name_elsewhere(key: str, schema: type) -> list[str]:
+    """The full names of fields of that name: for a key written in the wrong section."""
+    return [name for name in _annotations(schema) if name.split(".")[-1] == key]
+
+
+def _explain(error: OmegaConfBaseException, schema: type) -> str:
+    key = error.full_key or "a key"
+    if isinstance(error, MissingMandatoryValue):
+        return f"Expected a value for {key}, got none; add it to the config file or append {key}=… to the command."
+    annotation = _annotations(schema).get(key.split("[")[0])
+    kind = annotation.__name__ if type(annotation) is type else annotation or "another type"
+    got = str(error).splitlines()[0]
+    return f"Expected {key} as {kind}, got: {got}; correct its value."
+
+
+def check_values(config: Any, prefix: str = "") -> None:
+    """Hold every field, and every entry of a section, against the rule it was declared with."""
+    for f in dataclasses.fields(config):
+        key, value = f"{prefix}{f.name}", getattr(config, f.name)
+        entries = {f"{key}.{name}": entry for name, entry in value.items()} if isinstance(value, dict) else {key: value}
+        for name, entry in entries.items():
+            if dataclasses.is_dataclass(entry):
+                check_values(entry, f"{name}.")
+            elif f.metadata and entry is not None:
+                _check_value(name, entry, f.metadata)
+
+
+def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
+    choices = rule["choices"]
+    if choices and isinstance(value, list):
+        for entry in value:
+            _check_value(key, entry, rule)
+        return
+    if choices and value not in choices and not (rule["user_class"] and ":" in value):
+        hint = did_you_mean(str(value), choices, "choose one of them.")
+        own = ", or module:Class" if rule["user_class"] else ""
+        raise UsageError(f"Expected {key} as one of {', '.join(choices)}{own}, got {value!r}; {hint}")
+    holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}
+    bounds = {symbol: bound for symbol, bound in rule["bounds"].items() if bound is not None}
+    if bounds and value == []:
+        raise UsageError(f"Expected {key} with at least one entry, got none; {rule['doc']}")
+    for symbol, bound in bounds.items():
+        for number in value if isinstance(value, list) else [value]:
+            if not (holds[symbol](number, bound) and math.isfinite(number)):
+                raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")

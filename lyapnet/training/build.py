@@ -1,0 +1,126 @@
+"""From a config to what trains: modules, data, and the user's own callbacks."""
+
+import csv
+from pathlib import Path
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from lyapnet.build import (
+    Parts,
+    build_problem,
+    build_program,
+    build_rollout,
+    build_value_function,
+    entry_per_state,
+    parts_of,
+    resolve,
+)
+from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
+from lyapnet.errors import UsageError
+from lyapnet.problem import Problem
+from lyapnet.programs import PointwiseCondition, Program
+from lyapnet.rollout import Rollout
+from lyapnet.sets import Box
+from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
+from lyapnet.training.learner import Learner
+from lyapnet.training.modules import EnsembleModule, OptimizerOptions, TrainingModule, ValueModule
+
+
+def build_module(config: Config) -> TrainingModule:
+    """What trains a config: one V, or an ensemble of seeds.
+
+    Raises:
+        UsageError: as build_problem and its like; or the seeds cannot train as one batch.
+    """
+    parts = parts_of(config)
+    problem, options = build_problem(config, parts), _optimizer_options(config.training)
+    if config.seeds == 1:
+        one = build_learner(config, problem, parts)
+        module = ValueModule(problem, one.V, one.program, one.rollout, one.pointwise, options, config.seed)
+    else:
+        members = [build_learner(each, problem, parts, label_of(each)) for each in configs_of_seeds(config)]
+        module = EnsembleModule(members, config.training.batch_size, options)
+    module.metadata = {"config": to_plain(config)}
+    return module
+
+
+def build_learner(config: Config, problem: Problem, parts: Parts | None = None, label: str = "") -> Learner:
+    """What one seed of a config trains."""
+    parts = parts or Parts()
+    V = build_value_function(config, problem, parts.network)
+    rollout, program = build_rollout(config, problem, V), parts.program or build_program(config)
+    learner = Learner(problem, V, rollout, program, build_pointwise(config, rollout, program), config.seed, label)
+    learner.metadata = {"config": to_plain(config)}
+    return learner
+
+
+def _optimizer_options(training: TrainingConfig) -> OptimizerOptions:
+    return OptimizerOptions(
+        training.optimizer, training.learning_rate, training.final_learning_rate, (training.beta1, training.beta2),
+        training.weight_decay, training.iterations,
+    )  # fmt: skip
+
+
+def build_pointwise(config: Config, rollout: Rollout, program: Program) -> PointwiseCondition | None:
+    """The program's condition off the closed loops; None without weight.
+
+    Raises:
+        UsageError: a region or a file of counterexamples that does not fit the system.
+    """
+    options, problem = config.pointwise, rollout.problem
+    if not options.weight:
+        return None
+    n, goal, initial_states = problem.system.n, problem.goal, problem.initial_states
+    furthest = initial_states.reach_from(goal)
+    extent = entry_per_state("pointwise.region", options.region, problem.system) or (1.5 * furthest).tolist()
+    if min(extent) <= 0:
+        raise UsageError("Expected pointwise.region, got none, and X₀ is thin; give a bound of each |x_i|.")
+    reach = torch.tensor(extent, dtype=torch.float64).to(goal)
+    region = Box(goal - reach, goal + reach)
+    further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(goal)
+    return PointwiseCondition(rollout, program, region, options.weight, options.points, further)
+
+
+def _points_of(path: Path, n: int) -> Tensor:
+    """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            heading, *lines = csv.reader(file)
+        if heading[:1] != ["t"]:
+            raise ValueError("no heading t, …")
+        rows = [[float(entry) for entry in row] for row in lines]
+        points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
+        if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
+            raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")
+    except (OSError, ValueError) as error:
+        raise UsageError(
+            f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "
+            "see lyapnet certify --refine."
+        ) from error
+    return points
+
+
+def build_data(config: Config, problem: Problem) -> InitialStateDataModule:
+    """The batches that a config trains and validates on."""
+    options = (problem, config.training.batch_size, config.evaluation.validation_states, config.seed)
+    return EnsembleDataModule(*options, config.seeds) if config.seeds > 1 else InitialStateDataModule(*options)
+
+
+def build_callbacks(config: Config) -> list[L.Callback]:
+    """The user's own callbacks.
+
+    Raises:
+        UsageError: one that cannot be imported, is no Lightning callback, or needs arguments.
+    """
+    found = []
+    for name in config.callbacks:
+        cls = resolve(name, {}, "callbacks", L.Callback)
+        try:
+            found.append(cls())
+        except TypeError as error:
+            raise UsageError(
+                f"Expected callbacks without arguments, got {name} ({error}); give its arguments defaults."
+            ) from error
+    return found

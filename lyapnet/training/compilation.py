@@ -1,0 +1,62 @@
+"""The callback that compiles a closed loop before its first step, and when that pays."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
+
+from lyapnet.config import Config
+from lyapnet.errors import CompilationError, UntraceableError
+from lyapnet.graphs.compilation import cache_folder, has_compiler
+from lyapnet.rollout import TABLEAUX
+
+
+class Compilation(Callback):
+    """Compiles the closed loop and its gradient before the first step, where that pays, and says so.
+
+    Args:
+        console: where it is said.
+        batch_size: initial states in a training batch.
+        wanted: whether to compile in any case; else only what is on disk already.
+        record: takes down that the run is compiled, and in how many seconds.
+    """
+
+    def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[..., None]):
+        self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        module: Any = pl_module
+        try:
+            on_disk = module.compiled_before(self.batch_size)
+            if on_disk or self.wanted:
+                self._compile(trainer, module, on_disk)
+        except UntraceableError:  # which says so itself, where it runs as it is written
+            return
+        except CompilationError as error:
+            self._say(trainer, f"{error}; running without compilation.")
+
+    def _compile(self, trainer: Trainer, module: Any, on_disk: bool) -> None:
+        if not on_disk and has_compiler():
+            self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
+        started = time.perf_counter()
+        module.compile_for(self.batch_size)
+        verb, seconds = "loaded" if on_disk else "compiled", time.perf_counter() - started
+        self._say(trainer, f"{verb} machine code in {seconds:.0f} s, kept in {cache_folder()}")
+        if trainer.is_global_zero:
+            self.record(compiled=True, compilation_seconds=round(seconds, 2))
+
+    def _say(self, trainer: Trainer, line: str) -> None:
+        if trainer.is_global_zero:
+            self.console.print(line, soft_wrap=True)
+
+
+def earns_compilation(config: Config) -> bool:
+    """Whether a run is long enough to earn its compilation back.
+
+    By measurement on a 3-64-64-1 network and one CPU core, compiling takes about 45 s and then saves 0.3 ms at each
+    stage of each step, and 4 µs more for each state.
+    """
+    states, stages = config.training.batch_size * config.seeds, len(TABLEAUX[config.rollout.method].b)
+    return config.training.iterations * config.horizon.steps * stages * (3e-4 + 4e-6 * states) > 45

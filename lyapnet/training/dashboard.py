@@ -1,0 +1,41 @@
+"""What loggers show besides curves and figures: the layout of TensorBoard, and the config."""
+
+import textwrap
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from lyapnet.config import Config, to_plain, to_yaml
+from lyapnet.training.curves import loggers_of_each
+
+# the paper's panels: constraint loss beside trajectory cost
+LAYOUT = {
+    "lyapnet": {
+        "constraint loss": ["Multiline", ["constraint_loss/train", "constraint_loss/val"]],
+        "trajectory cost": ["Multiline", ["trajectory_cost/train", "trajectory_cost/val"]],
+        "optimality gap and value error": ["Multiline", ["optimality_gap/val", "value_error/val"]],
+        "satisfied and decreasing": ["Multiline", ["satisfied_fraction/val", "decreasing_fraction/val"]],
+    }
+}
+
+
+class Dashboard(Callback):
+    """Shows each member's config before the first step: TensorBoard as text, beside the layout of its curves.
+
+    Args:
+        configs: one for each member.
+    """
+
+    def __init__(self, configs: list[Config]):
+        self.configs = configs
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        for loggers, config in zip(loggers_of_each(trainer, pl_module), self.configs, strict=True):
+            for logger in loggers:
+                if not isinstance(logger, TensorBoardLogger):
+                    logger.log_hyperparams(to_plain(config))
+                elif trainer.global_step == 0:
+                    logger.experiment.add_custom_scalars(LAYOUT)
+                    logger.experiment.add_text("config", textwrap.indent(to_yaml(config), "    "))

@@ -1,0 +1,102 @@
+"""Initial states: a fresh batch of X₀ for every training step, a fixed draw for validation."""
+
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from lyapnet.errors import CheckpointError
+from lyapnet.problem import Problem
+from lyapnet.random_streams import TRAINING, VALIDATION, stream
+from lyapnet.types import State
+
+
+class InitialStateDataModule(L.LightningDataModule):
+    """Batches (b, n) from X₀.
+
+    The batch of a step is a function of (seed, process, step) alone: a run that resumes at a step draws what it
+    would have drawn, whatever was prefetched or lost, and processes never share a batch.
+
+    Args:
+        problem: whose X₀ is meant.
+        batch_size: initial states in each training batch, per process.
+        validation_states: size of the one validation batch, the same at every validation.
+        seed: of all streams.
+        steps_per_epoch: training steps that Lightning calls an epoch, after which it validates. No state is seen twice.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        batch_size: int = 64,
+        validation_states: int = 64,
+        seed: int = 0,
+        steps_per_epoch: int = 1,
+    ):
+        super().__init__()
+        self.problem, self.batch_size = problem, batch_size
+        self.validation_states, self.seed, self.steps_per_epoch = validation_states, seed, steps_per_epoch
+
+    def batch(self, step: int, process: int = 0) -> State:
+        """The training batch of a step in a process."""
+        return self.problem.initial_states.sample(self.batch_size, stream(self.seed, TRAINING, process, step))
+
+    def train_dataloader(self) -> DataLoader:
+        return DataLoader(_Epoch(self), batch_size=None)
+
+    def validation_batch(self) -> State:
+        """The states of every validation."""
+        return self.problem.initial_states.sample(self.validation_states, stream(self.seed, VALIDATION))
+
+    def val_dataloader(self) -> DataLoader:
+        return DataLoader([self.validation_batch()], batch_size=None)  # pyright: ignore[reportArgumentType]
+
+    def position(self) -> int:
+        """The step whose batch comes next."""
+        return self.trainer.global_step if self.trainer else 0
+
+    def state_dict(self) -> dict[str, Any]:
+        """The position of the training stream: its seed and the step whose batch comes next."""
+        return {"seed": self.seed, "step": self.position()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if state_dict["seed"] != self.seed:
+            raise CheckpointError(
+                f"Expected to resume the stream of seed {state_dict['seed']}, got seed {self.seed}; "
+                "keep the seed, or start a new run with --finetune."
+            )
+
+
+class EnsembleDataModule(InitialStateDataModule):
+    """Batches (E, b, n): for each of the seeds seed, seed + 1, … what its run alone would draw.
+
+    Args:
+        seeds: E.
+    """
+
+    def __init__(self, problem: Problem, batch_size: int, validation_states: int, seed: int, seeds: int):
+        super().__init__(problem, batch_size, validation_states, seed)
+        self.members = [InitialStateDataModule(problem, batch_size, validation_states, seed + k) for k in range(seeds)]
+
+    def batch(self, step: int, process: int = 0) -> Tensor:
+        return torch.stack([member.batch(step, process) for member in self.members])
+
+    def validation_batch(self) -> Tensor:
+        return torch.stack([member.validation_batch() for member in self.members])
+
+
+class _Epoch(Dataset):
+    """The batches of the steps of an epoch, from the one that comes next."""
+
+    def __init__(self, states: InitialStateDataModule):
+        self.states = states
+
+    def __len__(self) -> int:
+        return self.states.steps_per_epoch
+
+    def __getitem__(self, index: int) -> Tensor:
+        states = self.states
+        first = states.position() // states.steps_per_epoch * states.steps_per_epoch
+        return states.batch(first + index, states.trainer.global_rank if states.trainer else 0)

@@ -1,0 +1,134 @@
+"""One experiment, from its config to the evaluation of what it trained."""
+
+import resource
+import shlex
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from rich.console import Console
+
+from lyapnet.build import parts_of
+from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
+from lyapnet.controller import load
+from lyapnet.errors import DivergenceError, Interrupted
+from lyapnet.evaluation import evaluate
+from lyapnet.files import write_atomically, write_json
+from lyapnet.training.build import build_data
+from lyapnet.training.curves import loggers_of_each
+from lyapnet.training.loggers import log_result, take_back_after
+from lyapnet.training.plan import Plan, plan_run
+from lyapnet.training.runs import CONFIG, EVALUATION, Run
+from lyapnet.training.trainer import build_trainer
+from lyapnet.training.validation_optimum import optimum_progress
+
+
+def train(
+    config: str | Path | Mapping[str, Any] | Config,
+    overrides: Sequence[str] = (),
+    *,
+    resume: str | None = None,
+    finetune: str | Path | None = None,
+    console: Console | None = None,
+) -> Run:
+    """Train one experiment, as `lyapnet train` does; its run, with `folder`, `best` and `evaluation`.
+
+    Args:
+        config: a YAML file, its content as nested dictionaries, or a Config.
+        overrides: changes to it, as key.sub=value.
+        resume: "last", or the path of a checkpoint: go on with that run. One that is finished is left as it is.
+        finetune: a checkpoint whose weights a new run starts from.
+        console: where the progress is shown; None: the terminal.
+
+    Raises:
+        LyapnetError: as plan_run and fit.
+    """
+    if isinstance(config, str | Path):
+        resolved = load_config(config, overrides)
+        again = shlex.join(["python", "train.py", "--config", str(config), *overrides, "--resume", "last"])
+    else:
+        content = to_plain(config) if isinstance(config, Config) else config
+        resolved, again = config_from_plain(content, overrides), 'lyapnet.train(…, resume="last")'
+    plan = plan_run(resolved, resume, None if finetune is None else Path(finetune))
+    if not plan.finished:
+        fit(plan, console or Console(highlight=False), again)
+    return plan.run
+
+
+def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
+    """Train to the end of the config's iterations; the evaluation of the best checkpoint.
+
+    Args:
+        again: the command that resumes the run.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM, after saving.
+        DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
+        LyapnetError: a file of the run cannot be read or written.
+    """
+    config, run, module = plan.config, plan.run, plan.module
+    trainer = build_trainer(plan, console)
+    if trainer.is_global_zero:
+        _prepare_folder(plan)
+        console.print(f"[bold]{config.experiment}[/]  {run.folder}", soft_wrap=True)
+    started = time.perf_counter()
+    try:
+        torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
+        data = build_data(config, module.members[0].problem)
+        trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
+    except Interrupted as stop:
+        hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
+        raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
+    except DivergenceError as error:
+        kept = f" Kept: {run.last}." if run.last.exists() else ""
+        raise DivergenceError(f"{error}{kept}") from error
+    finally:
+        if trainer.is_global_zero:
+            _note_what_it_took(run, time.perf_counter() - started)
+    return _finish(trainer, plan, console) if trainer.is_global_zero else {}
+
+
+def _prepare_folder(plan: Plan) -> None:
+    """Write what the run is; take back what it logged after the point from which it goes on."""
+    folder = plan.run.folder
+    (folder / EVALUATION).unlink(missing_ok=True)
+    write_atomically(folder / CONFIG, to_yaml(plan.config).encode())
+    for run in plan.run.members(plan.config):
+        take_back_after(run, plan.step if plan.resume_from else None)
+
+
+def _note_what_it_took(run: Run, seconds: float) -> None:
+    """Add this process's share to the run's record."""
+    record, peak = run.record(), 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # Linux counts in KiB
+    total = record.get("training_seconds", 0.0) + seconds
+    run.note(training_seconds=round(total, 2), peak_bytes=max(record.get("peak_bytes", 0), peak))
+
+
+def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
+    """Evaluate each best checkpoint, log it as its run's final metrics, and mark the run as finished."""
+    config, options = plan.config, plan.config.evaluation
+    parts, results = parts_of(config), []
+    runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
+    for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
+        controller = load(run.best, **vars(parts))
+        with optimum_progress(console) as progress:
+            results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
+        log_result(own, one, results[-1], trainer.global_step)
+    result = results[0] if config.seeds == 1 else over_seeds(results)
+    write_json(plan.run.folder / EVALUATION, result)
+    return result
+
+
+def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The evaluations of several seeds, and mean and standard deviation of each measure that all of them have."""
+    measures = [key for key in results[0] if all(isinstance(result[key], float) for result in results)]
+    columns = {key: [result[key] for result in results] for key in measures}
+    return {
+        "mean": {key: statistics.fmean(values) for key, values in columns.items()},
+        "spread": {key: statistics.stdev(values) for key, values in columns.items()},
+        "seeds": list(results),
+    }

@@ -1,0 +1,77 @@
+"""Figures during a training, wherever its loggers can show them."""
+
+import warnings
+from collections.abc import Sequence
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
+from matplotlib.figure import Figure
+
+from lyapnet.drawing import pixels
+from lyapnet.errors import DivergenceError
+from lyapnet.evaluation import figures
+from lyapnet.random_streams import FIGURES, stream
+from lyapnet.training.curves import with_loggers
+from lyapnet.training.learner import Learner
+
+
+class FigureLogger(Callback):
+    """Draws the certified region, some trajectories and slices of V during training: the first member's.
+
+    Args:
+        every: steps between drawings; the last validation always draws.
+    """
+
+    def __init__(self, every: int):
+        self.every = every
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step == 0:
+            self._draw(trainer, pl_module)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        step = trainer.global_step
+        if step % self.every == 0 or step == trainer.max_epochs:
+            self._draw(trainer, pl_module)
+
+    def _draw(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        member, loggers = next(with_loggers(trainer, pl_module))
+        if not trainer.is_global_zero or not any(map(_shows_figures, loggers)):
+            return
+        try:
+            drawn = figures_of(member)
+        except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
+            warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
+            return
+        for name, figure in drawn.items():
+            log_figure(loggers, name, figure, trainer.global_step)
+
+
+def figures_of(learner: Learner) -> dict[str, Figure]:
+    """Name ↦ figure of what a learner has reached."""
+    problem = learner.problem
+    x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
+    with torch.no_grad():
+        sample = learner.rollout(x0)
+    return {
+        "certified_region": figures.certified_region(learner.rollout, problem),
+        "trajectories": figures.trajectories(sample, problem.system),
+        "value_slices": figures.value_slices(learner.V, problem),
+    }
+
+
+def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:
+    """Show a figure in TensorBoard, MLflow, and every logger that takes images as Lightning's WandbLogger does."""
+    image = pixels(figure)
+    for logger in loggers:
+        if isinstance(logger, TensorBoardLogger):
+            logger.experiment.add_image(name, image, step, dataformats="HWC")
+        elif isinstance(logger, MLFlowLogger):
+            logger.experiment.log_figure(logger.run_id, figure, f"{name}/{step:06d}.png")
+        elif _shows_figures(logger):
+            logger.log_image(key=name, images=[image], step=step)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _shows_figures(logger: Logger) -> bool:
+    return isinstance(logger, TensorBoardLogger | MLFlowLogger) or hasattr(logger, "log_image")

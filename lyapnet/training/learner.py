@@ -1,0 +1,117 @@
+"""What one seed trains: V in the closed loop of its own policy, and what was last measured of it."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.problem import Problem
+from lyapnet.programs import PointwiseCondition, Program, ProgramOutput
+from lyapnet.random_streams import POINTS, VALIDATION, stream
+from lyapnet.rollout import Rollout, Trajectory
+from lyapnet.types import PerState
+
+
+class Learner(nn.Module):
+    """A V, the closed loop of its policy, and the program that it minimises.
+
+    Args:
+        problem: what is to be solved.
+        V: what is trained.
+        rollout: the closed loop of a policy that V defines.
+        program: what is minimised.
+        pointwise: the program's condition off the closed loops, if that is a term too.
+        seed: of the points at which that condition is asked for.
+        label: tells it apart in messages and names of files; "" for the only one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        V: ValueFunction,
+        rollout: Rollout,
+        program: Program,
+        pointwise: PointwiseCondition | None = None,
+        seed: int = 0,
+        label: str = "",
+    ):
+        super().__init__()
+        self.problem, self.V, self.rollout = problem, V, rollout
+        self.program, self.pointwise, self.seed, self.label = program, pointwise, seed, label
+        self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
+        # of the last training step and the last validation, for whoever shows them
+        self.gradient_norm = self.steps_per_second = math.nan
+        self.output: ProgramOutput | None = None
+        self.validation: StateTable | None = None
+        self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
+
+    def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
+        """The loss of a training batch; its parts are kept in `output`.
+
+        Args:
+            draw: names the stream of the points off the closed loops.
+        """
+        output = self._with_pointwise(self.program(trajectory, mean_over_processes), trajectory, draw)
+        terms = {name: term.detach() for name, term in output.terms.items()}
+        self.output = ProgramOutput(
+            output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
+        )
+        return output.loss
+
+    def measure_on(self, trajectory: Trajectory) -> Tensor:
+        """The loss of the validation states and points; the states' table is kept in `validation`."""
+        self.validation = measure(self.problem, self.program, trajectory, self.validation_optimum)
+        return self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+
+    def _with_pointwise(self, output: ProgramOutput, trajectory: Trajectory, draw: Sequence[int]) -> ProgramOutput:
+        """The program with its condition off the closed loops, where that has a weight."""
+        if self.pointwise is None:
+            return output
+        values, mean_cost = trajectory.require_value(), mean_over_processes(output.trajectory_cost.detach())
+        term = self.pointwise(stream(self.seed, *draw), mean_cost, values[0].max())
+        loss = output.loss + self.pointwise.weight * term
+        return output._replace(loss=loss, terms={**output.terms, "pointwise": term})
+
+    def training_scalars(self) -> dict[str, float | Tensor]:
+        """What the curves show of the last training step, by name."""
+        assert self.output is not None
+        return {
+            "loss/train": self.output.loss,
+            **{f"term/{name}": value for name, value in self.output.terms.items()},
+            "constraint_loss/train": self.output.constraint_loss,
+            "trajectory_cost/train": self.output.trajectory_cost,
+            "gradient_norm": self.gradient_norm,
+            "rollout_steps_per_second": self.steps_per_second,
+        }
+
+    def validation_scalars(self) -> dict[str, float]:
+        """What the curves show of the last validation, by name; without what is not known."""
+        assert self.validation is not None
+        summary = self.validation.summary()
+        ratio = summary["cost_ratio"]
+        scalars = {
+            "constraint_loss/val": summary["constraint_loss"],
+            "trajectory_cost/val": summary["cost_mean"],
+            "optimality_gap/val": None if ratio is None else ratio - 1,
+            **{
+                f"{name}/val": summary[name]
+                for name in (
+                    "value_error", "value_to_cost", "satisfied_fraction", "bounded_fraction", "decreasing_fraction",
+                    "terminal_error",
+                )
+            },
+        }  # fmt: skip
+        return {name: value for name, value in scalars.items() if value is not None}
+
+
+def mean_over_processes(value: Tensor) -> Tensor:
+    """The mean of a number over the processes that train together; itself where there is one."""
+    if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
+        return value
+    total = value.clone()
+    torch.distributed.all_reduce(total)
+    return total / torch.distributed.get_world_size()

@@ -1,0 +1,344 @@
+"""The LightningModules: what they compute stands in programs/; what is shown, logged and saved, in callbacks.
+
+One V is trained by a ValueModule; several seeds that train as one batch, by an EnsembleModule.
+"""
+
+import math
+import re
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor, nn
+
+from lyapnet import __version__
+from lyapnet.calculus import ValueFunction
+from lyapnet.checkpoint import KEY, write_checkpoint
+from lyapnet.errors import CheckpointError, CompilationError, DivergenceError, UsageError
+from lyapnet.policy import HJBPolicy
+from lyapnet.problem import Problem
+from lyapnet.programs import PointwiseCondition, Program
+from lyapnet.random_streams import POINTS
+from lyapnet.rollout import ADAPTIVE_METHODS, DiscreteAdjoint, Rollout, Trajectory
+from lyapnet.training.curves import ScalarLogger, Stopwatch
+from lyapnet.training.learner import Learner
+
+
+@dataclass(frozen=True)
+class OptimizerOptions:
+    """Adam, or AdamW with decoupled weight decay; the learning rate falls along half a cosine."""
+
+    name: str = "adam"  # or adamw
+    learning_rate: float = 1e-2  # at the first step
+    final_learning_rate: float = 1e-4  # at the last step, and after it
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 0.0
+    iterations: int | None = None  # steps of the schedule; None: those of the trainer
+
+    def optimizer(self, parameters: Sequence[nn.Parameter]) -> torch.optim.Optimizer:
+        """The optimizer of some parameters."""
+        cls = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.name]
+        return cls(parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
+
+    def rate(self, step: int, iterations: float) -> float:
+        """The learning rate at a step, as a share of the first."""
+        final = self.final_learning_rate / self.learning_rate
+        progress = min(step / iterations, 1.0)
+        return final + (1 - final) * (1 + math.cos(math.pi * progress)) / 2
+
+
+class TrainingModule(L.LightningModule):
+    """Minimises the sum of its members' losses, each over weights and on initial states of its own."""
+
+    def __init__(self, members: Sequence[Learner], optimizer: OptimizerOptions):
+        super().__init__()
+        self.members: Sequence[Learner] = nn.ModuleList(members)  # pyright: ignore
+        self.optimizer_options = optimizer
+        self.metadata: dict[str, Any] = {}  # plain data that checkpoints carry: the config, where there is one
+
+    @abstractmethod
+    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
+        """The members' closed loops from their initial states.
+
+        Raises:
+            DivergenceError: when it is the turn of one that is not finite.
+        """
+
+    @abstractmethod
+    def save_member(self, member: Learner, path: Path) -> None:
+        """Write a checkpoint that `lyapnet.load` takes for that of the member's own run."""
+
+    @abstractmethod
+    def compile_for(self, batch_size: int) -> None:
+        """Compile the closed loop and its gradient for training batches of this size; see DiscreteAdjoint.compile."""
+
+    @abstractmethod
+    def compiled_before(self, batch_size: int) -> bool:
+        """Whether `compile_for` would find everything on disk."""
+
+    def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
+        """One evaluation of each member's program on its initial states."""
+        draw = (POINTS, self.global_rank, self.global_step)
+        losses = self._for_each(x0, lambda member, trajectory: member.train_on(trajectory, draw))
+        return {"loss": torch.stack(losses).sum()}
+
+    def validation_step(self, x0: Tensor, batch_idx: int) -> None:
+        """The tables of the fixed validation states, and the losses that pick the best checkpoints."""
+        for member, loss in zip(self.members, self.validate_on(x0), strict=True):
+            self.log(labelled("loss/val", member.label), loss, logger=False, sync_dist=True)
+
+    def validate_on(self, x0: Tensor) -> list[Tensor]:
+        """Fill each member's `validation` with the table of its states; the programs' losses on them."""
+        with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
+            return self._for_each(x0.clone(), Learner.measure_on)
+
+    def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
+        """What `evaluate` makes of each member's trajectories; a divergence names iteration and member."""
+        trajectories, results = self.trajectories(x0), []
+        for member in self.members:
+            try:
+                results.append(evaluate(member, next(trajectories)))
+            except DivergenceError as error:
+                raise DivergenceError(f"{self._place(member.label)}: {error}") from error
+        return results
+
+    def _place(self, label: str) -> str:
+        return f"Iteration {self.global_step}" + (f", {label.replace('_', ' ')}" if label else "")
+
+    def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
+        """Lightning's, which also meets an adaptive adjoint that gives up."""
+        try:
+            super().backward(loss, *args, **kwargs)
+        except AssertionError as error:
+            if self.members[0].rollout.method not in ADAPTIVE_METHODS:
+                raise
+            raise DivergenceError(
+                f"{self._place('')}: Expected the adjoint to reach t = 0, got {error}; lower "
+                "training.learning_rate, or take rollout.gradient=backprop."
+            ) from error
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Record the norm of each member's gradient; refuse to step along one that is not finite."""
+        for member in self.members:
+            norms = [p.grad.norm() for p in member.V.parameters() if p.grad is not None]
+            member.gradient_norm = float(torch.stack(norms).norm())
+            if not math.isfinite(member.gradient_norm):
+                raise DivergenceError(
+                    f"{self._place(member.label)}: Expected a finite gradient, got norm {member.gradient_norm}; lower "
+                    "training.learning_rate or set trainer.gradient_clip_val."
+                )
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """One optimizer for all members: what it does to a weight depends on no other one."""
+        options = self.optimizer_options
+        optimizer = options.optimizer([p for member in self.members for p in member.V.parameters()])
+        iterations = options.iterations or self.trainer.estimated_stepping_batches
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: options.rate(step, iterations))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def configure_callbacks(self) -> list[L.Callback]:
+        """The curves, for any trainer; one that has these callbacks keeps its own."""
+        present = {type(callback) for callback in self.trainer.callbacks}  # pyright: ignore
+        stopwatch = Stopwatch()
+        return [c for c in (stopwatch, ScalarLogger(stopwatch)) if type(c) not in present]
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Add what `lyapnet.load` needs, as plain data."""
+        checkpoint[KEY] = {**self.metadata, "version": __version__}
+
+    # A checkpoint holds each weight once, under the name that it has had since version 0.1.
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
+        own = super().state_dict(*args, **kwargs)
+        return {self._stored_name(key): tensor for key, tensor in own.items() if not _is_alias(key)}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        wanted = {key: self._stored_name(key) for key in super().state_dict() if not _is_alias(key)}
+        missing = [name for name in wanted.values() if name not in state_dict]
+        if strict and missing:
+            raise CheckpointError(f"Expected weights {', '.join(missing[:6])}, got none; use the same network.")
+        further = [name for name in state_dict if name not in wanted.values() and "closed_loop." not in name]
+        if strict and further:  # version 0.1 kept V under closed_loop too
+            raise CheckpointError(f"Expected no weights {', '.join(further[:6])}, got some; use the same network.")
+        known = {key: state_dict[name] for key, name in wanted.items() if name in state_dict}
+        return super().load_state_dict(known, strict=False, assign=assign)
+
+    def _stored_name(self, key: str) -> str:
+        """What a weight is called in checkpoints."""
+        return key
+
+
+def _is_alias(key: str) -> bool:
+    """Whether it names a weight of V by its place in the closed loop."""
+    return re.match(r"members\.\d+\.rollout\.", key) is not None
+
+
+class ValueModule(TrainingModule):
+    """Minimises a program over the weights of V, through the closed loop of V's own policy.
+
+        lightning.Trainer(max_epochs=300).fit(ValueModule(problem, V, ValueProgram()), InitialStateDataModule(problem))
+
+    Args:
+        problem: what is to be solved.
+        V: what is trained.
+        program: what is minimised: a ValueProgram makes V the cost-to-go of its greedy policy, a LyapunovProgram makes
+            V fall along the closed loop at least as fast as the cost accrues.
+        rollout: the closed loop of a policy that V defines; None: the HJB policy under Euler, with its exact gradient.
+        pointwise: the program's condition off the closed loops, if that is a term too.
+        optimizer: how the weights move.
+        seed: of the points at which that condition is asked for.
+
+    Raises:
+        ValueError: f, g or the cost break their contracts.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        V: ValueFunction,
+        program: Program,
+        rollout: Rollout | None = None,
+        pointwise: PointwiseCondition | None = None,
+        optimizer: OptimizerOptions | None = None,
+        seed: int = 0,
+    ):
+        problem.check()
+        rollout = Rollout(problem, HJBPolicy(problem, V), gradient="discrete") if rollout is None else rollout
+        member = Learner(problem, V, rollout, program, pointwise, seed)
+        super().__init__([member], optimizer or OptimizerOptions())
+
+    @property
+    def problem(self) -> Problem:
+        """What is to be solved."""
+        return self.members[0].problem
+
+    @property
+    def V(self) -> ValueFunction:
+        """What is trained."""
+        return self.members[0].V
+
+    @property
+    def rollout(self) -> Rollout:
+        """The closed loop."""
+        return self.members[0].rollout
+
+    @property
+    def program(self) -> Program:
+        """What is minimised."""
+        return self.members[0].program
+
+    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
+        yield self.rollout(x0)
+
+    def save_member(self, member: Learner, path: Path) -> None:
+        self.trainer.save_checkpoint(path)
+
+    def compile_for(self, batch_size: int) -> None:
+        if self.rollout.discrete is not None:
+            self.rollout.discrete.compile(self._any_batch(batch_size))
+
+    def compiled_before(self, batch_size: int) -> bool:
+        discrete = self.rollout.discrete
+        return discrete is not None and discrete.is_on_disk(self._any_batch(batch_size))
+
+    def _any_batch(self, batch_size: int) -> Tensor:
+        return self.problem.initial_states.center.expand(batch_size, -1).contiguous()
+
+    def _stored_name(self, key: str) -> str:
+        return key.removeprefix("members.0.")
+
+
+class EnsembleModule(TrainingModule):
+    """Several seeds' runs as one batch: each equals the run of its seed alone, up to rounding.
+
+    Args:
+        members: of one problem, with networks of one shape; each rollout by the gradient's discrete route.
+        batch_size: initial states of each member in a training batch.
+        optimizer: how the weights move.
+
+    Raises:
+        UsageError: the gradient's route has no batch of closed loops; or the members' closed loops differ in more than
+            trained weights.
+    """
+
+    def __init__(self, members: Sequence[Learner], batch_size: int, optimizer: OptimizerOptions | None = None):
+        super().__init__(members, optimizer or OptimizerOptions())
+        gradient = members[0].rollout.gradient
+        if gradient != "discrete":
+            raise UsageError(
+                f"Expected rollout.gradient=discrete for seeds={len(members)}, got {gradient}; set it, or train the "
+                "seeds one by one."
+            )
+        self._require_one_batch(batch_size)
+
+    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
+        return self.members[0].rollout.together(x0, self._weights())
+
+    def save_member(self, member: Learner, path: Path) -> None:
+        weights = {f"V.{name}": tensor for name, tensor in member.V.state_dict().items()}
+        kept = {**member.metadata, "version": __version__}
+        write_checkpoint({"state_dict": weights, "global_step": self.global_step, KEY: kept}, path)
+
+    def compile_for(self, batch_size: int) -> None:
+        self._discrete(0).compile(self._any_batch(batch_size), self._weights())
+
+    def compiled_before(self, batch_size: int) -> bool:
+        return self._discrete(0).is_on_disk(self._any_batch(batch_size), self._weights())
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Each member's gradient by itself, as in a run of its own."""
+        by_value = gradient_clip_algorithm == "value"  # Lightning's enumeration is of strings
+        clip = nn.utils.clip_grad_value_ if by_value else nn.utils.clip_grad_norm_
+        if gradient_clip_val and gradient_clip_val > 0:
+            for member in self.members:
+                clip(member.V.parameters(), gradient_clip_val)
+
+    def _weights(self) -> list[Tensor]:
+        """The members' trained parameters, (E, *shape) each."""
+        trained = [self._discrete(k).trained() for k in range(len(self.members))]
+        return [torch.stack(parameters) for parameters in zip(*trained, strict=True)]
+
+    def _discrete(self, k: int) -> DiscreteAdjoint:
+        discrete = self.members[k].rollout.discrete
+        assert discrete is not None
+        return discrete
+
+    def _any_batch(self, batch_size: int) -> Tensor:
+        center = self.members[0].problem.initial_states.center
+        return center.expand(len(self.members), batch_size, -1).contiguous()
+
+    def _require_one_batch(self, batch_size: int) -> None:
+        """Hold the members against what one batch can serve: the same function of their trained weights."""
+        remedy = "train the seeds one by one"
+        first, *others = self.members
+        for other in others:
+            for name, tensor in _frozen(first.V).items():
+                if not torch.equal(tensor, _frozen(other.V)[name]):
+                    raise UsageError(
+                        f"Expected seeds to differ in trained weights alone, got another {name} in {other.label}; "
+                        f"{remedy}."
+                    )
+        try:
+            self.compiled_before(batch_size)
+        except CompilationError as error:
+            raise UsageError(f"{error}, for seeds={len(self.members)}; {remedy}.") from error
+
+
+def labelled(name: str, label: str) -> str:
+    """The name of one member's share of something; the name itself where there is but one."""
+    return f"{name}/{label}" if label else name
+
+
+def _frozen(module: nn.Module) -> dict[str, Tensor]:
+    """What a module is made of besides its trained parameters."""
+    untrained = {name: p for name, p in module.named_parameters() if not p.requires_grad}
+    return {**untrained, **dict(module.named_buffers())}

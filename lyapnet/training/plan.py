@@ -1,0 +1,93 @@
+"""What a training is to do: start a run, resume one, or start one from the weights of another."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import lightning as L
+import torch
+
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.config import Config, differing_keys, load_config
+from lyapnet.controller import config_of, load_value_function
+from lyapnet.errors import UsageError
+from lyapnet.training.build import build_callbacks, build_module
+from lyapnet.training.loggers import require_libraries
+from lyapnet.training.modules import TrainingModule
+from lyapnet.training.runs import CONFIG, LAST, PROVENANCE, Run, last_run, new_run
+from lyapnet.training.trainer_options import check_trainer_options
+
+CHANGEABLE_ON_RESUME = (
+    "training.iterations", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum",
+    "evaluation.certify_every", "evaluation.certified_states", "evaluation.confidence", "loggers", "callbacks",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step."""
+
+    config: Config
+    module: TrainingModule
+    callbacks: list[L.Callback]
+    run: Run
+    resume_from: Path | None = None  # a checkpoint
+    step: int = 0  # at which that was written
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has its end behind it: there is nothing to train."""
+        return self.resume_from is not None and self.run.finished and self.step >= self.config.training.iterations
+
+
+def plan_run(config: Config, resume: str | None = None, finetune: Path | None = None) -> Plan:
+    """Build everything that a config names, and last of all, for a new run, its folder.
+
+    Args:
+        resume: "last", or the path of a checkpoint: go on with that run.
+        finetune: a checkpoint whose weights a new run starts from.
+
+    Raises:
+        UsageError: config and checkpoint contradict each other, or there is nothing to resume.
+        CheckpointError: a checkpoint cannot be read, or its weights do not fit.
+        LyapnetError: the folder of a new run cannot be made.
+    """
+    if resume and finetune:
+        raise UsageError("Expected --resume or --finetune, got both; resume goes on, finetune starts a new run.")
+    check_trainer_options(config)
+    require_libraries(config.loggers)
+    callbacks = build_callbacks(config)
+    torch.set_num_threads(config.training.threads)  # compiled functions are kept for a number of threads
+    module = build_module(config)
+    if not resume:
+        _start_from(module, finetune)
+        return Plan(config, module, callbacks, new_run(config, finetune))
+    run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
+    if resume == LAST and not run.last.exists():  # stopped before its first checkpoint: it stands where it began
+        written = run.folder / CONFIG
+        if written.exists():
+            _require_same_experiment(config, load_config(written), written)
+        _start_from(module, run.finetuned_from)
+        return Plan(config, module, callbacks, run)
+    checkpoint = run.last if resume == LAST else Path(resume)
+    content = read_checkpoint(checkpoint)
+    if not (run.folder / PROVENANCE).is_file():
+        raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
+    _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
+    return Plan(config, module, callbacks, run, checkpoint, int(content["global_step"]))
+
+
+def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:
+    """Put the weights of a checkpoint into every member, if there is one to fine-tune from."""
+    if checkpoint is not None:
+        content = read_checkpoint(checkpoint)
+        for member in module.members:
+            load_value_function(member.V, content, checkpoint)
+
+
+def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:
+    changed = [key for key in differing_keys(config, stored) if not key.startswith(CHANGEABLE_ON_RESUME)]
+    if changed:
+        raise UsageError(
+            f"Expected the config of {str(origin)!r}, got another {', '.join(changed)}; resuming continues the "
+            "same run: undo the change, or start a new run with --finetune."
+        )

@@ -1,0 +1,87 @@
+"""The callback that shows in a terminal how far a training is."""
+
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Column
+
+from lyapnet.training.curves import members_of
+
+# the line of a validation: name, key of the summary, format
+VALIDATED = (
+    ("cost", "cost_mean", ".4g"),
+    ("cost/optimum", "cost_ratio", ".4f"),
+    ("constraint loss", "constraint_loss", ".3g"),
+    ("satisfied", "satisfied_fraction", ".0%"),
+)
+
+
+class TrainingProgress(ProgressBar):
+    """A line for each validation, and below them in a terminal: step, loss, cost, speed, time left."""
+
+    def __init__(self, console: Console):
+        super().__init__()
+        self._console, self._progress, self._task = console, None, None
+
+    def disable(self) -> None:
+        self._enabled = False
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        self._progress = Progress(
+            MofNCompleteColumn(),
+            BarColumn(bar_width=None),
+            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            TimeRemainingColumn(elapsed_when_finished=True),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._progress.add_task("…", total=trainer.max_epochs, completed=trainer.global_step)
+        self._progress.start()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        if self._progress is None or self._task is None:
+            return
+        members = members_of(pl_module)
+        outputs = [member.output for member in members if member.output is not None]
+        loss = fmean(float(output.loss) for output in outputs)
+        cost = fmean(float(output.trajectory_cost) for output in outputs)
+        speed = sum(member.steps_per_second for member in members)
+        line = f"loss {loss:.4g}  cost {cost:.4g}  {speed:,.0f} rollout steps/s"
+        self._progress.update(self._task, completed=trainer.global_step, description=line)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._progress is None:
+            return
+        tables = [member.validation for member in members_of(pl_module)]
+        summaries = [table.summary() for table in tables if table is not None]
+        measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
+        self._console.print(f"step {trainer.global_step}/{trainer.max_epochs}  {'  '.join(measures)}", soft_wrap=True)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        self._stop()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
+        if self._progress is not None:  # gives the cursor back to the terminal
+            self._progress.stop()
+            self._progress = None
+
+
+def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
+    """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
+    values = [summary[key] for summary in summaries]
+    if None in values:
+        return ""
+    mean, low, high = (format(value, form) for value in (fmean(values), min(values), max(values)))
+    return mean if len(values) == 1 else f"{mean} ({low} – {high})"

@@ -1,0 +1,110 @@
+"""Counterexamples back into training, until a sound claim is certified: `lyapnet certify --refine`."""
+
+import copy
+import csv
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from torch import Tensor
+
+from lyapnet.certification import DecreaseCondition, violations
+from lyapnet.certification.sound_certificate import SoundCertificate
+from lyapnet.config import config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.files import write_atomically
+from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.training.experiment import train
+from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
+
+POINTS_FILE = "points.csv"
+FURTHER = 256  # counterexamples, and as many undecided points, of each round
+
+
+def refine(
+    checkpoint: Path,
+    certified: Callable[[Path], SoundCertificate],
+    rounds: int,
+    overrides: Sequence[str],
+    console: Console,
+) -> tuple[Path, SoundCertificate]:
+    """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
+
+    Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
+    the checkpoint with `pointwise.counterexamples`, a weight and a region if it had none, and a fifth of its learning
+    rate; then `overrides`) and a run that starts from the weights before. What is there already is taken as it is, so
+    the same command goes on after whatever stopped it.
+
+    Args:
+        certified: makes the sound certificate of the controller of a checkpoint.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM while it trains.
+    """
+    home = checkpoint.resolve().parent.parent
+    for k in range(1, rounds + 1):
+        folder = home / f"refine_{k}"
+        run = _finished_run(folder)
+        if run is None:
+            certificate = certified(checkpoint)
+            if certificate.claim.verdict == "certified":
+                return checkpoint, certificate
+            if not (folder / CONFIG).exists():
+                _prepare(folder, certificate, overrides)
+            run = _train(folder, checkpoint, console)
+        checkpoint = run.best
+    return checkpoint, certified(checkpoint)
+
+
+def failing_points(certificate: SoundCertificate) -> Tensor:
+    """Points (t, x) at which a condition fails or is undecided inside the funnel that X₀ needs, (k, 1 + n)."""
+    controller, claim = certificate.controller, certificate.claim
+    condition = DecreaseCondition(copy.deepcopy(controller.closed_loop).double(), claim.alpha, claim.delta)
+    lower, upper = (
+        torch.cat([side.new_tensor([time]), side])
+        for time, side in ((0.0, claim.states.lower), (claim.duration, claim.states.upper))
+    )
+    generator = stream(controller.config.seed, CERTIFICATION, 1)
+    failing = violations(condition, (lower, upper), claim.wanted, FURTHER, generator)
+    chosen = torch.randperm(len(claim.undecided), generator=generator)[:FURTHER]
+    return torch.cat([failing, claim.undecided[chosen]])
+
+
+def _extent(certificate: SoundCertificate) -> list[float]:
+    """A bound of each |x_i| in D; 1 for states that the claim leaves out."""
+    return [bound if bound > 0 else 1.0 for bound in certificate.claim.states.magnitude.tolist()]
+
+
+def _finished_run(folder: Path) -> Run | None:
+    """The training of a round, if it came to its end."""
+    runs = runs_of(load_config(folder / CONFIG)) if (folder / CONFIG).exists() else []
+    return runs[-1] if runs and runs[-1].finished else None
+
+
+def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[str]) -> None:
+    """Write what a round trains on, and its config last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    controller = certificate.controller
+    config = to_plain(controller.config)
+    pointwise, earlier = config["pointwise"], config["pointwise"]["counterexamples"]
+    rows = [["t", *controller.system.state_names], *failing_points(certificate).tolist()]
+    if earlier is not None:
+        with Path(earlier).open(encoding="utf-8", newline="") as file:
+            rows += list(csv.reader(file))[1:]
+    text = io.StringIO()
+    csv.writer(text).writerows(rows)
+    write_atomically(folder / POINTS_FILE, text.getvalue().encode())
+    config["logs"], config["experiment"] = str(folder.parent), folder.name
+    pointwise["counterexamples"] = str(folder / POINTS_FILE)
+    pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
+    pointwise["region"] = pointwise["region"] or _extent(certificate)
+    config["training"]["learning_rate"] /= 5
+    write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())
+
+
+def _train(folder: Path, checkpoint: Path, console: Console) -> Run:
+    """Train a round to its end, from where it stands."""
+    begun = runs_of(load_config(folder / CONFIG))
+    resume, finetune = (LAST, None) if begun else (None, checkpoint)
+    return train(folder / CONFIG, resume=resume, finetune=finetune, console=console)

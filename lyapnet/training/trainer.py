@@ -1,0 +1,81 @@
+"""The Lightning trainer of a run: its loggers, its callbacks, and how it writes and reads checkpoint files."""
+
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from rich.console import Console
+
+from lyapnet.checkpoint import read_plain_data, write_checkpoint
+from lyapnet.config import configs_of_seeds
+from lyapnet.training.certified_share import CertifiedShare
+from lyapnet.training.checkpoints import Checkpoints
+from lyapnet.training.compilation import Compilation, earns_compilation
+from lyapnet.training.curves import ScalarLogger, Stopwatch
+from lyapnet.training.dashboard import Dashboard
+from lyapnet.training.figure_logger import FigureLogger
+from lyapnet.training.loggers import loggers_of_run
+from lyapnet.training.plan import Plan
+from lyapnet.training.progress import TrainingProgress
+from lyapnet.training.trainer_options import trainer_options
+from lyapnet.training.validation_optimum import ValidationOptimum
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's door to checkpoint files: all or nothing on writing, nothing executed on reading."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        write_checkpoint(checkpoint, path)
+
+    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
+        return read_plain_data(path, map_location or "cpu")
+
+
+def build_trainer(plan: Plan, console: Console) -> L.Trainer:
+    """The trainer of a planned run; it makes no file yet."""
+    config, resumed_at = plan.config, plan.step if plan.resume_from else None
+    loggers = [logger for run in plan.run.members(config) for logger in loggers_of_run(config, run, resumed_at)]
+    return L.Trainer(
+        max_epochs=config.training.iterations,  # an epoch is one step
+        check_val_every_n_epoch=config.training.validate_every,
+        log_every_n_steps=1,
+        num_sanity_val_steps=0,
+        inference_mode=False,  # figures and certificates need V_x after a validation too
+        enable_model_summary=False,
+        use_distributed_sampler=False,  # each process has a stream of its own
+        default_root_dir=plan.run.folder,
+        logger=loggers,
+        callbacks=_callbacks(plan, console),
+        plugins=[AtomicCheckpointIO()],
+        **trainer_options(config),
+    )
+
+
+def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
+    """All callbacks, in the order in which they act."""
+    config, run, stopwatch = plan.config, plan.run, Stopwatch()
+    options, every, members = config.evaluation, config.training.validate_every, plan.module.members
+    best = {member.label: one.best for member, one in zip(members, run.members(config), strict=True)}
+    certified = CertifiedShare(every * options.certify_every, options.certified_states, options.confidence)
+    return [
+        *_compilation(plan, console),
+        ValidationOptimum(console, options.optimum),
+        Dashboard(configs_of_seeds(config)),
+        stopwatch,
+        ScalarLogger(stopwatch),
+        FigureLogger(every * options.figures_every),
+        *([certified] if options.certify_every else []),
+        TrainingProgress(console),
+        *plan.callbacks,
+        Checkpoints(run.last, best, every),
+    ]
+
+
+def _compilation(plan: Plan, console: Console) -> list[Compilation]:
+    """What compiles the run, if anything may; a resumed run goes on as it was."""
+    options = plan.config.rollout
+    goes_on = plan.resume_from is not None
+    if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
+        return []
+    wanted = goes_on or options.compile == "on" or earns_compilation(plan.config)
+    return [Compilation(console, plan.config.training.batch_size, wanted, plan.run.note)]

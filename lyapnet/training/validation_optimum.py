@@ -1,0 +1,71 @@
+"""The optimum of the validation states, found before the first step."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
+from torch import Tensor
+
+from lyapnet.errors import OracleError
+from lyapnet.evaluation.oracles import Report, oracle_of
+from lyapnet.training.curves import data_of, members_of
+from lyapnet.training.learner import Learner
+
+
+class ValidationOptimum(Callback):
+    """Finds the optimum of the validation states before the first step, and says so.
+
+    A checkpoint keeps it, so that a run is compared with the same numbers to its end, whatever the cache has by then.
+
+    Args:
+        console: where it is said.
+        wanted: whether an optimum that is not known yet is sought.
+    """
+
+    def __init__(self, console: Console, wanted: bool = True):
+        self.console, self.wanted = console, wanted
+        self.cost: Tensor | None = None  # (members, b)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {} if self.cost is None else {"cost": self.cost}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.cost = state_dict.get("cost")
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        members = members_of(pl_module)
+        if self.cost is None and self.wanted:
+            states = data_of(trainer).validation_batch()
+            found = self._solve(members[0], states) if trainer.is_global_zero else None
+            self.cost = trainer.strategy.broadcast(found)
+        if self.cost is not None:
+            for member, cost in zip(members, self.cost.to(pl_module.device), strict=True):
+                member.validation_optimum = cost
+
+    def _solve(self, member: Learner, states: Tensor) -> Tensor | None:
+        """J* (members, b) of states (members, b, n), or (1, b) of (b, n); None where there is no oracle."""
+        started = time.perf_counter()
+        try:
+            with optimum_progress(self.console) as progress:
+                oracle = oracle_of(member.problem, member.rollout.method)
+                optima = oracle.solve(states.flatten(0, -2), progress=progress)
+        except OracleError as error:
+            self.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
+            return None
+        seconds, missing = time.perf_counter() - started, ""
+        if optima.failures:
+            missing = f"; unknown for {optima.failures}, which are left out"
+        if missing or seconds > 0.2:  # else nobody waits for it
+            mean = f"mean {optima.cost.nanmean():.4g}, in {seconds:.0f} s"
+            self.console.print(f"optimum of {len(optima.cost)} validation states: {mean}{missing}", soft_wrap=True)
+        return optima.cost.cpu().reshape(-1, states.shape[-2])
+
+
+@contextmanager
+def optimum_progress(console: Console) -> Iterator[Report]:
+    """A line in a terminal that says how far an oracle is."""
+    with console.status("optimum …") as status:
+        yield lambda done, total: status.update(f"optimum: {done} of {total} initial states")

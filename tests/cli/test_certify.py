@@ -1,0 +1,204 @@
+"""lyapnet certify: its JSON for every kind of claim, its table, and what it refuses."""
+
+import inspect
+import json
+import subprocess
+import sys
+
+import pytest
+from typer.main import get_command
+
+from lyapnet.certification import funnel
+from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
+from lyapnet.certification.sound_certificate import SoundCertificate, parse_set, sound_certificate
+from lyapnet.cli import certify, main
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from lyapnet.systems import DoubleIntegrator
+from tests.problems import Formula, problem_of
+
+MAKERS = {"sampled": sampled_certificate, "statistical": statistical_certificate, "sound": sound_certificate}
+
+TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4",
+        "loggers=[csv]"]  # no figures  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_seconds_for_levels():
+    """What is sought beside the proof takes no longer than this; it decides no verdict here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(funnel, "LEVELS", 0.5)
+        patch.setattr(funnel, "FINISH", 0.5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    changes = [f"logs={folder}", "network.hidden=[8]", *TINY]
+    assert main(["train", "--config", "conf/double_integrator.yaml", *changes]) == 0
+    return str(folder / "double_integrator/version_0/checkpoints/best.ckpt")
+
+
+def certificate(capsys, *arguments):
+    capsys.readouterr()
+    assert main(["certify", *arguments, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_sampled_and_statistical(checkpoint, capsys):
+    sampled = certificate(capsys, "sampled", checkpoint)
+    assert sampled["kind"] == "sampled"
+    assert sampled["samples"] == 100
+    assert 0 <= sampled["all_share"] <= min(sampled[f"{e}_share"] for e in ("decrease", "cost"))
+    assert "terminal_share" not in sampled, "no radius was named"
+    assert sampled["verdict"] == ("unknown" if sampled["all_share"] == 1 else "falsified")
+    everything = ("--radius", "100", "--samples", "300", "--confidence", "0.9")
+    result = certificate(capsys, "statistical", checkpoint, *everything)
+    assert result["kind"] == "statistical"
+    assert result["confidence"] == 0.9
+    assert result["terminal_share"] == 1
+    assert result["terminal_lower_bound"] == pytest.approx(0.1 ** (1 / 300))
+    assert result["probability_lower_bound"] <= result["terminal_lower_bound"]
+    assert result["verdict"] in ("certified", "falsified", "unknown")
+
+
+def test_sound(checkpoint, capsys, tmp_path):
+    options = ("--seconds", "1", "--figure", str(tmp_path / "funnel.png"), "--delta", "0.5")
+    result = certificate(capsys, "sound", checkpoint, *options)
+    keys = {"kind", "verdict", "alpha", "delta", "rho", "set", "volume_share", "guaranteed_cost_ratio"}
+    keys |= {"boxes", "seconds", "counterexample"}
+    assert keys <= result.keys()
+    assert result["kind"] == "sound"
+    assert result["verdict"] != "certified"  # two steps of training are not enough
+    assert result["alpha"] == 0.95
+    assert (tmp_path / "funnel.png").stat().st_size > 0
+
+
+def test_tables(checkpoint, capsys):
+    few = ["--samples", "20"]
+    for kind, options, shown in (
+        ("sampled", few, "sampled"),
+        ("statistical", few, "1 − 1e-06"),
+        ("sound", ["--seconds", "0.5"], "cost per second"),
+    ):
+        assert main(["certify", kind, checkpoint, *options]) == 0
+        assert shown in capsys.readouterr().out
+
+
+REFUSED = [
+    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, got 'certain'"),
+    ("certify sound --set=1,2", "Expected --set as lower:upper"),
+    ("certify sound --set=-0.5:0.5,-2:2", "Expected a set around X₀"),
+    ("certify sound --set=-2:2", "Expected a set of 2 states, got 1"),
+    ("certify sound --alpha=1.5", "Expected --alpha in (0, 1], got 1.5"),
+    ("certify sound --alpha=0", "Expected --alpha in (0, 1], got 0"),
+    ("certify sound --delta=-1", "Expected --delta ≥ 0, got -1"),
+    ("certify sound --delta=nan", "Expected --delta ≥ 0, got nan"),
+    ("certify sound --seconds=0", "Expected --seconds > 0, got 0"),
+    ("certify statistical --confidence=1", "Expected --confidence strictly between 0 and 1, got 1"),
+    ("certify --confidence=0", "Expected --confidence strictly between 0 and 1, got 0"),
+    ("certify statistical --share=0", "Expected --share in (0, 1], got 0"),
+    ("certify statistical --share=1.1", "Expected --share in (0, 1], got 1.1"),
+    ("certify sampled --radius=-1", "Expected --radius ≥ 0, got -1"),
+    ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
+    ("certify --alpha=0.9", "No such option: --alpha"),
+    ("certify sampled --share=0.9", "No such option: --share"),
+    ("certify sound --radius=1", "No such option: --radius"),
+    ("certify statistical --refine=1", "No such option: --refine"),
+    ("certify sampled --figure=nowhere/claim.png", "make 'nowhere' first"),
+    ("certify sound --keep=nowhere/kept", "make 'nowhere' first"),
+    ("certify sampled --figure=claim.xyz", "got 'claim.xyz'; for example claim.png"),
+    ("certify sampled --report=conf/reacher.yaml", "Expected --report as a folder, got 'conf/reacher.yaml'"),
+]
+
+
+@pytest.mark.parametrize(("line", "message"), REFUSED)
+def test_what_does_not_fit_is_refused(checkpoint, line, message, capsys):
+    assert main([*line.split(), checkpoint]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert len(printed.err.splitlines()) == 1
+    assert not printed.out
+
+
+def test_options_are_refused_before_any_work(monkeypatch, capsys):
+    monkeypatch.setattr(
+        certify, "load_controller", lambda *_, **own: pytest.fail("Expected no work on a wrong request.")
+    )
+    for wrong in (
+        ["sound", "any.ckpt", "--alpha=2"],
+        ["statistical", "any.ckpt", "--share=2"],
+        ["sampled", "any.ckpt", "--figure=nowhere/claim.png"],
+        ["sound", "any.ckpt", "--set=1"],
+    ):
+        assert main(["certify", *wrong]) == 2
+        assert capsys.readouterr().err.startswith("error: Expected")
+
+
+@pytest.mark.parametrize(("kind", "make"), list(MAKERS.items()))
+def test_the_command_line_has_the_defaults_of_the_functions(kind, make):
+    parameters = get_command(certify.app).commands[kind].params
+    line = {parameter.opts[0].removeprefix("--"): parameter.default for parameter in parameters}
+    own = {name: p.default for name, p in inspect.signature(make).parameters.items() if p.default is not p.empty}
+    own.pop("report", None)
+    assert own == {name: line[name] for name in own}
+
+
+def test_the_command_says_every_option():
+    controller = Controller(problem_of(DoubleIntegrator()), Formula(lambda t, x: (x**2).sum(-1)))
+    options = {"alpha": 0.95, "delta": None, "set": "-1:1,-2:2", "seed": 0}
+    line = SoundCertificate(controller, None, options).command("my run/best.ckpt", system="pendulum:Pendulum")
+    assert line.startswith("lyapnet certify sound 'my run/best.ckpt' --alpha=0.95 --set=-1:1,-2:2")
+    assert line.endswith("--seed=0 --system=pendulum:Pendulum")
+
+
+# As 0.1 had it
+
+
+@pytest.mark.parametrize("line", ["{} --kind sampled --samples 3", "--kind=sampled {} --samples=3"])
+def test_a_kind_that_is_an_option_is_read_for_one_version_more(line, checkpoint, capsys):
+    new = certificate(capsys, "sampled", checkpoint, "--samples", "3")
+    assert main(["certify", *line.format(checkpoint).split(), "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == new
+    (note,) = printed.err.splitlines()
+    assert note.startswith("note: --kind")
+    assert f"lyapnet certify sampled {checkpoint} --samples" in note
+
+
+def test_without_a_kind_it_is_statistical_without_a_note(checkpoint, capsys):
+    new = certificate(capsys, "statistical", checkpoint, "--samples", "3")
+    assert main(["certify", checkpoint, "--samples", "3", "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == new
+    assert not printed.err
+
+
+def test_help_fits_a_terminal(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    for kind in ("", *MAKERS):
+        assert main(["certify", *kind.split(), "--help"]) == 0
+        text = capsys.readouterr().out
+        assert "…" not in text.replace("lower:upper,…", ""), "nothing is cut off"
+        assert max(map(len, text.splitlines())) <= 80
+
+
+def test_help_loads_nothing_heavy():
+    lines = "import sys", "from lyapnet.cli import main", "main(['certify', 'sound', '--help'])"
+    program = "\n".join([*lines, "sys.exit('torch' in sys.modules)"])
+    assert subprocess.run([sys.executable, "-c", program], stdout=subprocess.DEVNULL).returncode == 0
+
+
+def test_a_missing_checkpoint_is_refused(capsys):
+    assert main(["certify", "sampled", "nowhere.ckpt"]) == 2
+    assert "nowhere.ckpt" in capsys.readouterr().err
+
+
+def test_sets_are_read():
+    box = parse_set("-1:2,-0.5:0.25")
+    assert box.lower.tolist() == [-1, -0.5]
+    assert box.upper.tolist() == [2, 0.25]
+    for text in ("", "1", "2:1", "1:2:3", "a:b"):
+        with pytest.raises(UsageError, match="--set"):
+            parse_set(text)

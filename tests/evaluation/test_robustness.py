@@ -1,0 +1,95 @@
+"""Disturbances hit the plant and not the policy, and are measured against the optimum of the disturbed task."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.evaluation import robustness
+from lyapnet.evaluation.robustness import disturbances
+from lyapnet.rollout import Rollout
+from tests.problems import untrained
+
+SMALL = ["network.hidden=[4,4]", "horizon.steps=20"]
+
+
+@pytest.fixture
+def controller():
+    return untrained("double_integrator", *SMALL)
+
+
+def by_name(controller, samples=50):
+    return {disturbance.name: disturbance for disturbance in disturbances(controller, samples, 0)}
+
+
+def test_states_outside_are_outside_and_not_far():
+    controller = untrained("cartpole_balancing", *SMALL)
+    X0, found = controller.initial_states, by_name(controller)
+    for name, outside in (("none", False), ("x₀ up to 20% outside X₀", True)):
+        x0 = found[name].x0
+        reach = ((x0 - X0.center) / (X0.widths / 2)).abs().amax(-1)
+        assert (reach > 1).all() == outside
+        assert (reach <= 1.2 + 1e-12).all()
+        assert reach.std() > 0.01
+
+
+def test_a_fixed_component_stays_fixed():
+    x0 = by_name(untrained("cartpole_swingup", *SMALL))["x₀ up to 20% outside X₀"].x0
+    assert (x0[:, [0, 2, 3]] == 0).all()
+    assert ((x0[:, 1] - torch.pi).abs() > 0.3).all()
+
+
+def test_each_parameter_changes_the_plant_alone():
+    controller = untrained("cartpole_swingup", *SMALL)
+    found, x, u = by_name(controller, 3), torch.randn(5, 4).double(), torch.randn(5, 1).double()
+    names = ("cart mass", "length", "pole damping", "pole mass")  # the cart has no damping, gravity is what it is
+    expected = {f"{name} {share}" for name in names for share in ("-20%", "+20%")}
+    assert {name for name in found if name.endswith(("-20%", "+20%"))} == expected
+    lighter = untrained("cartpole_swingup", *SMALL, "system.parameters.pole_mass=0.8").system
+    assert_close(found["pole mass -20%"].problem.system.dynamics(x, u), lighter.dynamics(x, u))
+    assert not torch.allclose(found["pole mass -20%"].problem.system.dynamics(x, u), controller.system.dynamics(x, u))
+    assert all(one.policy is controller.closed_loop.policy for name, one in found.items() if "noise" not in name)
+    assert controller.system.pole_mass == 1
+
+
+def test_noise_is_on_what_the_policy_reads(controller):
+    found, x, t = by_name(controller), torch.randn(4000, 2).double(), torch.tensor(0.1)
+    noisy, clean = found["noise of 1% on the state"].policy, found["none"].policy
+    assert not torch.equal(noisy(t, x), clean(t, x))
+    assert not torch.equal(noisy(t, x), noisy(t, x)), "drawn anew"
+    noisy.policy = torch.nn.Module()
+    noisy.policy.forward = lambda t, x: x
+    extent = controller.rollout(found["none"].x0).x.abs().amax((0, 1))
+    assert_close((noisy(t, x) - x).std(0), 0.01 * extent, rtol=0.05, atol=0)
+
+
+def test_rows_are_ratios_to_the_optimum_of_the_disturbed_task(controller):
+    rows = {row.disturbance: row for row in robustness.robustness(controller, 20)}
+    undisturbed, finer, heavier = rows["none"], rows["half the Δt"], rows["mass +20%"]
+    x0 = by_name(controller, 20)["none"].x0
+    assert undisturbed.cost_mean == pytest.approx(float(controller.rollout(x0).cost.mean()), rel=1e-12)
+    for row in rows.values():
+        assert row.cost_ratio == pytest.approx(row.cost_mean / row.optimal_cost_mean)
+        assert row.cost_ratio >= 1
+    assert finer.optimal_cost_mean == pytest.approx(undisturbed.optimal_cost_mean, rel=0.1)
+    assert finer.optimal_cost_mean != undisturbed.optimal_cost_mean
+    rollout = Rollout(by_name(controller, 20)["mass +20%"].problem, controller.closed_loop.policy, gradient="backprop")
+    assert heavier.cost_mean == pytest.approx(float(rollout(x0).cost.mean()), rel=1e-12)
+    assert heavier.cost_mean != pytest.approx(undisturbed.cost_mean, rel=1e-6)
+
+
+def test_a_loop_that_diverges_is_a_row_too(controller, monkeypatch):
+    for p in controller.V.parameters():
+        p.data.mul_(1e200)
+    with pytest.raises(Exception, match="finite"):
+        controller.rollout(by_name_x0(controller))
+    monkeypatch.setattr(robustness, "magnitude", lambda controller, x0: torch.ones(2).double())
+    assert all(row.cost_mean is None and row.cost_ratio is None for row in robustness.robustness(controller, 3))
+
+
+def by_name_x0(controller):
+    return controller.initial_states.sample(3, torch.Generator().manual_seed(0))
+
+
+def test_no_sample_is_refused(controller):
+    with pytest.raises(ValueError, match="samples ≥ 1"):
+        robustness.robustness(controller, 0)

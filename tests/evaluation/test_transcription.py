@@ -1,0 +1,267 @@
+"""The optimum by direct transcription, held against Riccati, rollouts and finite differences; and what it refuses."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.build import build_problem
+from lyapnet.config import load_config
+from lyapnet.cost import QuadraticCost
+from lyapnet.errors import OracleError
+from lyapnet.evaluation.oracles import discrete_riccati, oracle_of
+from lyapnet.evaluation.oracles.multistart import Candidate, MultiStart
+from lyapnet.evaluation.oracles.transcription import Transcription
+from lyapnet.problem import Horizon
+from lyapnet.systems import Cartpole, DoubleIntegrator, Linear, Reacher
+from tests.problems import problem_of
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+@pytest.fixture(autouse=True)
+def _empty_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "cache"))
+
+
+def transcription_of(name, *overrides, **options):
+    """The oracle of a shipped config, and its X₀."""
+    problem = build_problem(load_config(CONF / f"{name}.yaml", list(overrides)))
+    return Transcription(problem, **options), problem.initial_states
+
+
+# The optimum
+
+
+def linear_problem(n, m):
+    """Unstable in open loop, with couplings in all weights."""
+    half, terminal = torch.randn(n, n), torch.randn(n, n)
+    cost = QuadraticCost(half @ half.mT, torch.eye(m) + 0.2 * torch.ones(m, m), terminal @ terminal.mT)
+    return problem_of(Linear(torch.randn(n, n), torch.randn(n, m)), cost, 30, 0.05)
+
+
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (3, 2), (6, 1)])
+def test_optimum_of_a_linear_task_is_riccatis(n, m):
+    problem = linear_problem(n, m)
+    system, cost, horizon = problem.system, problem.cost, problem.horizon
+    x0 = torch.randn(5, n)
+    optima = Transcription(problem).solve(x0)
+    solution = discrete_riccati(system, cost, horizon)
+    assert_close(optima.cost, solution.value(0, x0), rtol=1e-8, atol=1e-10)
+    assert_close(optima.u[0], solution.policy(0, x0), rtol=1e-4, atol=1e-4)
+    # twin: a slightly different model has another optimum
+    other = discrete_riccati(Linear(1.001 * system.A, system.B), cost, horizon)
+    assert not torch.allclose(optima.cost, other.value(0, x0), rtol=1e-6)
+
+
+def test_one_step_and_any_leading_shape():
+    system, cost = DoubleIntegrator(), QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2))
+    oracle = Transcription(problem_of(system, cost, 1, 0.1))
+    x0 = torch.randn(2, 3, 2)
+    assert_close(oracle(x0), discrete_riccati(system, cost, Horizon(1, 0.1)).value(0, x0))
+    assert oracle(x0[0, 0]).shape == ()
+    assert oracle(x0.float()).dtype == torch.float32
+
+
+def test_R_as_a_function_needs_no_riccati_equation():
+    system = DoubleIntegrator(mass=2.0)
+    cost = QuadraticCost(torch.eye(2), system.inverse_mass, torch.eye(2))
+    same = QuadraticCost(torch.eye(2), [[0.5]], torch.eye(2))
+    x0 = torch.randn(3, 2)
+    assert_close(oracle_of(problem_of(system, cost, 20))(x0), oracle_of(problem_of(system, same, 20))(x0))
+
+
+def slopes(oracle, x0, u, h=1e-4, directions=3):
+    """First and second differences of J along random directions of control sequences, in one rollout."""
+    d = torch.randn(directions, *u.shape)
+    points = torch.cat([u + h * d, u - h * d, u[None]])
+    _, J = oracle.rollout(x0.repeat(len(points), 1), points.movedim(0, 1).flatten(1, 2))
+    up, down, middle = J.reshape(len(points), -1).split([directions, directions, 1])
+    return (up - down) / (2 * h), (up - 2 * middle + down) / h**2
+
+
+@pytest.mark.parametrize(("name", "least", "most"), [("cartpole_swingup", 170, 200), ("reacher", 1, 60)])
+def test_optimum_is_a_minimum_of_the_rollouts_cost(name, least, most):
+    oracle, X0 = transcription_of(name)
+    x0 = X0.sample(2, torch.Generator().manual_seed(3))
+    optima = oracle.solve(x0)
+    assert optima.failures == 0
+
+    assert_close(oracle.rollout(x0, optima.u)[1], optima.cost, rtol=1e-12, atol=0)
+    assert ((least < optima.cost) & (optima.cost < most)).all()
+    assert (oracle.rollout(x0, torch.zeros_like(optima.u))[1] > 1.2 * optima.cost).all()
+    first, second = slopes(oracle, x0, optima.u)
+    assert (first.abs() < 1e-5 * optima.cost).all()
+    assert (second > 0).all()
+    # twin: elsewhere the slope is not zero
+    assert (slopes(oracle, x0, 1.1 * optima.u)[0].abs() > 1e-4 * optima.cost).all()
+
+
+def test_no_controller_costs_less():
+    oracle, X0 = transcription_of("reacher")
+    x0 = X0.sample(6)
+    optima = oracle.solve(x0)
+    for stiffness, damping in ((0.2, 0.3), (0.6, 0.4), (2.0, 1.0)):
+        x, u = x0, []
+        for _ in range(oracle.problem.horizon.steps):  # a spring and a damper at each joint
+            u.append(-stiffness * x[:, :2] - damping * x[:, 2:])
+            x = oracle.step(x, u[-1])[0]
+        assert (oracle.rollout(x0, torch.stack(u))[1] > optima.cost).all()
+
+
+def test_neighbours_and_batch_do_not_matter():
+    oracle, X0 = transcription_of("cartpole_swingup")
+    x0 = X0.sample(3)
+    together = oracle.solve(x0).cost
+    assert together.max() < 200
+    for entry in oracle.cache.folder.iterdir():
+        entry.unlink()
+    alone = torch.cat([oracle.solve(x[None]).cost for x in x0])
+    assert_close(together, alone, rtol=1e-8, atol=0)
+
+
+# Failure
+
+
+def test_what_does_not_converge_is_nan_and_says_why():
+    oracle, X0 = transcription_of("cartpole_swingup", iterations=2)
+    optima = oracle.solve(X0.sample(3))
+    assert optima.failures == 3
+    assert torch.isnan(optima.cost).all()
+    assert set(optima.reasons) == {"IPOPT: Maximum_Iterations_Exceeded"}
+    assert not oracle.cache.folder.exists()
+
+
+def test_a_minimum_that_the_rollout_does_not_confirm_is_none():
+    oracle, X0 = transcription_of("reacher", "horizon.steps=10")
+    minimise, x0 = oracle.minimise, X0.sample(2)
+    oracle.minimise = lambda *a: minimise(*a)._replace(cost=1.0)
+    optima = oracle.solve(x0)
+    assert optima.failures == 2
+    assert "cost 1 is " in optima.reasons[0]
+
+
+def test_known_controls_that_cost_less_than_every_minimum_refute_it():
+    oracle, X0 = transcription_of("reacher", "horizon.steps=10")
+    x0 = X0.sample(2)
+    best = oracle.solve(x0)
+    for entry in oracle.cache.folder.iterdir():
+        entry.unlink()
+    zero = torch.zeros_like(best.u)
+    path, J = oracle.rollout(x0, zero)
+    worse = {tuple(x.tolist()): Candidate(path[1:, i].numpy(), zero[:, i].numpy(), float(J[i]))
+             for i, x in enumerate(x0)}  # fmt: skip
+    oracle.minimise = lambda x, start: worse[tuple(x.tolist())]
+    assert oracle.solve(x0, known=best.u).failures == 2
+    assert "known controls cost less" in oracle.solve(x0, known=best.u).reasons[0]
+
+
+def test_minima_spread_to_the_states_around():
+    """Two basins, costs 1 and 2; only the first state has a start in the better one."""
+
+    def minimise(x0, start):
+        basin = float(start.u[0, 0])
+        return Candidate(start.x, start.u, 1 + basin)
+
+    def start(basin):
+        return Candidate(np.zeros((1, 1)), np.full((1, 1), basin), math.inf)
+
+    search = MultiStart(np.arange(20.0)[:, None], [None] * 20, minimise)
+    search.run({i: [start(float(i > 0))] for i in range(20)}, lambda done, total: None)
+    assert [candidate.cost for candidate in search.best] == [1.0] * 20
+
+
+# The cache
+
+
+@pytest.fixture
+def solved():
+    """An oracle, some states, and their optima, which are on disk."""
+    oracle, X0 = transcription_of("reacher", "horizon.steps=10")
+    x0 = X0.sample(3)
+    return oracle, x0, oracle.solve(x0)
+
+
+def unsolvable(oracle):
+    """The oracle without IPOPT."""
+    oracle.minimise = lambda *_: "no solver"
+    return oracle
+
+
+def test_what_is_on_disk_is_not_solved_again(solved):
+    _, x0, optima = solved
+    again = unsolvable(transcription_of("reacher", "horizon.steps=10")[0])
+    assert torch.equal(again.solve(x0).cost, optima.cost)
+    assert torch.equal(again.solve(x0.flip(0)).cost, optima.cost.flip(0))
+    # twins: another state, another task
+    assert again.solve(x0 + 1e-9).failures == 3
+    for change in ("horizon.steps=11", "horizon.dt=0.011", "system.parameters.a2=0.0481", "cost.Q_T=[100,100,1,2]"):
+        other = unsolvable(transcription_of("reacher", "horizon.steps=10", change)[0])
+        assert other.solve(x0).failures == 3
+
+
+@pytest.mark.parametrize("damage", [lambda c: c[: len(c) // 2], lambda c: b"", lambda c: c[:150] + b"?" + c[151:]])
+def test_damaged_files_are_solved_again(solved, damage):
+    oracle, x0, optima = solved
+    for path in oracle.cache.folder.iterdir():
+        path.write_bytes(damage(path.read_bytes()))
+    assert [oracle.cache.read(x) for x in x0] == [None] * 3
+    assert_close(oracle.solve(x0).cost, optima.cost)
+    assert torch.equal(unsolvable(oracle).solve(x0).cost, optima.cost)
+
+
+def test_a_folder_that_cannot_be_written_keeps_nothing(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "file"))
+    oracle, X0 = transcription_of("reacher", "horizon.steps=3")
+    assert oracle.solve(X0.sample(2)).failures == 0
+
+
+def test_better_known_controls_replace_what_is_kept(solved):
+    oracle, x0, optima = solved
+    for x in x0:
+        oracle.cache.write(x, torch.zeros_like(optima.u[:, 0]))
+    assert (oracle.solve(x0).cost > 1.01 * optima.cost).all()
+    assert_close(oracle.solve(x0, known=optima.u).cost, optima.cost)
+    assert_close(oracle.solve(x0).cost, optima.cost)
+
+
+# Precision, and systems past torch
+
+
+def test_a_float32_task_is_solved_in_float64_and_left_as_it_is():
+    """R as a method of the system that is copied: a copy in float64 does not keep the original's precision."""
+    system = Reacher().float()
+    cost = QuadraticCost(torch.eye(4), system.inverse_mass, torch.eye(4)).float()
+    x0 = torch.tensor([[0.5, -0.5, 0.0, 0.0]])
+    exact = Reacher()
+    reference = QuadraticCost(torch.eye(4), exact.inverse_mass, torch.eye(4))
+    ours = Transcription(problem_of(system, cost, 10, 0.05))(x0)
+    assert_close(ours, Transcription(problem_of(exact, reference, 10, 0.05))(x0), rtol=1e-5, atol=0)
+    assert system.B.dtype == torch.float32
+
+
+class Drag(Cartpole):
+    """A cartpole with a force that is computed past torch."""
+
+    def forces(self, q, qdot):
+        return super().forces(q, qdot) - torch.as_tensor(np.sin(qdot.detach().numpy()))
+
+
+class Branch(Cartpole):
+    """A cartpole whose code asks for its state."""
+
+    def forces(self, q, qdot):
+        return super().forces(q, qdot) * (2 if q[..., 0].sum() > 0 else 1)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"), [(Drag(), "got a trace that is off by"), (Branch(), "that torch can trace")]
+)
+def test_a_system_past_torch_is_refused(system, message):
+    weight = torch.eye(4)
+    with pytest.raises(OracleError, match=message):
+        oracle_of(problem_of(system, QuadraticCost(weight, [[1.0]], weight), 5))

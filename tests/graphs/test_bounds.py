@@ -1,0 +1,371 @@
+"""Bounds on boxes: sound on random points, exact digits and whole conditions; tight to second order."""
+
+import math
+
+import mpmath
+import pytest
+import torch
+
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.cost import QuadraticCost
+from lyapnet.errors import UsageError
+from lyapnet.graphs import elementary_functions as functions
+from lyapnet.graphs import taylor
+from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.networks import FCN, NETWORKS, Scaling, TerminalAnchor
+from lyapnet.policy import POLICIES
+from lyapnet.rollout import ClosedLoop
+from lyapnet.systems import SYSTEMS
+from tests.problems import problem_of
+
+W = torch.tensor([[0.3, -1.2, 0.7], [0.1, 0.4, -0.9]])  # promoted to float64 by the bounds
+
+FIRST = torch.tensor([0])
+
+
+def weights(x):
+    return W.to(x)
+
+
+FUNCTIONS = {
+    "affine": lambda t, x: x @ weights(x) + 0.1 * t - weights(x)[0] / 7,
+    "product": lambda t, x: x[0] * x[1] * t - (x[0] + 0.3) * (x[0] - t),
+    "quotient": lambda t, x: (x + t) / (3 + x[1]) + 2 / (4 - x),
+    "power": lambda t, x: x**2 + x**3 - 0.2 * x**4 + (3 + x) ** -1 + (x + 3) ** 0.5,
+    "exp": lambda t, x: torch.exp(x * t),
+    "log1p": lambda t, x: torch.log1p(x**2 + t),
+    "sqrt": lambda t, x: torch.sqrt(2.5 + x) + torch.rsqrt(4 + t),
+    "reciprocal": lambda t, x: torch.reciprocal(x - 3) + torch.reciprocal(3 + x),
+    "sigmoid": lambda t, x: torch.sigmoid(5 * x - t),
+    "tanh": lambda t, x: torch.tanh(4 * x + t),
+    "softplus": lambda t, x: torch.nn.functional.softplus(9 * x + 10 * t),
+    "softplus of a beta": lambda t, x: torch.nn.functional.softplus(x, beta=3.0, threshold=1.0),
+    "silu": lambda t, x: torch.nn.functional.silu(3 * x),
+    "sin": lambda t, x: torch.sin(6 * x + t),
+    "cos": lambda t, x: torch.cos(6 * x - 3 * t),
+    "sums": lambda t, x: torch.stack([x.sum(), x.mean(), (x[:, None] * x).sum(0).sum()]) - x.sum(0, keepdim=True),
+    "matrices": lambda t, x: (x[:, None] * x) @ weights(x)[:, :2] @ torch.stack([x, x * t]) + torch.mv(x[:, None] * x, x),  # noqa: E501
+    "arrangements": lambda t, x: torch.cat([x.flip(0)[:0], x[1:], t[None]]).unsqueeze(-1).expand(-1, 3).mT.reshape(-1),
+    "index_add": lambda t, x: x.index_add(0, FIRST + 1, t[None]) + torch.zeros_like(x).index_add(0, FIRST, x[1:]),
+}  # fmt: skip
+
+
+def box(widths, boxes=120, n=2):
+    """Boxes around random points of [0, 1] × [−1, 1]ⁿ."""
+    center = torch.rand(boxes, 1 + n)
+    center[:, 1:] = 2 * center[:, 1:] - 1
+    half = widths / 2 * torch.rand(boxes, 1 + n)
+    return center - half, center + half
+
+
+def points_in(lower, upper, points=60):
+    """Random points of each box, a third of them corners: (boxes, points, 1 + n)."""
+    unit = torch.rand(len(lower), points, lower.shape[-1])
+    unit[:, ::3] = unit[:, ::3].round()
+    return lower[:, None] + (upper - lower)[:, None] * unit
+
+
+def violations(bounded, function, lower, upper):
+    """How many values at points of the boxes lie outside the bounds."""
+    points = points_in(lower, upper)
+    count = 0
+    values = torch.func.vmap(torch.func.vmap(lambda p: function(p[0], p[1:])))(points)
+    for (low, high), value in zip(bounded.bounds(lower, upper), values, strict=True):
+        count += int(((value < low[:, None]) | (value > high[:, None]) | low[:, None].isnan()).sum())
+    return count
+
+
+def several(function):
+    return lambda t, x: (function(t, x),)
+
+
+UNIT = torch.tensor([0.0, -1.0, -1.0]), torch.tensor([1.0, 1.0, 1.0])
+
+
+def unit():
+    return tuple(side.double() for side in UNIT)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_lie_within_bounds(name, degree):
+    function = several(FUNCTIONS[name])
+    bounded = BoundedFunction(function, unit(), degree)
+    for width in (2.0, 0.5, 0.1, 1e-2, 1e-5, 0.0):
+        lower, upper = box(width)
+        assert violations(bounded, function, lower, upper) == 0
+    assert all(torch.stack(pair).isfinite().all() for pair in bounded.bounds(*box(0.1)))
+
+
+def without_remainder(function):
+    def wrong(*arguments, **keywords):
+        form = function(*arguments, **keywords)
+        return form.with_parts(form.terms, torch.zeros_like(form.radius))
+
+    return wrong
+
+
+SMOOTH = ["power", "exp", "log1p", "sqrt", "reciprocal", "sigmoid", "tanh", "softplus", "sin", "cos"]
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+def test_functions_without_their_remainder_are_caught(name, monkeypatch):
+    monkeypatch.setattr(functions, "linearised", without_remainder(functions.linearised))
+    function = several(FUNCTIONS[name])
+    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
+
+
+def test_products_without_their_remainder_are_caught(monkeypatch):
+    monkeypatch.setattr(taylor, "multiply", without_remainder(taylor.multiply))
+    function = several(FUNCTIONS["product"])
+    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
+
+
+@pytest.mark.parametrize("name", ["exp", "sigmoid", "sin", "cos", "sqrt", "log1p", "reciprocal", "square", "softplus"])
+def test_the_remainder_of_a_function_is_no_larger_than_needed(name):
+    """On wide intervals too: the band a x + b ± e touches the graph of f on both sides."""
+    function = getattr(functions, name)
+    lower = torch.linspace(0.3, 4, 50)[:, None]
+    if name not in ("sqrt", "log1p", "reciprocal"):
+        lower = lower - 3
+    form = function(taylor.box_form(lower, lower + 2.5))
+    y = torch.linspace(-1, 1, 20_001)[:, None]
+    value = {
+        "square": lambda x: x**2, "reciprocal": lambda x: 1 / x, "softplus": torch.nn.functional.softplus,
+    }.get(name, getattr(torch, name, None))(lower[:, 0] + 1.25 * (y + 1))  # fmt: skip
+    distance = value - (form.center[:, 0] + form.coefficients[0, :, 0] * y)
+    radius = form.radius[:, 0]
+    torch.testing.assert_close(distance.amax(0), radius, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(distance.amin(0), -radius, rtol=1e-5, atol=1e-9)
+
+
+EXPANDED = {
+    "exp": torch.exp, "log": torch.log, "log1p": torch.log1p, "sqrt": torch.sqrt, "reciprocal": torch.reciprocal,
+    "sigmoid": torch.sigmoid, "softplus": torch.nn.functional.softplus, "sin": torch.sin, "cos": torch.cos,
+}  # fmt: skip
+
+
+def distances_from_parabolas(name, width):
+    """(of f from c + A ε + B ε² on [l, l + width], (points, l); r) for many l."""
+    lower = torch.linspace(0.3, 4, 200)[:, None]
+    if name in ("sigmoid", "softplus", "sin", "cos", "exp"):
+        lower = 2 * lower - 5
+    form = getattr(functions, name)(taylor.box_form(lower, lower + width, degree=2))
+    y = torch.linspace(-1, 1, 2001)[:, None]
+    value = EXPANDED[name](lower[:, 0] + width / 2 * (y + 1))
+    parabola = form.center[:, 0] + form.coefficients[0, :, 0] * y + form.products[0, :, 0] * y**2
+    return (value - parabola).abs(), form.radius[:, 0]
+
+
+@pytest.mark.parametrize("width", [2.5, 0.5, 1e-2, 1e-5])
+@pytest.mark.parametrize("name", EXPANDED)
+def test_functions_lie_within_their_parabolas(name, width):
+    distance, radius = distances_from_parabolas(name, width)
+    assert (distance <= radius).all()
+
+
+@pytest.mark.parametrize("name", EXPANDED)
+def test_remainders_of_second_degree_are_of_third_order_and_not_idle(name):
+    """At least a half of them is needed somewhere; eight times less on half the width."""
+    distance, radius = distances_from_parabolas(name, 0.1)
+    _, smaller = distances_from_parabolas(name, 0.05)
+    assert (distance.amax(0) / radius).median() > 0.5
+    assert math.log2(radius.median() / smaller.median()) == pytest.approx(3, abs=0.3)
+
+
+def test_a_product_of_second_degree_is_exact_up_to_third_order():
+    """(ε₁ + ε₁ε₂)(ε₂ + ε₂²) over a box of points: no cancellation is lost below third order."""
+    x, y = (taylor.box_form(*(torch.full((1, 2), side) for side in (-0.1, 0.1)), degree=2) for _ in range(2))
+    product = taylor.multiply(x, y)
+    assert product.pairs == [(0, 0), (0, 1), (1, 1)]
+    torch.testing.assert_close(product.products[:, 0], torch.tensor([[0.01, 0.0], [0.0, 0.0], [0.0, 0.01]]))
+    assert float(product.radius.max()) < 1e-15
+    curved = taylor.multiply(product, taylor.add(x, product))
+    assert 0 < float(curved.radius.max()) < 3 * 0.1**3
+
+
+def test_bounds_of_a_parabola_know_its_vertex():
+    """−x² + x on [0, 1] is at most ¼, which lies in the middle; −(x² + y²) + xy is at most 0, where both meet."""
+    form = taylor.box_form(torch.zeros(1, 1), torch.ones(1, 1), degree=2)
+    low, high = taylor.add(form, taylor.negate(functions.square(form))).interval()
+    assert (float(low), float(high)) == pytest.approx((0.0, 0.25), abs=1e-12)
+    x, y = (
+        form.with_parts(form.terms[..., k : k + 1], form.radius[..., k : k + 1])
+        for form in [taylor.box_form(-torch.ones(1, 2), torch.ones(1, 2), degree=2)]
+        for k in range(2)
+    )
+    definite = taylor.add(taylor.multiply(x, y), taylor.negate(taylor.add(functions.square(x), functions.square(y))))
+    assert float(definite.interval()[1]) == pytest.approx(0, abs=1e-12)
+
+
+EXACT = {
+    "affine": (lambda x: 0.1 * x / 3 - 0.3 * (x + 0.1), lambda x: x * D(0.1) / 3 - D(0.3) * (x + D(0.1))),
+    "cubes": (lambda x: (x + 0.1) ** 3 - x * x * x, lambda x: (x + D(0.1)) ** 3 - x**3),
+    "exp": (lambda x: torch.exp(x) / (1 + x**2), lambda x: mpmath.exp(x) / (1 + x**2)),
+    "sigmoid": (lambda x: torch.sigmoid(x) + torch.tanh(x), lambda x: 1 / (1 + mpmath.exp(-x)) + mpmath.tanh(x)),
+    "waves": (lambda x: torch.sin(9 * x) * torch.cos(x), lambda x: mpmath.sin(9 * x) * mpmath.cos(x)),
+    "softplus": (lambda x: torch.log1p(torch.exp(x)).sqrt(), lambda x: mpmath.sqrt(mpmath.log(1 + mpmath.exp(x)))),
+}  # fmt: skip
+
+
+def D(number):
+    return mpmath.mpf(number)
+
+
+def digits_outside(name):
+    """How many of 50 points have their true value, to 50 digits, outside the bounds of the box that is the point."""
+    function, exact = EXACT[name]
+    bounded = BoundedFunction(lambda t, x: (function(x),), unit())
+    point = box(0.0, 50)[0]
+    ((low, high),) = bounded.bounds(point, point)
+    assert float((high - low).max()) < 1e-12
+    with mpmath.workdps(50):
+        true = [[exact(D(float(v))) for v in row[1:]] for row in point]
+        return sum(
+            not (D(float(low[i, j])) <= value <= D(float(high[i, j])))
+            for i, row in enumerate(true)
+            for j, value in enumerate(row)
+        )
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_rounding_is_covered(name):
+    assert digits_outside(name) == 0
+
+
+@pytest.mark.parametrize("name", ["affine", "cubes", "exp"])
+def test_without_a_margin_rounding_is_not_covered(name, monkeypatch):
+    for module in (taylor, functions):
+        monkeypatch.setattr(module, "EPSILON", 0.0)
+    assert digits_outside(name) > 0
+
+
+def applied(function):
+    return lambda t, x: (function(x),)
+
+
+def test_an_operator_without_a_rule_is_named():
+    truths = lambda x: ((x > 0) + (x < 1)) * x  # noqa: E731  torch reads 1 + 1 as true there
+    for function, named in ((torch.erf, "erf"), (torch.floor, "floor"), (torch.cosh, "cosh"), (truths, "add")):
+        with pytest.raises(UsageError, match=f"rule for bounds, got aten.{named}"):
+            BoundedFunction(applied(function), unit())
+    with pytest.raises(UsageError, match=r"whole exponent.*1\.5"):
+        BoundedFunction(lambda t, x: ((x + 2) ** 1.5,), unit())
+    with pytest.raises(UsageError, match="control flow that does not depend on values"):
+        BoundedFunction(lambda t, x: (x if x[0] > 0 else -x,), unit())
+
+
+@pytest.mark.parametrize(
+    "function", [lambda x: 1 / x, torch.sqrt, torch.log1p, lambda x: torch.exp(1000 * x), lambda x: torch.sin(50 * x)]
+)
+def test_where_a_function_has_no_bound_none_is_given(function):
+    """And what is computed from it has none either."""
+    bounded = BoundedFunction(lambda t, x: (0 * function(x) * x + x,), unit())
+    ((low, high),) = bounded.bounds(torch.tensor([[0.0, -2.0, 0.5]]), torch.tensor([[1.0, 2.0, 1.0]]))
+    assert low[0, 0] == -torch.inf
+    assert high[0, 0] == torch.inf
+
+
+def test_every_rule_has_a_derivation():
+    assert all(function.__doc__ or function.__name__ == "<lambda>" for function in RULES.values())
+    assert not RULES.keys() & ARRANGEMENTS.keys()
+
+
+# Whole conditions
+
+
+def condition(system_name, network, policy="hjb", **options):
+    system = SYSTEMS[system_name]()
+    cost = QuadraticCost(torch.eye(system.n), system.inverse_mass, torch.eye(system.n))
+    V = NETWORKS[network](Scaling([1.0] * system.n, 1.0, 3.0), hidden=(8, 8), **options).requires_grad_(False)
+    V = TerminalAnchor(V, cost, 1.0)
+    problem = problem_of(system, cost)
+    return DecreaseCondition(ClosedLoop(problem, POLICIES[policy](problem, V)), 0.9, 0.01), system.n
+
+
+CONDITIONS = [
+    ("double_integrator", "fcn", {}), ("double_integrator", "anchored", {}), ("double_integrator", "icnn", {}),
+    ("cartpole", "fcn", {"embedded_angles": (1,), "activation": "sin"}),
+    ("reacher", "fcn", {"activation": "silu"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("system", "network", "options"), CONDITIONS)
+def test_whole_conditions_lie_within_bounds(system, network, options):
+    c, n = condition(system, network, **options)
+
+    def function(t, x):
+        return c(t, x), c.V(t, x)
+
+    bounded = BoundedFunction(function, (torch.zeros(1 + n).double() - 0.5, torch.ones(1 + n).double()))
+    for width in (1.0, 0.1, 1e-5):
+        lower, upper = box(width, 60, n)
+        points = points_in(lower, upper)
+        with torch.no_grad():
+            values = function(points[..., 0], points[..., 1:])
+        for (low, high), value in zip(bounded.bounds(lower, upper), values, strict=True):
+            assert ((low[:, None] <= value) & (value <= high[:, None])).all()
+
+
+def test_a_condition_of_another_alpha_is_caught():
+    """The twin: bounds of the condition at α = 0.8 do not hold the one at 0.9."""
+    c, n = condition("double_integrator", "fcn")
+    bounded = BoundedFunction(several(c), unit())
+    c.alpha = 0.8
+    lower, upper = box(1e-2, 60, n)
+    points = points_in(lower, upper)
+    with torch.no_grad():
+        value = c(points[..., 0], points[..., 1:])
+    ((low, high),) = bounded.bounds(lower, upper)
+    assert ((value < low[:, None]) | (high[:, None] < value)).any()
+
+
+def test_the_excess_of_the_width_is_of_second_order():
+    c, n = condition("double_integrator", "fcn")
+    bounded = BoundedFunction(several(c), unit())
+    center, excess = box(0.0, 20)[0], []
+    grid = torch.cartesian_prod(*[torch.linspace(-1, 1, 13)] * (1 + n))
+    for half in (0.1, 0.05, 0.025, 0.0125):
+        ((low, high),) = bounded.bounds(center - half, center + half)
+        points = center[:, None] + half * grid
+        with torch.no_grad():
+            value = c(points[..., 0], points[..., 1:])
+        excess.append(float(((high - low) - (value.amax(1) - value.amin(1))).mean()))
+    orders = torch.tensor(excess[:-1]).div(torch.tensor(excess[1:])).log2()
+    assert (orders > 1.8).all()
+    assert (orders < 2.5).all()
+
+
+def test_alpha_and_delta_are_checked():
+    c, _ = condition("double_integrator", "fcn")
+    for alpha, delta, named in ((0.0, 0.1, "alpha"), (1.1, 0.1, "alpha"), (0.9, -1.0, "delta")):
+        with pytest.raises(UsageError, match=named):
+            DecreaseCondition(c.closed_loop, alpha, delta)
+
+
+def test_float32_weights_are_taken_as_they_are():
+    V = FCN(Scaling([1.0, 1.0], 1.0, 3.0), hidden=(8,)).float().requires_grad_(False).double()
+    bounded = BoundedFunction(several(V), unit())
+    assert violations(bounded, several(V), *box(0.1)) == 0
+
+
+@pytest.mark.parametrize(
+    "function", [functions.log, functions.log1p, functions.sqrt, functions.reciprocal], ids=lambda f: f.__name__
+)
+def test_close_to_where_a_function_ends_nothing_is_lost(function):
+    """An interval of ratio 1e15 and more: its third derivative is that on it, and not a rounding error outside it."""
+    box = taylor.box_form(torch.tensor([[-1.0]]), torch.tensor([[1.0]]), 2)
+    plain = {functions.log: torch.log, functions.log1p: torch.log1p, functions.sqrt: torch.sqrt}.get(
+        function, torch.reciprocal
+    )
+    offset = 1.0 if function is functions.log1p else 0.0
+    known = 0
+    for least in torch.logspace(-15.5, -13, 80):
+        form = function(taylor.shift(taylor.multiply(box, box), least - offset))
+        low, high = form.interval()
+        values = plain(torch.stack([least, 0.25 + least, 1 + least]) - offset)
+        assert (low <= values.min()).all()
+        assert (values.max() <= high).all()
+        known += int(high.isfinite().all())
+    assert known > 20

@@ -1,0 +1,147 @@
+"""Traced graphs compute what their functions do: as they are, cut in two, and over an axis of members."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.errors import UsageError
+from lyapnet.graphs.tracing import batched, cut, trace
+
+
+def function(weight, x, late):
+    """Two early results and two late ones, of which one needs nothing late; with a derivative inside."""
+    leaf = x.detach().requires_grad_()
+    with torch.enable_grad():
+        hidden = torch.tanh(leaf @ weight.mT + torch.ones(3).to(x))
+        (slope,) = torch.autograd.grad((hidden**2).sum(), leaf)
+    hidden = hidden.detach()
+    return hidden.sum(-1), slope, (hidden * late).mT @ slope, torch.exp(hidden).mT
+
+
+def draw(*members):
+    return torch.randn(*members, 3, 2), torch.randn(*members, 4, 2), torch.randn(*members, 4, 3)
+
+
+def agree(results, expected):
+    for result, value in zip(results, expected, strict=True):
+        assert_close(result, value)
+        assert not result.requires_grad
+
+
+def operations(graph_module):
+    return {getattr(node.target, "__name__", "") for node in graph_module.graph.nodes}
+
+
+def test_trace_reads_its_arguments_and_nothing_else():
+    scale = 1.0
+    arguments = draw()
+    graph = trace(lambda *a: tuple(scale * y for y in function(*a)), arguments)
+    scale, others = 2.0, draw()
+    for given in (arguments, others):
+        agree(graph(*given), function(*given))
+    with pytest.raises(AssertionError):
+        agree(graph(*others), function(*arguments))
+
+
+def test_nothing_is_computed_twice():
+    (x,) = (torch.randn(3),)
+    graph = trace(lambda x: (torch.sin(x) + 1, torch.sin(x) + 2), (x,))
+    assert sum(node.target is torch.ops.aten.sin.default for node in graph.graph.nodes) == 1
+    agree(graph(x), (torch.sin(x) + 1, torch.sin(x) + 2))
+
+
+def test_tensors_that_are_filled_in_place_stay_apart():
+    def fill(x):
+        first, second = torch.zeros_like(x), torch.zeros_like(x)
+        first[0] = x[1]
+        second[1] = x[0] ** 2
+        return (first + 2 * second,)
+
+    x = torch.tensor([2.0, 3.0])
+    agree(trace(fill, (x,))(x), fill(x))
+
+
+@pytest.mark.parametrize("course", [lambda x: x if x.sum() > 0 else -x, lambda x: x * float(x.sum())])
+def test_a_course_that_depends_on_values_is_no_trace(course):
+    with pytest.raises(Exception):  # noqa: B017, PT011 (of any kind)
+        trace(lambda x: (course(x),), (torch.ones(2),))
+
+
+@pytest.mark.parametrize("members", [(), (2,)])
+def test_code_that_leaves_torch_is_found_out_on_other_values(members):
+    def leaves(weight, x):
+        return (weight * torch.from_numpy(np.sin(x.detach().numpy())),)
+
+    def stays(weight, x):
+        return (weight * torch.sin(x),)
+
+    weight, x, other = torch.randn(3, *members, 4).unbind()
+    tracer = {(): trace, (2,): lambda f, given, *moved: batched(f, given, (0, 0), (0,), *moved)}[members]
+    with pytest.raises(ValueError, match="leaves it"):
+        tracer(leaves, (weight, x), (other,))
+    agree(tracer(stays, (weight, x), (other,))(weight, other), stays(weight, other))
+    if not members:  # in a batch, NumPy meets a tensor that it cannot read
+        agree(tracer(leaves, (weight, x))(weight, other), leaves(weight, x))
+
+
+def test_random_numbers_are_refused():
+    dropout = torch.nn.Dropout(0.5)
+    with pytest.raises(UsageError, match="without random numbers"):
+        trace(lambda x: (dropout(x),), (torch.ones(3),))
+    agree(trace(lambda x: (dropout.eval()(x),), (torch.ones(3),))(torch.ones(3)), (torch.ones(3),))
+
+
+# Cut
+
+
+def test_both_parts_together_are_the_whole():
+    arguments, others = draw(), draw()
+    early, rest = cut(trace(function, arguments), late=1, early_outputs=2)
+    for given in (arguments, others):
+        expected = function(*given)
+        first, second, *handed = early(*given[:-1])
+        agree((first, second, *rest(*given, *handed)), expected)
+    with pytest.raises(AssertionError):
+        agree(rest(*others, *(torch.zeros_like(y) for y in handed)), expected[2:])
+
+
+def test_the_rest_repeats_no_work():
+    early, rest = cut(trace(function, draw()), late=1, early_outputs=2)
+    assert "tanh.default" in operations(early) - operations(rest)
+
+
+def test_the_rest_may_need_nothing_early_and_views_are_not_handed_over():
+    arguments = draw()
+    early, rest = cut(trace(lambda w, x, y: (w.sum(), x.mT @ y), arguments), late=1, early_outputs=1)
+    (total,) = early(*arguments[:-1])
+    agree((total, *rest(*arguments)), (arguments[0].sum(), arguments[1].mT @ arguments[2]))
+
+
+@pytest.mark.parametrize("early_outputs", [3, 4])
+def test_an_early_result_that_needs_a_late_argument_is_refused(early_outputs):
+    with pytest.raises(KeyError):
+        cut(trace(function, draw()), late=1, early_outputs=early_outputs)
+
+
+# Batched
+
+
+def test_members_at_once_are_members_one_by_one():
+    """With a weight of its own for each, and without."""
+    weights, x, late = draw(5)
+    for weight, axis in ((weights, 0), (weights[0], None)):
+        graph = batched(function, (weight, x, late), (axis, 0, 0), (0, 0, 1, 0))
+        one_by_one = [function(weight[i] if axis == 0 else weight, x[i], late[i]) for i in range(5)]
+        expected = [torch.stack(y, out) for y, out in zip(zip(*one_by_one, strict=True), (0, 0, 1, 0), strict=True)]
+        agree(graph(weight, x, late), expected)
+        with pytest.raises(AssertionError):
+            agree(graph(weight, x.roll(1, 0), late), expected)
+
+
+def test_a_batched_graph_is_cut_like_any_other():
+    arguments = draw(5)
+    early, rest = cut(batched(function, arguments, (0, 0, 0), (0, 0, 0, 0)), late=1, early_outputs=2)
+    first, second, *handed = early(*arguments[:-1])
+    expected = torch.func.vmap(trace(function, [y[0] for y in arguments]))(*arguments)
+    agree((first, second, *rest(*arguments, *handed)), expected)

@@ -1,0 +1,113 @@
+"""What the tests share: problems in one line, and toy value functions."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
+from lyapnet.calculus import ValueFunction
+from lyapnet.config import load_config
+from lyapnet.controller import Controller
+from lyapnet.cost import Cost, QuadraticCost
+from lyapnet.policy import HJBPolicy
+from lyapnet.problem import Horizon, Problem
+from lyapnet.rollout import ClosedLoop
+from lyapnet.sets import Box, ControlSet, Unbounded
+from lyapnet.systems import ControlAffineSystem, MechanicalSystem
+
+CONF = Path(__file__).parents[1] / "conf"
+
+
+def problem_of(
+    system: ControlAffineSystem,
+    cost: Cost | None = None,
+    steps: int = 10,
+    dt: float = 0.1,
+    initial_states: Box | None = None,
+    controls: ControlSet | None = None,
+) -> Problem:
+    """A problem of a system: with Q = I, R = I, Q_T = I, no limits, and X₀ = [−1, 1]ⁿ unless told otherwise."""
+    cost = QuadraticCost(torch.eye(system.n), torch.eye(system.m), torch.eye(system.n)) if cost is None else cost
+    box = Box([-1.0] * system.n, [1.0] * system.n) if initial_states is None else initial_states
+    return Problem(system, cost, Unbounded() if controls is None else controls, box, Horizon(steps, dt))
+
+
+def untrained(name: str, *overrides: str) -> Controller:
+    """The controller of conf/NAME.yaml with fresh weights."""
+    config = load_config(CONF / f"{name}.yaml", overrides)
+    problem = build_problem(config)
+    V = build_value_function(config, problem)
+    return Controller(problem, V, build_rollout(config, problem, V), build_program(config), config)
+
+
+def hjb_loop(system: ControlAffineSystem, cost: Cost, V: ValueFunction) -> ClosedLoop:
+    """The closed loop of the HJB policy of V."""
+    problem = problem_of(system, cost)
+    return ClosedLoop(problem, HJBPolicy(problem, V))
+
+
+class Quadratic(ValueFunction):
+    """V = xᵀPx from P (n, n), or xᵀP_n x at the nodes t = n·dt from P (N + 1, n, n); its gradient is autograd's."""
+
+    def __init__(self, P, dt: float = 1.0):
+        super().__init__()
+        P = torch.as_tensor(P, dtype=torch.get_default_dtype())
+        self.P = nn.Parameter(P if P.ndim == 3 else P[None])
+        self.dt = dt
+
+    def forward(self, t, x):
+        P = self.P[(t / self.dt).round().long().clamp(0, len(self.P) - 1)]
+        return ((P @ x[..., None])[..., 0] * x).sum(-1)
+
+
+class ThreeLinkArm(MechanicalSystem):
+    """Three links in the horizontal plane, in absolute angles, with torques at the joints:
+
+    M_ij = c_ij cos(θ_i − θ_j) and h_i = −Σ_j c_ij sin(θ_i − θ_j) θ̇_j².
+    """
+
+    state_names = ("first angle", "second angle", "third angle", "first rate", "second rate", "third rate")
+    state_units = ("rad",) * 3 + ("rad/s",) * 3
+    control_names, control_units = ("shoulder torque", "elbow torque", "wrist torque"), ("N·m",) * 3
+    angles = (0, 1, 2)
+
+    def __init__(self, mass: float = 1.0, length: float = 0.5, damping: float = 0.25):
+        super().__init__([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]], [damping] * 3)
+        c = torch.tensor([[7 / 3, 3 / 2, 1 / 2], [3 / 2, 4 / 3, 1 / 2], [1 / 2, 1 / 2, 1 / 3]])
+        self.register_buffer("c", mass * length**2 * c.to(self.B), persistent=False)
+
+    def mass_matrix(self, q):
+        return self.c * torch.cos(q[..., :, None] - q[..., None, :])
+
+    def forces(self, q, qdot):
+        return -(self.c * torch.sin(q[..., :, None] - q[..., None, :]) * qdot[..., None, :] ** 2).sum(-1)
+
+    def energy(self, x):
+        return self.kinetic_energy(x[..., :3], x[..., 3:])
+
+
+class Formula(ValueFunction):
+    """V(t, x) = f(t, x) for any function of tensors; its gradient is autograd's."""
+
+    def __init__(self, f: Callable[[Tensor, Tensor], Tensor]):
+        super().__init__()
+        self.f = f
+
+    def forward(self, t, x):
+        return self.f(t, x)
+
+
+def planted(condition: nn.Module, point: Tensor, side: float, height: float) -> nn.Module:
+    """A function of (t, x) with a bump of width `side` that lifts it to `height` at one point."""
+    forward = condition.forward
+    with torch.no_grad():
+        lift = height - float(forward(point[0], point[1:]))
+
+    def lifted(t, x):
+        distance = (t - point[0]) ** 2 + ((x - point[1:]) ** 2).sum(-1)
+        return forward(t, x) + lift * torch.exp(-distance / side**2)
+
+    condition.forward = lifted
+    return condition

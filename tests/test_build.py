@@ -1,0 +1,125 @@
+"""From a config to objects: the shipped files against the task sheet, and classes of the user's own."""
+
+import sys
+
+import pytest
+import torch
+import yaml
+from torch.testing import assert_close
+
+from lyapnet.config import config_from_plain, load_config, to_plain
+from lyapnet.programs import LyapunovProgram, ValueProgram
+from lyapnet.systems import Cartpole, DoubleIntegrator, Reacher
+from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
+
+# The shipped configs against the task sheet
+
+BALANCING = {"cart_mass": 1, "pole_mass": 0.1, "length": 0.3, "cart_damping": 0.1, "pole_damping": 0.1}
+SWINGUP = {"cart_mass": 1, "pole_mass": 1, "length": 1, "cart_damping": 0, "pole_damping": 0.1}
+DOUBLE_INTEGRATOR = (DoubleIntegrator, {"mass": 1}, 400, [10, 0.1], [10, 0.1], [0, 0], [1, 0.7])
+TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width of X₀
+    "double_integrator": (LyapunovProgram, *DOUBLE_INTEGRATOR),
+    "double_integrator_certified": (LyapunovProgram, *DOUBLE_INTEGRATOR),
+    "double_integrator_value": (ValueProgram, *DOUBLE_INTEGRATOR),
+    "cartpole_balancing": (
+        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
+        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
+    ),
+    "cartpole_balancing_certified": (
+        LyapunovProgram, Cartpole, BALANCING, 79, [0, 25, 0.5, 0.1], [0, 25, 0.5, 0.1],
+        [0, 0, 0, 0], [0.6, 0.6, 0.2, 0.2],
+    ),
+    "cartpole_swingup": (
+        ValueProgram, Cartpole, SWINGUP, 171, [0, 0, 0, 0], [80, 600, 0.8, 4.5],
+        [0, torch.pi, 0, 0], [0, 0.3, 0, 0],
+    ),
+    "reacher": (
+        ValueProgram, Reacher, {"damping": 0.25}, 170, [1, 1, 0, 0], [100, 100, 1, 1],
+        [0, 0, 0, 0], [3, 3, 0, 0],
+    ),
+}  # fmt: skip
+
+
+PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
+
+
+def test_every_shipped_config_is_a_task_of_the_sheet():
+    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain"}
+    assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(PAPER)
+
+
+@pytest.mark.parametrize("name", PAPER)
+def test_the_papers_literal_program_has_the_task_of_ours(name):
+    """And its loss: the mean sum, without normalisation, margin or a cost term."""
+    ours, literal = load_config(CONF / f"{name}.yaml"), load_config(CONF / "paper" / f"{name}.yaml")
+    for section in ("system", "cost", "initial_states", "horizon"):
+        assert to_plain(literal)[section] == to_plain(ours)[section]
+    program = literal.program
+    assert program.name == ours.program.name
+    assert (program.constraint, program.trajectory_cost, program.normalise) == (1, 0, False)
+    assert (literal.training.batch_size, literal.rollout.gradient) == (12, "adjoint")
+    assert literal.network.hidden == {"cartpole_balancing": [200, 500], "double_integrator": [64, 64]}.get(
+        name, [128, 128]
+    )
+
+
+def test_one_number_stands_for_every_state():
+    config = load_config(CONF / "integrator_chain.yaml", ["system.parameters.length=3", "network.state_scale=[2]"])
+    problem, V, _, _ = objects(config)
+    assert_close(problem.cost.Q, torch.eye(3, dtype=torch.float64))
+    assert_close(problem.initial_states.widths, torch.full((3,), 2.0, dtype=torch.float64))
+    assert_close(V.inputs.state_scale, torch.full((3,), 2.0, dtype=torch.float64))
+    assert_close(problem.system.f(torch.tensor([1.0, 2.0, 3.0])), torch.tensor([2.0, 3.0, 0.0]).double())
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_shipped_config_is_its_task(name):
+    config = load_config(CONF / f"{name}.yaml")
+    problem, V, program, rollout = objects(config)
+    program_class, system_class, parameters, N, Q, Q_T, center, half_width = TASKS[name]
+    assert config.experiment == name
+    assert type(program) is program_class
+    assert type(problem.system) is system_class
+    assert (problem.horizon.steps, problem.horizon.dt) == (N, 0.01)
+    assert_close(problem.cost.Q, torch.tensor(Q, dtype=torch.float64).diag())
+    assert_close(problem.cost.Q_T, torch.tensor(Q_T, dtype=torch.float64).diag())
+    assert_close(problem.initial_states.center, torch.tensor(center, dtype=torch.float64))
+    assert_close(problem.initial_states.widths, 2 * torch.tensor(half_width, dtype=torch.float64))
+    expected, x = system_class(**parameters), torch.randn(8, problem.system.n)
+    assert_close(problem.system.f(x), expected.f(x))
+    assert_close(problem.system.g(x), expected.g(x))
+    assert_close(problem.cost.R(x), expected.inverse_mass(x))
+    assert V(torch.tensor(0.0), x).shape == (8,)
+    assert config.rollout.policy == "hjb"
+    assert rollout.method == "euler"
+
+
+# The user's own classes
+
+
+@pytest.fixture
+def plain():
+    return yaml.safe_load(PLAIN)
+
+
+@pytest.fixture
+def own_classes(tmp_path, monkeypatch):
+    """A module of the user's in the working directory; its name."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "hangar.py").write_text(HANGAR)
+    yield "hangar"
+    sys.modules.pop("hangar", None)
+
+
+@pytest.mark.parametrize(("name", "mass"), [("Balloon", 1), ("Drone", 4), ("Squadron", 4)])
+def test_classes_of_the_users_own_are_built(name, mass, own_classes, plain):
+    """Also without a constructor, and with one that takes anything."""
+    parameters = {"mass": mass} if name != "Balloon" else {}
+    plain["system"] = {"name": f"{own_classes}:{name}", "parameters": parameters}
+    plain["network"] = {"name": f"{own_classes}:Bowl", "hidden": [6]}
+    problem, V, _, rollout = objects(config_from_plain(plain))
+    x = torch.randn(3, 2)
+    assert problem.system.mass == mass
+    assert V.width == 6
+    assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / mass)  # −½ R⁻¹gᵀV_x with V = ‖x‖²

@@ -1,0 +1,225 @@
+"""Control laws against brute force, the Riccati equation and the theorems that define them."""
+
+import math
+
+import pytest
+import torch
+from scipy.linalg import solve_continuous_are
+from torch.testing import assert_close
+
+from lyapnet.calculus import gradients, time_derivative
+from lyapnet.cost import QuadraticCost
+from lyapnet.networks import PartiallyConvexNetwork, Scaling
+from lyapnet.networks.anchored import GoalAnchor
+from lyapnet.policy import POLICIES, HJBPolicy, SontagPolicy
+from lyapnet.sets import ControlSet
+from lyapnet.systems import DoubleIntegrator, Linear
+from tests.problems import Formula, problem_of
+
+
+def draw(system, *batch):
+    return torch.rand(batch), torch.randn(*batch, system.n)
+
+
+def lie(V, system, cost, t, x):
+    """V_t, LfV, LgV, q and σ = LgV R⁻¹ LgVᵀ."""
+    V_t, V_x = gradients(V, t, x)
+    LfV = torch.einsum("bn,bn->b", V_x, system.f(x))
+    LgV = torch.einsum("bn,bnm->bm", V_x, system.g(x))
+    return V_t, LfV, LgV, cost.state(x), torch.einsum("bi,bij,bj->b", LgV, torch.linalg.inv(cost.R(x)), LgV)
+
+
+def minimises_the_hamiltonian(u, system, cost, V, t, x):
+    """No perturbation of u, small or large, lowers H(x, u, V_x) = ℓ(x, u) + V_xᵀ(f + gu)."""
+    V_x = gradients(V, t, x)[1].detach()
+
+    def hamiltonian(u):
+        states = x.expand(*u.shape[:-1], system.n)
+        return cost.running(states, u) + (V_x * system.dynamics(states, u)).sum(-1)
+
+    sizes = torch.logspace(-4, 1, 200)[:, None, None]
+    assert (hamiltonian(u + sizes * torch.randn(200, *u.shape)) - hamiltonian(u) > -1e-12).all()
+
+
+def test_hjb_policy_minimises_the_hamiltonian(system, cost, V):
+    t, x = draw(system, 8)
+    u = HJBPolicy(problem_of(system, cost), V)(t, x).detach()
+    minimises_the_hamiltonian(u, system, cost, V, t, x)
+    for wrong in (0.99 * u, -u, u + 1e-2):
+        with pytest.raises(AssertionError):
+            minimises_the_hamiltonian(wrong, system, cost, V, t, x)
+
+
+@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
+def test_control_comes_with_its_value_function(policy, system, cost, V):
+    t, x = draw(system, 8)
+    law = policy(problem_of(system, cost), V)
+    expected = law(t, x), V(t, x), gradients(V, t, x)[1]
+    for value, wanted, other in zip(law.with_value(t, x), expected, law.with_value(t + 0.1, x), strict=True):
+        assert_close(value, wanted)
+        assert not torch.allclose(other, wanted)
+
+
+def test_under_the_hjb_policy_the_hjb_residual_has_its_closed_form(system, cost, V):
+    """V̇ + ℓ = V_t + V_xᵀf + q − ¼ V_xᵀg R⁻¹ gᵀV_x."""
+    t, x = draw(system, 50)
+    policy = HJBPolicy(problem_of(system, cost), V)
+    V_t, LfV, _, q, sigma = lie(V, system, cost, t, x)
+    expected = V_t + LfV + q - sigma / 4
+    assert_close(time_derivative(V, system, t, x, policy(t, x)) + cost.running(x, policy(t, x)), expected)
+
+    def scaled(t, x):
+        return 1.2 * policy(t, x)
+
+    residual = time_derivative(V, system, t, x, scaled(t, x)) + cost.running(x, scaled(t, x))
+    assert (residual >= expected).all()
+    assert not torch.allclose(residual, expected)
+
+
+def test_under_sontags_formula_every_V_falls_at_its_rate(system, cost, V):
+    """V̇ = −√(a² + qσ), with a = V_t + LfV; the HJB policy of the same V lets it rise somewhere."""
+    t, x = draw(system, 200)
+    V_t, LfV, LgV, q, sigma = lie(V, system, cost, t, x)
+    assert (LgV.abs().amax(-1) > 0).all()
+    sontag, hjb = (policy(problem_of(system, cost), V) for policy in (SontagPolicy, HJBPolicy))
+    Vdot = time_derivative(V, system, t, x, sontag(t, x))
+    assert_close(Vdot, -torch.sqrt((V_t + LfV) ** 2 + q * sigma))
+    assert (Vdot < 0).all()
+    assert (time_derivative(V, system, t, x, hjb(t, x)) > 0).any()
+
+
+LINEAR = {
+    "double integrator": (DoubleIntegrator, [[1.0]]),
+    "unstable, two controls": (
+        lambda: Linear([[0.5, 1.0, 0.0], [0.0, -0.2, 1.0], [1.0, 0.0, 0.3]], [[0.0, 1.0], [0.2, 0.0], [1.0, 0.3]]),
+        [[1.0, 0.3], [0.3, 2.0]],
+    ),
+}
+
+
+@pytest.mark.parametrize(("build", "R"), LINEAR.values(), ids=LINEAR)
+def test_with_the_riccati_solution_both_policies_are_the_linear_regulator(build, R, quadratic):
+    system = build()
+    cost = QuadraticCost(torch.diag(torch.linspace(1, 2, system.n)), R, torch.eye(system.n))
+    A, B = system.A.numpy(), system.B.numpy()
+    P = torch.from_numpy(solve_continuous_are(A, B, cost.Q.numpy(), R))
+    K = torch.linalg.solve(torch.tensor(R), system.B.mT @ P)
+    t, x = draw(system, 50)
+
+    def controls(P):
+        return [policy(problem_of(system, cost), quadratic(P))(t, x) for policy in (HJBPolicy, SontagPolicy)]
+
+    for u in controls(P):
+        assert_close(u, -x @ K.mT)
+    hjb, sontag = controls(1.2 * P)
+    assert_close(hjb, -1.2 * x @ K.mT)
+    assert not torch.allclose(sontag, hjb, rtol=1e-2)
+
+
+# At and near the goal
+
+
+def anchored(system):
+    scaling = Scaling([1.0] * system.n, duration=1.0, value=3.0)
+    return GoalAnchor(PartiallyConvexNetwork(scaling, hidden=(8, 8)))
+
+
+class UnguardedSontag(SontagPolicy):
+    """The formula as printed."""
+
+    def forward(self, t, x):
+        V_t, LfV, LgV, q, sigma = lie(self.V, self.system, self.cost, t, x)
+        a = V_t + LfV
+        return -((a + torch.sqrt(a**2 + q * sigma)) / sigma)[:, None] * self.cost.solve_R(x, LgV)
+
+
+def is_finite_at_the_goal(policy, system):
+    """The control and all its derivatives, at the goal and where only some states vanish."""
+    t = torch.full((4,), 0.3)
+    x = torch.cat([torch.zeros(2, system.n), torch.eye(system.n)[:1], -torch.eye(system.n)[-1:]]).requires_grad_()
+    u = policy(t, x)
+    slopes = torch.autograd.grad(u.sum(), [x, *policy.parameters()], materialize_grads=True, allow_unused=True)
+    for value in (u, *slopes):
+        assert torch.isfinite(value).all()
+
+
+@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
+def test_control_and_its_gradients_are_finite_at_the_goal(policy, system, cost, V):
+    for value in (V, anchored(system)):
+        is_finite_at_the_goal(policy(problem_of(system, cost), value), system)
+
+
+def test_the_formula_as_printed_is_not_finite_at_the_goal(system, cost):
+    with pytest.raises(AssertionError):
+        is_finite_at_the_goal(UnguardedSontag(problem_of(system, cost), anchored(system)), system)
+
+
+def vanishes_with_the_state(policy, t, x):
+    """‖u(t, sx)‖ ≤ c s for every s down to the fourth root of the smallest number (u has fourth powers of s inside)."""
+    near = policy(t, 1e-2 * x).abs().max() / 1e-2
+    for s in torch.logspace(-2, math.log10(torch.finfo(x.dtype).tiny) / 4, 60, dtype=x.dtype):
+        assert policy(t, s * x).abs().max() <= 10 * s * near
+
+
+@pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+def test_control_vanishes_with_the_state(policy, dtype, system, cost, V):
+    smooth = Formula(lambda t, x: (2 + torch.sin(3 * t)) * ((x**2).sum(-1) + (x**4).sum(-1)))
+    sloped = Formula(lambda t, x: V(t, x) + 100 * t)
+    t, x = (v.to(dtype) for v in draw(system, 64))
+    vanishes_with_the_state(policy(problem_of(system, cost), smooth).to(dtype), t, x)
+    with pytest.raises(AssertionError):
+        vanishes_with_the_state(policy(problem_of(system, cost), sloped).to(dtype), t, x)
+
+
+def test_sontag_does_nothing_where_V_falls_by_itself_and_nothing_is_asked(system, V):
+    """With q = 0: u = 0 where a ≤ 0, and u ≠ 0 where a > 0."""
+    t, x = draw(system, 20)
+    free = QuadraticCost(torch.zeros(system.n, system.n), torch.eye(system.m), torch.eye(system.n))
+    tilted = [Formula(lambda t, x, c=c: V(t, x) + c * t) for c in (-100, 100)]
+    falling, rising = (SontagPolicy(problem_of(system, free), value) for value in tilted)
+    assert (falling(t, x) == 0).all()
+    assert (rising(t, x) != 0).all()
+
+
+# Sets of controls
+
+
+class Small(ControlSet):
+    """|u_i| ≤ 0.1, for R = 1."""
+
+    def minimise(self, R, b):
+        return self.project(-b / 2)
+
+    def contains(self, u):
+        return (u.abs() <= 0.1).all(-1)
+
+    def project(self, u):
+        return u.clamp(-0.1, 0.1)
+
+
+def test_the_hjb_policy_keeps_within_the_control_set():
+    """It minimises the Hamiltonian over U: no admitted control is better; and the law without limits leaves U."""
+    system = DoubleIntegrator()
+    cost, V = QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2)), Formula(lambda t, x: (x**2).sum(-1))
+    t, x = draw(system, 30)
+    limited, free = (HJBPolicy(problem_of(system, cost, controls=c), V) for c in (Small(), None))
+    V_x = gradients(V, t, x)[1]
+
+    def hamiltonian(u):
+        return cost.running(x, u) + (V_x * system.dynamics(x, u)).sum(-1)
+
+    u = limited(t, x)
+    assert Small().contains(u).all()
+    assert not Small().contains(free(t, x)).all()
+    for other in torch.linspace(-0.1, 0.1, 21):
+        assert (hamiltonian(u) <= hamiltonian(other.expand(30, 1)) + 1e-12).all()
+    assert_close(u, Small().project(free(t, x)))
+    assert_close(limited.with_value(t, x).u, u)
+
+
+def test_sontags_formula_is_refused_where_controls_are_limited(V):
+    system = DoubleIntegrator()
+    SontagPolicy(problem_of(system), V)
+    with pytest.raises(ValueError, match="Expected controls without limits for Sontag's formula, got Small"):
+        SontagPolicy(problem_of(system, controls=Small()), V)

@@ -1,0 +1,142 @@
+"""Boxes of states against brute force; sets of controls."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.testing import assert_close
+
+from lyapnet.cost import QuadraticCost
+from lyapnet.sets import CONTROL_SETS, Box, Unbounded
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture
+def box():
+    """With one fixed component, and one that excludes the origin."""
+    return Box([-1.0, 0.5, 2.0], [1.0, 0.5, 6.0])
+
+
+def test_a_box_knows_its_geometry(box):
+    assert box.dimension == 3
+    assert box.center.tolist() == [0.0, 0.5, 4.0]
+    assert box.widths.tolist() == [2.0, 0.0, 4.0]
+    assert box.magnitude.tolist() == [1.0, 0.5, 6.0]
+
+
+def looks_uniform(samples, lower, upper):
+    """Mean and variance of every component within five standard errors of the uniform distribution's."""
+    count, lower, widths = len(samples), torch.tensor(lower), torch.tensor(upper) - torch.tensor(lower)
+    unit = (samples - lower)[:, widths > 0] / widths[widths > 0]
+    mean_error, variance_error = math.sqrt(1 / 12 / count), math.sqrt(1 / 180 / count)
+    assert ((unit.mean(0) - 1 / 2).abs() < 5 * mean_error).all()
+    assert ((unit.var(0) - 1 / 12).abs() < 5 * variance_error).all()
+
+
+def test_samples_are_uniform_in_the_box(box):
+    samples = box.sample(20_000, seeded())
+    assert samples.shape == (20_000, 3)
+    assert box.contains(samples).all()
+    looks_uniform(samples, [-1.0, 0.5, 2.0], [1.0, 0.5, 6.0])
+
+
+@pytest.mark.parametrize("upper", [[1.1, 0.5, 6.0], [1.0, 0.5, 5.9]])
+def test_another_box_does_not_pass_for_uniform(box, upper):
+    with pytest.raises(AssertionError):
+        looks_uniform(box.sample(20_000, seeded()), [-1.0, 0.5, 2.0], upper)
+
+
+def test_a_seed_names_the_samples(box):
+    assert torch.equal(box.sample(5, seeded(3)), box.sample(5, seeded(3)))
+    assert not torch.equal(box.sample(5, seeded(3)), box.sample(5, seeded(4)))
+    assert_close(box.float().sample(5, seeded(3)).double(), box.double().sample(5, seeded(3)), rtol=1e-6, atol=1e-6)
+
+
+@given(st.integers(0, 2**32), st.floats(-1e3, 1e3, width=32), st.floats(0, 1e3, width=32))
+def test_samples_stay_in_the_box_in_single_precision(seed, low, width):
+    box = Box([low], [low + width]).float()
+    assert box.sample(64, seeded(seed)).dtype == torch.float32
+    assert box.contains(box.sample(64, seeded(seed))).all()
+
+
+def test_a_sample_at_the_upper_end_stays_in_the_box(monkeypatch):
+    """lower + (upper − lower) can exceed upper by a rounding."""
+    monkeypatch.setattr(torch, "rand", lambda *size, **_: torch.full(size, 1 - 2**-53))
+    box = Box([-0.2], [0.1]).float()
+    assert box.lower + box.widths > box.upper
+    assert box.contains(box.sample(1)).all()
+
+
+def test_contains_is_closed_and_looks_at_every_component(box):
+    inside = torch.tensor([[-1.0, 0.5, 2.0], [1.0, 0.5, 6.0], [0.0, 0.5, 3.0]])
+    outside = torch.tensor([[-1.01, 0.5, 2.0], [1.0, 0.5 + 1e-9, 6.0], [0.0, 0.5, 6.01], [math.nan, 0.5, 3.0]])
+    assert box.contains(inside).all()
+    assert not box.contains(outside).any()
+    assert box.contains(inside[0]).shape == ()
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "reason"),
+    [
+        ([0.0], [1.0, 2.0], "same shape"),
+        ([], [], "same shape"),
+        (torch.tensor(0.0), torch.tensor(1.0), "same shape"),
+        (torch.zeros(1, 2), torch.ones(1, 2), "same shape"),
+        ([-math.inf], [0.0], "finite"),
+        ([0.0], [math.nan], "finite"),
+        ([0.0, 2.0], [1.0, 1.0], "2.0 > 1.0 at index 1"),
+    ],
+)
+def test_bounds_without_meaning_are_refused(lower, upper, reason):
+    with pytest.raises(ValueError, match=f"Expected .*{reason}"):
+        Box(lower, upper)
+
+
+def test_integer_bounds_make_a_box_of_floats():
+    assert Box([0, -1], [1, 1]).lower.dtype == torch.float64
+
+
+# Sets of controls
+
+
+@pytest.mark.parametrize("m", range(1, 5))
+def test_without_limits_the_minimum_is_where_the_gradient_vanishes(m):
+    """2Ru + b = 0."""
+    factor, b = torch.randn(7, m, m), torch.randn(7, m)
+    R = factor @ factor.mT + torch.eye(m)
+    u = Unbounded().minimise(R, b)
+    assert_close(2 * (R @ u[..., None])[..., 0] + b, torch.zeros(7, m), rtol=0, atol=1e-10)
+    assert not torch.allclose(u, Unbounded().minimise(R.roll(1, 0), b))
+
+
+def test_only_the_unbounded_set_itself_has_no_limits():
+    class Halved(Unbounded):
+        def minimise(self, R, b):
+            return super().minimise(R, b) / 2
+
+    assert not Unbounded().limited
+    assert Halved().limited, "else its own law would be passed over, and an optimum without limits be its own"
+
+
+@pytest.mark.parametrize("controls", CONTROL_SETS.values(), ids=CONTROL_SETS)
+def test_every_registered_set_keeps_its_contract(controls):
+    """The minimum and every projection lie in the set; no admitted control is better than the minimum."""
+    controls, b, others = controls(), torch.randn(50, 2), torch.randn(50, 200, 2)
+    R = QuadraticCost(torch.eye(2), [[2.0, 0.3], [0.3, 1.0]], torch.eye(2)).R(torch.zeros(50, 2))
+
+    def objective(u):
+        return torch.einsum("...i,...ij,...j->...", u, R[0], u) + (b.reshape(50, *[1] * (u.ndim - 2), 2) * u).sum(-1)
+
+    u = controls.minimise(R, b)
+    assert u.shape == b.shape
+    assert controls.contains(u).all()
+    assert controls.contains(controls.project(others)).all()
+    assert_close(controls.project(controls.project(others)), controls.project(others))
+    assert (objective(u)[:, None] <= objective(controls.project(others)) + 1e-12).all()
+    assert not (objective(0.9 * u)[:, None] <= objective(u[:, None])).any(), "a control that is not the minimum"
+    assert not controls.contains(torch.tensor([0.0, math.nan]))

@@ -1,0 +1,219 @@
+"""lyapnet certify --refine: a round writes its points, its config and a run, whatever stops it in between.
+
+Most rounds are of a claim that is made up, as a proof takes seconds; one goes through the command.
+"""
+
+import csv
+import json
+import shutil
+from functools import partial
+
+import pytest
+import torch
+from rich.console import Console
+
+import lyapnet
+from lyapnet.certification import DecreaseCondition, SoundClaim, sound_certificate
+from lyapnet.certification.sound_certificate import SoundCertificate
+from lyapnet.cli import main
+from lyapnet.config import load_config
+from lyapnet.errors import Interrupted
+from lyapnet.sets import Box
+from lyapnet.training import experiment, refinement
+from lyapnet.training.modules import ValueModule
+from lyapnet.training.runs import Run
+
+TINY = [
+    *("training.iterations=2", "training.batch_size=4", "horizon.steps=8", "network.hidden=[4]"),
+    *("evaluation.validation_states=4", "evaluation.test_states=4", "rollout.gradient=backprop"),
+    "loggers=[csv]",  # no figures, which take most of the time of a short run
+]
+FEW = ["training.iterations=3", "pointwise.points=8"]
+ALPHA, DELTA = 0.9, 0.01
+
+
+def train(logs, *changes):
+    """The folder of a run whose condition fails."""
+    assert main(["train", "--config", "conf/double_integrator.yaml", f"logs={logs}", *TINY, *changes]) == 0
+    return logs / "double_integrator/version_0"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    return train(tmp_path_factory.mktemp("logs"))
+
+
+@pytest.fixture
+def run(trained, tmp_path):
+    """A copy of it, to be refined."""
+    return shutil.copytree(trained, tmp_path / "run")
+
+
+def best(folder):
+    return folder / "checkpoints/best.ckpt"
+
+
+def claimed(checkpoint, rho=-float("inf"), undecided=((0.01, 0.2, -0.3), (0.02, 1.5, 2.5)), level=20.0):
+    """A claim about the controller of a checkpoint: nothing is proved, and two boxes are undecided."""
+    controller = lyapnet.load(checkpoint)
+    D, centers = Box([-1.6, -2.6], [1.6, 2.6]), torch.tensor(undecided).reshape(-1, 3)
+    duration = controller.horizon.duration
+    claim = SoundClaim(ALPHA, DELTA, duration, D, rho, level, level, 0.0, 0.0, None, 9, 1.0, 0.5, centers, [])
+    return SoundCertificate(controller, claim, {"seed": 0})
+
+
+def refine(run, rounds=1, certified=claimed):
+    return refinement.refine(best(run), certified, rounds, FEW, Console(quiet=True))
+
+
+def points_of(folder):
+    with (folder / "points.csv").open() as file:
+        header, *rows = csv.reader(file)
+    return header, torch.tensor([[float(entry) for entry in row] for row in rows])
+
+
+def runs(folder):
+    return sorted(path.name for path in folder.glob("version_*"))
+
+
+def weights(checkpoint):
+    return lyapnet.load(checkpoint).V.state_dict()
+
+
+def no_training(monkeypatch):
+    monkeypatch.setattr(experiment, "fit", lambda *_: pytest.fail("Expected no training."))
+
+
+def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
+    checkpoint, certificate = refine(run)
+    folder = run / "refine_1"
+    again = Run(folder / "version_0")
+    assert runs(folder) == ["version_0"]
+    assert again.finished
+    assert checkpoint == again.best
+    assert certificate.controller.config.pointwise.counterexamples
+    assert again.finetuned_from == best(run).resolve()
+    before, config = load_config(trained / "config.yaml"), load_config(folder / "config.yaml")
+    assert config.training.learning_rate == pytest.approx(before.training.learning_rate / 5)
+    assert (config.training.iterations, config.pointwise.points) == (3, 8), "the overrides"
+    assert config.pointwise.weight == before.program.constraint > 0 == before.pointwise.weight
+    assert config.pointwise.counterexamples == str(folder.resolve() / "points.csv")
+    assert config.pointwise.region == [1.6, 2.6], "D"
+    assert any(not torch.equal(w, weights(best(run))[name]) for name, w in weights(checkpoint).items())
+
+
+def test_its_points_fail_the_condition_or_are_undecided(run):
+    """By plain arithmetic, at the controller that failed."""
+    condition = DecreaseCondition(lyapnet.load(best(run)).closed_loop.double(), ALPHA, DELTA)
+    refine(run)
+    header, points = points_of(run / "refine_1")
+    assert header == ["t", "position", "velocity"]
+    *failing, first, second = points
+    assert {tuple(first.tolist()), tuple(second.tolist())} == {(0.01, 0.2, -0.3), (0.02, 1.5, 2.5)}
+    failing = torch.stack(failing)
+    assert len(failing) == refinement.FURTHER
+    with torch.no_grad():
+        c, W = condition(failing[:, 0], failing[:, 1:]), condition.height(failing[:, 0], failing[:, 1:])
+    assert (c > 0).all()
+    assert (W <= 20.0).all()
+    assert len(refinement.failing_points(claimed(best(run), level=-1.0))) == 2, "no violation lies below this level"
+
+
+def test_the_same_command_does_not_train_again(run, monkeypatch):
+    checkpoint, _ = refine(run)
+    before = checkpoint.read_bytes()
+    no_training(monkeypatch)
+    assert refine(run)[0] == checkpoint
+    assert checkpoint.read_bytes() == before
+    assert runs(run / "refine_1") == ["version_0"]
+
+
+def test_a_second_round_starts_from_the_first_and_keeps_its_points(run):
+    refine(run)
+    checkpoint, _ = refine(run, rounds=2)
+    assert checkpoint == Run(run / "refine_2/version_0").best
+    assert Run(run / "refine_2/version_0").finetuned_from == best(run / "refine_1/version_0").resolve()
+    (_, first), (_, both) = points_of(run / "refine_1"), points_of(run / "refine_2")
+    assert torch.equal(both[-len(first) :], first)
+    assert len(both) > len(first)
+    rates = [load_config(folder / "config.yaml").training.learning_rate for folder in (run, run / "refine_2")]
+    assert rates[1] == pytest.approx(rates[0] / 25)
+
+
+def interrupted(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("place", "name", "written"),
+    [
+        (refinement, "to_yaml", {"points.csv"}),
+        (experiment, "fit", {"points.csv", "config.yaml", "version_0"}),
+        (ValueModule, "on_before_optimizer_step", {"points.csv", "config.yaml", "version_0"}),
+    ],
+    ids=["before its config", "before its training", "in its training"],
+)
+def test_what_was_stopped_goes_on_to_the_same_end(place, name, written, run, trained, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(place, name, interrupted)
+        with pytest.raises((KeyboardInterrupt, SystemExit, Interrupted)):
+            refine(run)
+    assert {path.name for path in (run / "refine_1").iterdir()} == written
+    checkpoint, _ = refine(run)
+    assert runs(run / "refine_1") == ["version_0"]
+    undisturbed, _ = refine(shutil.copytree(trained, tmp_path / "undisturbed"))
+    assert all(torch.equal(w, weights(undisturbed)[name]) for name, w in weights(checkpoint).items())
+
+
+def test_what_is_certified_needs_no_round(run, monkeypatch):
+    no_training(monkeypatch)
+    checkpoint, certificate = refine(run, 3, partial(claimed, rho=20.0))
+    assert checkpoint == best(run)
+    assert certificate.claim.verdict == "certified"
+    assert not list(run.glob("refine_*"))
+
+
+def test_where_nothing_fails_it_still_trains(run):
+    """A rim that is too low, say, has neither counterexamples nor undecided boxes."""
+    refine(run, certified=partial(claimed, undecided=(), level=-1.0))
+    assert runs(run / "refine_1") == ["version_0"]
+    assert points_of(run / "refine_1")[1].numel() == 0
+
+
+def test_single_precision_is_refined(tmp_path):
+    refine(train(tmp_path, "training.precision=float32"))
+    assert runs(tmp_path / "double_integrator/version_0/refine_1") == ["version_0"]
+
+
+def test_the_command(run, capsys, monkeypatch):
+    class Made(SoundCertificate):
+        def numbers(self):
+            return {"alpha": self.options["alpha"], "trained with": self.controller.config.seed}
+
+    def certify(controller, alpha, *_):
+        return Made(controller, claimed(best(run)).claim, {"alpha": alpha, "seed": 0})
+
+    monkeypatch.setattr(sound_certificate, "sound_certificate", certify)
+    capsys.readouterr()
+    command = ["certify", "sound", str(best(run)), *FEW, "--alpha=0.7", "--json"]
+    assert main([*command, "--refine=1", "seed=5"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["alpha"], result["trained with"]) == (0.7, 5), "of what was trained last"
+    assert runs(run / "refine_1") == ["version_0"]
+    no_training(monkeypatch)
+    assert main([*command, "--refine=1", "seed=5"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["seed=3"], "Expected overrides with --refine ROUNDS, got 'seed=3'; add it."),
+        (["--refine=1", "--keep=proof.pt"], "Expected --keep or --refine, got both"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(arguments, message, run, capsys):
+    assert main(["certify", "sound", str(best(run)), *arguments]) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert len(printed.splitlines()) == 1
+    assert not list(run.glob("refine_*"))

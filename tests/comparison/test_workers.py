@@ -47,6 +47,7 @@ def test_a_job_that_fails_is_told_and_the_others_go_on(runner, monkeypatch, tmp_
     begun = []
     if runner == "ray":
         pytest.importorskip("ray")
+        monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))  # where its workers find this module
     outcomes = list(run_jobs(jobs, 2, "local" if runner == "ray" else None, begun.append))
     assert {outcome.job.name: outcome.failure for outcome in outcomes} == {"failing": "last words", "working": ""}
     assert set(begun) == set(jobs)

@@ -49,4 +49,3 @@ StageInputMatrices = Float[Tensor, "nodes stages *batch n m"]
 Jacobians = Float[Tensor, "nodes *batch n n"]
 
 Value = Callable[[Tensor, Tensor], Tensor]  # V: (t, x) ↦ one number for each state
-Policy = Callable[[Tensor, Tensor], Tensor]  # u: (t, x) ↦ one control for each state

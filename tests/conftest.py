@@ -1,16 +1,45 @@
-"""Shared by all tests: shapes checked on every call, float64, fixed seeds, every registered system and its task."""
+"""Shared by all tests: shapes checked, float64, fixed seeds, every registered system and its task."""
 
+import functools
+import inspect
 import os
+from collections import Counter
 
 os.environ["MPLBACKEND"] = "Agg"
 
 import hypothesis
+import jaxtyping
 import pytest
 import torch
-from jaxtyping import install_import_hook
 
+CHECKED_CALLS = 20  # of each function in each test; with all of them the tests take three times as long
+_calls = Counter()
+
+
+def _checked_at_first(typechecker):
+    """jaxtyping's decorator, in effect for the first calls of a function in each test."""
+
+    def decorate(function):
+        if not inspect.isfunction(function):
+            return _jaxtyped(function, typechecker=typechecker)
+
+        @functools.wraps(function)
+        def call(*arguments, **options):
+            _calls[function.__code__] += 1
+            few = _calls[function.__code__] <= CHECKED_CALLS
+            return (checked() if few else function)(*arguments, **options)
+
+        # Only when called: a function within a function is made anew each time, and most of these are not checked.
+        checked = functools.cache(lambda: _jaxtyped(function, typechecker=typechecker))
+        return call
+
+    return decorate
+
+
+_jaxtyped = jaxtyping.jaxtyped
+jaxtyping.jaxtyped = _checked_at_first
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
-install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
@@ -37,6 +66,7 @@ def _cache(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def _float64_and_seeded():
+    _calls.clear()
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(0)
 
@@ -108,6 +138,9 @@ def quadratic():
     return Quadratic
 
 
+LONG = ("test_runs.py", "test_readme.py", "test_funnel.py", "test_negative_controls.py", "test_bounds.py")
+
+
 def pytest_collection_modifyitems(items):
-    """What takes minutes comes first, so that no process is left alone with it."""
-    items.sort(key=lambda item: item.path.name != "test_readme.py")
+    """The files that take longest come first, so that no process is left alone with one of them."""
+    items.sort(key=lambda item: item.path.name not in LONG)

@@ -9,6 +9,7 @@ PAGES = {path: path.read_text(encoding="utf-8") for path in (README, *sorted((RO
 REPORT = ROOT / "docs" / "compare" / "report.md"  # written by lyapnet compare
 
 
-def blocks(language: str) -> list[str]:
-    """The code blocks of a language on all pages, in their order."""
-    return [block for text in PAGES.values() for block in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)]
+def blocks(language: str, *pages: Path) -> list[str]:
+    """The code blocks of a language on these pages, or on all, in their order."""
+    texts = [PAGES[page] for page in pages or PAGES]
+    return [block for text in texts for block in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)]

@@ -6,18 +6,20 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 import lyapnet
-from lyapnet.cli import main
+from lyapnet.cli import app, main
 from lyapnet.comparison.plan import jobs_of, load_comparison
+from lyapnet.config import load_config
 from tests.pages import PAGES, README, REPORT, ROOT, blocks
 
 SHORT = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4"]
 
 
-def commands(program: str) -> list[list[str]]:
+def commands(program: str, language_blocks: list[str] | None = None) -> list[list[str]]:
     """The arguments of every line of a bash block that calls the program, in the pages' order, none twice."""
-    joined = [block.replace("\\\n", " ") for block in blocks("bash")]
+    joined = [block.replace("\\\n", " ") for block in language_blocks or blocks("bash")]
     lines = [part.strip() for block in joined for line in block.splitlines() for part in line.split("&&")]
     return [shlex.split(line.removeprefix(program)) for line in dict.fromkeys(lines) if line.startswith(program)]
 
@@ -69,14 +71,57 @@ def with_option(arguments: list[str], name: str, value: str) -> list[str]:
     return [*arguments[: at + 1], value, *arguments[at + 2 :]]
 
 
+def trains(arguments: list[str]) -> bool:
+    return "trainer.strategy=ddp" not in arguments  # which starts this very process again: see test_distributed
+
+
+@pytest.mark.slow
 def test_every_command_runs(workplace, capsys):
     trainings = commands("python train.py")
     assert len(trainings) >= 4
-    for arguments in trainings:
-        if "trainer.strategy=ddp" not in arguments:  # starts this very process again: see test_distributed
-            assert train(arguments) == 0, capsys.readouterr().err
+    for arguments in filter(trains, trainings):
+        assert train(arguments) == 0, capsys.readouterr().err
     for arguments in commands("lyapnet"):
         assert main(brief(arguments)) == 0, (arguments, capsys.readouterr().err)
+
+
+def test_every_command_of_the_readme_runs(workplace, capsys):
+    """But for the proof, which takes longer than the others together: see test_certify."""
+    of_readme = blocks("bash", README)
+    for arguments in filter(trains, commands("python train.py", of_readme)):
+        assert train(arguments) == 0, capsys.readouterr().err
+    others = commands("lyapnet", of_readme)
+    assert len(others) >= 3
+    for arguments in others:
+        if arguments[:2] != ["certify", "sound"]:
+            assert main(brief(arguments)) == 0, (arguments, capsys.readouterr().err)
+
+
+def understood(arguments: list[str]) -> dict:
+    """What the command line makes of them, without doing it: the parameters of the innermost command."""
+    command, context = typer.main.get_command(app), None
+    while True:
+        context = command.make_context("lyapnet", list(arguments), parent=context)
+        if not isinstance(command, typer.core.TyperGroup):
+            return context.params
+        _, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
+
+
+def test_every_command_is_understood(workplace):
+    """Each option exists, and each experiment and change that is named makes a config."""
+    trainings = [["train", *arguments] for arguments in commands("python train.py")]
+    found = trainings + commands("lyapnet")
+    assert len(found) >= 30
+    for arguments in found:
+        given = understood(arguments)
+        if arguments[0] in ("train", "sweep"):
+            experiments = given["config"] if arguments[0] == "sweep" else [given["config"]]
+            for experiment in experiments:
+                load_config(experiment, list(given["overrides"] or ()))
+        elif arguments[0] == "compare":
+            assert load_comparison(given["config"]).tasks
+    with pytest.raises(typer.TyperException):
+        understood(["evaluate", "last.ckpt", "--samplez", "3"])
 
 
 def test_the_python_example_runs(workplace):

@@ -25,14 +25,15 @@ class ByKind(TyperGroup):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args or (args[0] not in self.commands and args[0] != "--help"):
+        if args[:1] != ["--help"]:
             args = self._with_kind(args)
         return super().parse_args(ctx, args)
 
     def _with_kind(self, args: list[str]) -> list[str]:
         kind, others = _without_option("--kind", args)
-        if kind is None:
-            return [DEFAULT, *others]
+        if kind is None:  # options may stand before the kind, or none: those of the group itself are none
+            named = next((argument for argument in args if argument in self.commands), DEFAULT)
+            return [named, *(argument for argument in args if argument != named)]
         if kind not in self.commands:
             raise UsageError(f"Expected --kind as one of {', '.join(self.commands)}, got {kind!r}; choose one.")
         command = shlex.join(["lyapnet", "certify", kind, *others])

@@ -1,14 +1,15 @@
 """How much of X₀ is certified, as a curve over the training."""
 
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 
 from lyapnet.certification import StatisticalClaim, statistical_claim
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.training.curves import log_scalars, with_loggers
 from lyapnet.training.learner import Learner
+from lyapnet.training.recurring import Recurring
 
 
-class CertifiedShare(Callback):
+class CertifiedShare(Recurring):
     """Logs the statistical bound of each member: a share of X₀ that succeeds, at a confidence, and one for each event.
 
     Its states are drawn by a stream of (seed, step) of their own: nothing was trained, validated or chosen on them, and
@@ -23,18 +24,10 @@ class CertifiedShare(Callback):
     """
 
     def __init__(self, every: int, states: int, confidence: float):
-        self.every, self.states, self.confidence = every, states, confidence
+        super().__init__(every)
+        self.states, self.confidence = states, confidence
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step == 0:
-            self._certify(trainer, pl_module)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        step = trainer.global_step
-        if step % self.every == 0 or step == trainer.max_epochs:
-            self._certify(trainer, pl_module)
-
-    def _certify(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def act(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.is_global_zero:
             return
         for member, loggers in with_loggers(trainer, pl_module):

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Sequence
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from matplotlib.figure import Figure
 
@@ -14,28 +14,17 @@ from lyapnet.evaluation import figures
 from lyapnet.random_streams import FIGURES, stream
 from lyapnet.training.curves import with_loggers
 from lyapnet.training.learner import Learner
+from lyapnet.training.recurring import Recurring
 
 
-class FigureLogger(Callback):
+class FigureLogger(Recurring):
     """Draws the certified region, some trajectories and slices of V during training: the first member's.
 
     Args:
         every: steps between drawings; the last validation always draws.
     """
 
-    def __init__(self, every: int):
-        self.every = every
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step == 0:
-            self._draw(trainer, pl_module)
-
-    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        step = trainer.global_step
-        if step % self.every == 0 or step == trainer.max_epochs:
-            self._draw(trainer, pl_module)
-
-    def _draw(self, trainer: Trainer, pl_module: LightningModule) -> None:
+    def act(self, trainer: Trainer, pl_module: LightningModule) -> None:
         member, loggers = next(with_loggers(trainer, pl_module))
         if not trainer.is_global_zero or not any(map(_shows_figures, loggers)):
             return

@@ -209,6 +209,7 @@ def run(capsys, monkeypatch):
     return call
 
 
+@pytest.mark.slow
 def test_json_and_figure(run, enclosed, monkeypatch, tmp_path):
     monkeypatch.setattr(enclosures, "enclosures_of", lambda *_: enclosed)  # as traced above
     status, out, err = run("--json", "--figures", str(tmp_path / "new"))

@@ -105,6 +105,7 @@ def test_peak_of_known_tensors():
     assert peak_bytes(lambda: None) == 0
 
 
+@pytest.mark.slow
 def test_memory_of_backprop_grows_with_the_steps_and_exceeds_that_of_discrete():
     short, long = (
         {row.route: row.peak_bytes for row in bench.time_routes(case, 16, ["backprop", "discrete"], 1, print)}
@@ -210,6 +211,7 @@ def test_chain_of_integrators_moves_its_last_state_by_its_control():
     assert system.dynamics(x, u).tolist() == [[2.0, 3.0, 4.0]]
 
 
+@pytest.mark.slow
 def test_accuracy_orders_of_convergence():
     by_route = {}
     for point in bench.gradient_accuracy(case_of("horizon.steps=40", "horizon.dt=0.02"), batch=2, halvings=2):

@@ -113,6 +113,7 @@ def test_another_config_is_not_taken_for_the_same(change, named, report, compare
     assert len(err.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_seeds_beyond_the_config_are_reported(smoke, compare):
     tasks = "double_integrator,double_integrator"
     status, out, err = compare("--tasks", tasks, "--methods", "ppo_tuned", "--seeds", "2")
@@ -124,6 +125,7 @@ def test_seeds_beyond_the_config_are_reported(smoke, compare):
     assert len(rows) == 3
 
 
+@pytest.mark.slow
 def test_a_killed_job_goes_on(tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     longer = "tasks.double_integrator.steps.ppo_tuned=15000"

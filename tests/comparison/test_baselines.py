@@ -139,6 +139,7 @@ def test_killed_while_saving_the_last_whole_checkpoint_counts(tmp_path):
     assert trained(tmp_path, baseline).curve[-1].environment_steps >= 1200
 
 
+@pytest.mark.slow
 def test_tuned_ppo_learns_where_no_learning_does_not(tmp_path):
     learning = baseline_of("ppo_tuned", 20_000, n_epochs=10, n_steps=6, batch_size=96)
     first, *_, last = trained(tmp_path / "learning", learning).curve

@@ -59,6 +59,7 @@ def test_the_run_is_the_same_without_them(run, tmp_path):
     assert not set(BOUNDS) & fewer.keys(), "off by default"
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_with_the_same_curves(run, tmp_path):
     desk = Desk(
         tmp_path,
@@ -74,7 +75,7 @@ def test_a_killed_run_resumes_with_the_same_curves(run, tmp_path):
 
 def _dies(place):
     without_figures()
-    dies_at(place, "_certify", call=2)
+    dies_at(place, "act", call=2)
 
 
 def test_each_member_of_an_ensemble_has_its_own(run, tmp_path):

@@ -42,7 +42,8 @@ def gradient_on(name, *overrides, processes):
 
 
 @pytest.mark.parametrize(
-    ("name", "gradient"), [("double_integrator", "discrete"), ("double_integrator_value", "adjoint")]
+    ("name", "gradient"),
+    [("double_integrator", "discrete"), pytest.param("double_integrator_value", "adjoint", marks=pytest.mark.slow)],
 )
 def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, gradient):
     """Normalised by the mean cost of the whole batch. With β₁ = 0, Adam keeps the gradient itself."""
@@ -55,6 +56,7 @@ def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, grad
     assert (taken - alone).norm() / joint.norm() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     name, options = "double_integrator", ["rollout.gradient=adjoint", f"logs={tmp_path}", "training.iterations=1"]
     lyapnet.train(CONF / f"{name}.yaml", [*SMALL, *options])

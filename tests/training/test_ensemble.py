@@ -233,6 +233,7 @@ def test_a_measure_over_seeds():
 # Interrupted, diverged, refused
 
 
+@pytest.mark.slow
 def test_interrupted_an_ensemble_goes_on_to_the_same_end(ensemble, tmp_path):
     desk = desk_of(tmp_path)
     process = desk.start(prepare=without_figures)

@@ -223,8 +223,9 @@ def survives(desk, moments, arguments=()):
         arguments = ("--resume", "last")
 
 
-def test_killed_at_chosen_moments_a_run_ends_the_same(desk, reference):
-    survives(desk, MOMENTS)
+@pytest.mark.parametrize("moments", [MOMENTS[::4], pytest.param(MOMENTS, marks=pytest.mark.slow)], ids=["some", "all"])
+def test_killed_at_chosen_moments_a_run_ends_the_same(moments, desk, reference):
+    survives(desk, moments)
     assert desk.train("--resume", "last")[0] == 0
     assert_same_end(desk, reference)
 

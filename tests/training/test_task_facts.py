@@ -115,6 +115,7 @@ def test_figure_that_cannot_be_drawn_does_not_stop_a_run(tmp_path, monkeypatch):
         trained("double_integrator", tmp_path)
 
 
+@pytest.mark.slow
 def test_two_processes_draw_different_batches_and_agree(without_figures, tmp_path):
     """Distributed data parallel on the CPU; a process of its own, since it forks."""
     arguments = [*SHORT, "trainer.devices=2", "trainer.strategy=ddp_fork", f"logs={tmp_path}", "network.hidden=[8,8]"]

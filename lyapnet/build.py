@@ -19,7 +19,7 @@ from lyapnet.cost import COSTS, Cost, QuadraticCost
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
-from lyapnet.problem import Horizon, Problem, check_system
+from lyapnet.problem import Horizon, Problem
 from lyapnet.programs import PROGRAMS, Program
 from lyapnet.rollout import Rollout
 from lyapnet.sets import CONTROL_SETS, Box, ControlSet
@@ -98,14 +98,13 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             _require_length("initial_states.lower", initial_states.dimension, system)
         with _section("horizon"):
             horizon = Horizon(config.horizon.steps, config.horizon.dt)
-        check_system(system, initial_states.sample(3, torch.Generator().manual_seed(0)))
         with _section("cost"):
             cost = _build_cost(config.cost, system) if cost is None else cost.double()
-            cost.check(initial_states.sample(256, torch.Generator().manual_seed(0)))
-            _require_length("cost.R", cost.R(initial_states.center).shape[-1], system, system.m)
         with _section("controls"):
             controls = _with_parameters(config.controls, "controls") if controls is None else controls.double()
-        return Problem(system, cost, controls, initial_states, horizon).to(dtype)
+        problem = Problem(system, cost, controls, initial_states, horizon)
+        problem.check()
+        return problem.to(dtype)
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:

@@ -212,6 +212,7 @@ def load(
     problem = build_problem(config, parts)
     V = build_value_function(config, problem, network)
     load_value_function(V, content, path)
+    problem.check_value_function(V)
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
     return Controller(problem, V, build_rollout(config, problem, V), own, config)

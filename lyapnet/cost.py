@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.errors import UsageError
 from lyapnet.linear_algebra import apply, solve
 from lyapnet.types import Control, ControlMatrix, Matrix, PerState, State
 
@@ -81,19 +82,14 @@ class Cost(nn.Module, ABC):
         """Refuse a cost that breaks its contract at some state of a batch (b, n).
 
         Raises:
-            ValueError: naming the first state at which q, φ or R(x) is not what it has to be.
+            UsageError: naming the first state at which q, φ or R(x) is not what it has to be.
         """
         for name, value in (("q(x)", self.state(x)), ("φ(x)", self.terminal(x))):
-            if value.shape != x.shape[:-1]:
-                raise ValueError(
-                    f"Expected {name} of shape {tuple(x.shape[:-1])} for x of shape {tuple(x.shape)}, got "
-                    f"{tuple(value.shape)}; return one number for each state."
-                )
             rounding = 100 * torch.finfo(value.dtype).eps * float(torch.nan_to_num(value).abs().max())
             bad = torch.nonzero(~(value >= -rounding)).flatten()
             if len(bad):
                 i = int(bad[0])
-                raise ValueError(f"Expected {name} ≥ 0, got {float(value[i]):.6g} at x = {x[i].tolist()}; correct it.")
+                raise UsageError(f"Expected {name} ≥ 0, got {float(value[i]):.6g} at x = {x[i].tolist()}; correct it.")
         R = self.R(x)
         asymmetry = (R - R.mT).abs().amax((-2, -1))
         smallest = torch.linalg.eigvalsh(torch.nan_to_num(R, nan=-1.0, posinf=-1.0, neginf=-1.0))[..., 0]
@@ -101,7 +97,7 @@ class Cost(nn.Module, ABC):
         bad = torch.nonzero(~((smallest > 0) & (asymmetry <= rounding * R.abs().amax((-2, -1))))).flatten()
         if len(bad):
             i = int(bad[0])
-            raise ValueError(
+            raise UsageError(
                 f"Expected R(x) symmetric positive definite, got smallest eigenvalue {smallest[i]:.3g} and asymmetry "
                 f"{asymmetry[i]:.3g} at x = {x[i].tolist()}; choose another R, or an X₀ that avoids this state."
             )

@@ -35,7 +35,7 @@ class CompilationError(LyapnetError):
 
 
 class UntraceableError(CompilationError):
-    """The control flow of a closed loop depends on tensor values; it runs eagerly, which is slower."""
+    """A function reads the values of tensors, its control flow say; a closed loop then runs eagerly, which is slower."""
 
 
 class OracleError(LyapnetError):

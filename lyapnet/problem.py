@@ -1,16 +1,20 @@
 """The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lyapnet.contracts import called, check_function
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import State, Times
+
+TRIED = 64  # states at which functions of others are tried
 
 
 @dataclass(frozen=True)
@@ -78,52 +82,58 @@ class Problem(nn.Module):
         return Problem(**{**own, **parts})
 
     def check(self) -> None:
-        """Hold f, g and the cost against their contracts on states of X₀.
+        """Hold f, g, the cost and the controls against their contracts on states of X₀, in float64.
 
         Raises:
-            ValueError: naming what is wrong, and where.
+            UsageError: naming what is wrong, and where.
         """
-        x, m = self.initial_states.sample(256, torch.Generator().manual_seed(0)), self.system.m
-        check_system(self.system, x[:3])
-        self.cost.check(x)
-        R = self.cost.R(x)
-        if R.shape != (len(x), m, m):
-            raise ValueError(
-                f"Expected R(x) of shape {(len(x), m, m)}, got {tuple(R.shape)}; give a row for each control."
+        own = copy.deepcopy(self).double().cpu()
+        system, cost, n, m = own.system, own.cost, own.system.n, own.system.m
+        name = type(system).__name__
+        if len(system.state_units) != n or len(system.control_units) != m:
+            raise UsageError(
+                f"Expected one unit for each state and control name of {name}, got another number of units."
             )
-        b = torch.randn(len(x), m, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(x)
-        u = self.controls.minimise(R, 100 * b)
-        inside = u.shape == b.shape and torch.allclose(u, self.controls.project(u), rtol=1e-6, atol=1e-9)
+        generator = torch.Generator().manual_seed(0)
+        x = own.initial_states.sample(256, generator)
+        for symbol, function, shape in (
+            (f"{name}.f(x)", system.f, (n,)),
+            (f"{name}.g(x)", system.g, (n, m)),
+            (f"q(x) of {type(cost).__name__}", cost.state, ()),
+            (f"φ(x) of {type(cost).__name__}", cost.terminal, ()),
+            (f"R(x) of {type(cost).__name__}", cost.R, (m, m)),
+        ):
+            check_function(symbol, function, [x[:TRIED]], shape)
+        cost.check(x)
+        b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
+        u = own.controls.minimise(cost.R(x), 100 * b)
+        inside = u.shape == b.shape and torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9)
         if not inside:
-            raise ValueError(
-                f"Expected {type(self.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
+            raise UsageError(
+                f"Expected {type(own.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
                 f"{tuple(u.shape)} or a control outside; correct it."
             )
 
+    def check_value_function(self, V: nn.Module) -> None:
+        """Hold V and its V_x against their contracts at times and states of the problem, in float64.
 
-def check_system(system: ControlAffineSystem, x: Tensor) -> None:
-    """Hold a system's f and g against their contract on a batch (b, n) of states.
-
-    Raises:
-        UsageError: f or g fails, returns another type, dtype or shape, or loses its gradient; or names lack a unit.
-    """
-    name, n, m = type(system).__name__, system.n, system.m
-    if len(system.state_units) != n or len(system.control_units) != m:
-        raise UsageError(f"Expected one unit for each state and control name of {name}, got another number of units.")
-    x = x.requires_grad_()
-    for symbol, function, shape in (("f", system.f, (len(x), n)), ("g", system.g, (len(x), n, m))):
-        try:
-            value = function(x)
-        except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
-            line = " ".join(str(error).split())
+        Raises:
+            UsageError: naming what is wrong, and where.
+        """
+        name, generator = type(V).__name__, torch.Generator().manual_seed(0)
+        own: Any = copy.deepcopy(V).double().cpu().eval()
+        x = self.initial_states.sample(TRIED, generator).double().cpu()
+        t = self.horizon.duration * torch.rand(TRIED, generator=generator, dtype=torch.float64)
+        check_function(f"{name}.forward(t, x)", own, [t, x], ())
+        leaf = x.clone().requires_grad_()
+        with torch.enable_grad():
+            (expected,) = torch.autograd.grad(own(t, leaf).sum(), leaf, materialize_grads=True)
+        value, V_x = called(f"{name}.value_and_state_gradient(t, x)", own.value_and_state_gradient, [t, x])
+        same = V_x.shape == x.shape and torch.allclose(
+            V_x, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().max())
+        )
+        if not same or not torch.allclose(value, own(t, x), rtol=1e-6):
             raise UsageError(
-                f"Expected {name}.{symbol}(x) for x of shape {tuple(x.shape)}, got {type(error).__name__}: {line}"
-            ) from error
-        got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
-        if got != (shape, x.dtype):
-            raise UsageError(f"Expected {name}.{symbol}(x) as a tensor of {shape} and {x.dtype}, got {got}.")
-        moved = not torch.equal(value, function(x.detach() + 1e-3))
-        if moved and not value.requires_grad:
-            raise UsageError(
-                f"Expected {name}.{symbol}(x) differentiable by autograd, got a detached tensor; use torch on x."
+                f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than autograd's: "
+                "correct it, or leave it out."
             )

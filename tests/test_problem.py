@@ -1,17 +1,21 @@
 """Horizons and problems, and what is refused of the parts that a problem is made of."""
 
 import math
+import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
 from lyapnet.build import build_problem
+from lyapnet.calculus import ValueFunction
 from lyapnet.config import load_config
 from lyapnet.cost import Cost, QuadraticCost
 from lyapnet.errors import UsageError
-from lyapnet.problem import Horizon, check_system
+from lyapnet.networks import FCN, Scaling
+from lyapnet.problem import Horizon
 from lyapnet.sets import Box, Unbounded
 from lyapnet.systems import DoubleIntegrator
 from tests.problems import problem_of
@@ -82,7 +86,7 @@ def test_a_problem_checks_its_parts_on_its_own_states():
     problem_of(DoubleIntegrator(), cost, initial_states=Box([-0.4, -1.0], [1.0, 1.0])).check()
     with pytest.raises(ValueError, match=r"Expected R\(x\) symmetric positive definite"):
         problem_of(DoubleIntegrator(), cost).check()
-    with pytest.raises(UsageError, match=r"Detached\.f\(x\) differentiable"):
+    with pytest.raises(UsageError, match=r"Detached\.f\(x\)"):
         problem_of(Detached()).check()
 
 
@@ -150,21 +154,178 @@ class OneUnit(Sound):
         self.state_units = ("m",)
 
 
+class Tabulated(Sound):
+    """A lookup by NumPy, whose slope autograd does not see."""
+
+    def f(self, x):
+        table = np.interp(x[..., 0].detach().numpy(), [-1.0, 0.0, 1.0], [0.0, 0.0, 1.0])
+        return super().f(x) + torch.as_tensor(table).to(x)[..., None]
+
+
+class Mixing(Sound):
+    def f(self, x):
+        return super().f(x) - (x.mean(0) if x.ndim > 1 else 0)
+
+
+class Shaped(Sound):
+    """Friction for a batch alone."""
+
+    def f(self, x):
+        return super().f(x) - (0.1 * x if x.ndim > 1 else 0)
+
+
+class Noisy(Sound):
+    def f(self, x):
+        return super().f(x) + 0.1 * torch.randn_like(x)
+
+
+class InPlace(Sound):
+    def f(self, x):
+        with torch.no_grad():
+            x[..., 0] += 1
+        return super().f(x)
+
+
+class Pole(Sound):
+    def f(self, x):
+        return super().f(x) + torch.sqrt(x[..., :1])
+
+
+class WrongBackward(Sound):
+    class Sine(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x):
+            return torch.sin(x)
+
+        @staticmethod
+        def backward(ctx, grad):
+            return grad
+
+    def f(self, x):
+        return self.Sine.apply(super().f(x))
+
+
+class Exits(Sound):
+    def f(self, x):
+        sys.exit(0)
+
+
 @pytest.mark.parametrize(
     ("system", "named"),
     [
-        (ThreeRows, r"ThreeRows\.f\(x\).*\(2, 2\).*\(2, 3\)"),
+        (ThreeRows, r"ThreeRows\.f\(x\).*\(64, 2\).*\(64, 3\)"),
         (SinglePrecision, r"SinglePrecision\.g\(x\).*float64.*float32"),
-        (Detached, r"Detached\.f\(x\) differentiable"),
+        (Detached, r"Detached\.f\(x\) with autograd's derivative"),
         (NumPy, r"NumPy\.f\(x\).*ndarray"),
         (OneUnit, "one unit for each"),
+        (Tabulated, r"Tabulated\.f\(x\) with autograd's derivative.*lyapnet\.Table"),
+        (Mixing, r"Mixing\.f\(x\) to be a function of each state by itself.*batch of \(2, 32\)"),
+        (Shaped, r"Shaped\.f\(x\) to be a function of each state by itself.*one state"),
+        (Noisy, r"Noisy\.f\(x\) to be a function of each state by itself"),
+        (InPlace, r"InPlace\.f\(x\)"),
+        (Pole, r"finite Pole\.f\(x\), got nan at x = "),
+        (WrongBackward, r"WrongBackward\.f\(x\) with autograd's derivative"),
+        (Exits, r"Exits\.f\(x\).*SystemExit"),
     ],
 )
 def test_system_that_breaks_its_contract_is_refused_by_name(system, named):
-    x = torch.ones(2, 2)
-    check_system(Sound(), x)
+    problem_of(Sound()).check()
+    with pytest.raises(UsageError, match=named) as refused:
+        problem_of(system()).check()
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "broken", "named"),
+    [
+        ("state", lambda x: x[..., :1] ** 2, r"q\(x\) of QuadraticCost as a tensor of \(64,\).*\(64, 1\)"),
+        ("terminal", lambda x: x**2, r"φ\(x\) of QuadraticCost as a tensor of \(64,\)"),
+        ("terminal", lambda x: (x**2).sum(), r"φ\(x\) of QuadraticCost as a tensor of \(64,\)"),
+        ("state", lambda x: (x.detach() ** 2).sum(-1), r"q\(x\) of QuadraticCost with autograd's derivative"),
+    ],
+)
+def test_cost_that_breaks_its_contract_is_refused_by_name(method, broken, named):
+    cost = QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2))
+    problem_of(DoubleIntegrator(), cost).check()
+    setattr(cost, method, broken)
     with pytest.raises(UsageError, match=named):
-        check_system(system(), x)
+        problem_of(DoubleIntegrator(), cost).check()
+
+
+class Bowl(ValueFunction):
+    """V = ½‖x‖² + t; a network by its scale."""
+
+    def __init__(self):
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.tensor(1.0))
+
+    def forward(self, t, x):
+        return self.scale * (0.5 * (x**2).sum(-1) + t)
+
+
+class HalfDetached(Bowl):
+    def forward(self, t, x):
+        return super().forward(t, x) + 0.1 * (x.detach() ** 2).sum(-1)
+
+
+class TimeDetached(Bowl):
+    def forward(self, t, x):
+        return super().forward(t.detach(), x)
+
+
+class Pair(Bowl):
+    def forward(self, t, x):
+        return super().forward(t, x), x
+
+
+class Column(Bowl):
+    def forward(self, t, x):
+        return super().forward(t, x)[..., None]
+
+
+class OfTheBatch(Bowl):
+    def forward(self, t, x):
+        return super().forward(t, x) - (x**2).mean()
+
+
+class OtherGradient(Bowl):
+    def value_and_state_gradient(self, t, x):
+        return self(t, x), self.scale * x * 1.01
+
+
+class OwnGradient(Bowl):
+    """The twin of the one before."""
+
+    def value_and_state_gradient(self, t, x):
+        return self(t, x), self.scale * x
+
+
+@pytest.mark.parametrize(
+    ("V", "named"),
+    [
+        (HalfDetached, r"HalfDetached\.forward\(t, x\) with autograd's derivative"),
+        (TimeDetached, r"TimeDetached\.forward\(t, x\) with autograd's derivative"),
+        (Pair, r"Pair\.forward\(t, x\) as a tensor.*tuple"),
+        (Column, r"Column\.forward\(t, x\) as a tensor of \(64,\).*\(64, 1\)"),
+        (OfTheBatch, r"OfTheBatch\.forward\(t, x\) to be a function of each state by itself"),
+        (OtherGradient, r"OtherGradient\.value_and_state_gradient\(t, x\) as V and its gradient"),
+    ],
+)
+def test_value_function_that_breaks_its_contract_is_refused_by_name(V, named):
+    problem = problem_of(DoubleIntegrator())
+    for sound in (Bowl(), OwnGradient(), FCN(Scaling([1.0, 1.0], duration=1.0, value=1.0))):
+        problem.check_value_function(sound)
+    with pytest.raises(UsageError, match=named):
+        problem.check_value_function(V())
+
+
+def test_kinks_jumps_and_large_numbers_keep_the_contract():
+    class Rough(Sound):
+        def f(self, x):
+            rough = x.abs() + torch.relu(x - 0.3) + torch.sign(x) + torch.floor(3 * x) + x.clamp(-0.5, 0.5)
+            return 1e6 * super().f(x) + rough
+
+    problem_of(Rough()).check()
 
 
 def test_a_control_set_whose_minimum_lies_outside_is_refused():

@@ -15,13 +15,15 @@ from torch import Tensor
 from torch.fx import Node
 from torch.utils._pytree import tree_map
 
-from lyapnet.errors import UsageError
+from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.graphs import taylor
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES, SUMS
 from lyapnet.graphs.simplification import with_known_truths, without_copies
 from lyapnet.graphs.taylor import TaylorForm, box_form
 from lyapnet.graphs.tracing import trace
 from lyapnet.types import Corner, Corners, OnBoxes
+
+HELD = 32  # points of the box at which a trace is held against its function
 
 
 class BoundedFunction:
@@ -46,16 +48,16 @@ class BoundedFunction:
         lower, upper = sample
         self.degree = degree
         generator = torch.Generator().manual_seed(0)
-        points = [lower + (upper - lower) * torch.rand(len(lower), generator=generator).to(lower) for _ in range(2)]
+        share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
+        first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            first, other = [(y[0].clone(), y[1:].clone()) for y in points]
-            self._graph = trace(function, first, other)
-        except UsageError:
-            raise
+            self._graph = trace(function, first, others)
+        except LyapnetError as error:
+            raise UsageError(str(error)) from error
         except Exception as error:
+            line = " ".join(str(error).split())
             raise UsageError(
-                f"Expected f, g, the cost and V in torch operations, with control flow that does not depend on values, "
-                f"got {error}"
+                f"Expected f, g, the cost and V in torch operations, each state's result its own, got {line}"
             ) from error
         self._nodes = list(with_known_truths(without_copies(self._graph.graph)).nodes)
         self._fold_constants()

@@ -1,6 +1,10 @@
 """Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
 
+import re
+import traceback
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -11,7 +15,7 @@ from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.testing import assert_close
 
-from lyapnet.errors import UsageError
+from lyapnet.errors import UntraceableError, UsageError
 
 Tensors = tuple[Tensor, ...]
 
@@ -19,29 +23,34 @@ Tensors = tuple[Tensor, ...]
 def trace(
     function: Callable[..., Tensors],
     arguments: Sequence[Tensor],
-    elsewhere: Sequence[Tensor] = (),
+    elsewhere: Sequence[Sequence[Tensor]] = (),
     decompositions: Mapping[Any, Any] | None = None,
 ) -> GraphModule:
     """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
 
     No Python of the function is left, nothing is computed twice, and nothing records a graph: run it under no_grad.
-    The function must be one of its arguments alone; whatever else it reads is frozen as it is now.
+    The tensors that it is traced on have no values: code that reads them, and so would be frozen at these arguments
+    (x.numpy(), float(x), if x > 0), fails where it does. What it reads besides its arguments is frozen as it is now.
 
     Args:
-        elsewhere: other values of its last arguments, on which the trace is held against the function: code that
-            leaves torch (x.numpy(), say) is frozen without a word.
+        elsewhere: other values of its last arguments, on which the trace is held against the function.
         decompositions: operator ↦ the same in simpler operators, for a reader that knows only those.
 
     Raises:
         UsageError: the function draws random numbers.
-        Exception: of any kind, where control flow depends on tensor values.
+        UntraceableError: it reads the values of a tensor; names the line.
+        Exception: of any other kind that the function raises.
     """
-    options = {"decomposition_table": decompositions, "_allow_non_fake_inputs": True}
-    graph_module = make_fx(function, **options)(*arguments)
+    options = {"decomposition_table": decompositions, "tracing_mode": "fake", "_allow_non_fake_inputs": True}
+    with _reading_values():
+        graph_module = make_fx(function, **options)(*arguments)
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
         graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
-        raise ValueError("Expected shapes that do not depend on values, got an operation whose result's does.")
+        raise UntraceableError(
+            "Expected torch operations whose shapes do not depend on values, got one that reads them (x.item(), "
+            "x[mask], nonzero); use torch.where"
+        )
     for node in list(graph_module.graph.nodes):
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
             raise UsageError(
@@ -52,9 +61,38 @@ def trace(
             node.replace_all_uses_with(node.args[0])
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
-    if elsewhere:
-        _require_same(graph_module, function, [*arguments[: -len(elsewhere)], *elsewhere])
+    for others in elsewhere:
+        _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
+
+
+@contextmanager
+def _reading_values():
+    """Say in one line which code read the values of a tensor, where torch says it in its own terms."""
+    try:
+        yield
+    except (RuntimeError, NotImplementedError) as error:
+        known = type(error).__module__.startswith("torch.") or NO_VALUES.search(str(error))
+        if not known:
+            raise
+        raise UntraceableError(
+            f"Expected torch operations, with control flow that does not depend on values, got code that reads the "
+            f"values of a tensor{_where(error)}; use torch.where, or lyapnet.Table for a table"
+        ) from error
+
+
+NO_VALUES = re.compile(r"tensor subclasses|data pointer|'meta' device|Cannot copy out of meta|FakeTensor")
+"""What torch says of code that asks a tensor without values for them."""
+
+
+def _where(error: BaseException) -> str:
+    """The innermost line outside torch in an error's traceback, as " at file:line (its text)"."""
+    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(TORCH)]
+    own = [f for f in frames if not f.filename.startswith(LYAPNET)] or frames
+    return f" at {Path(own[-1].filename).name}:{own[-1].lineno} ({own[-1].line})" if own else ""
+
+
+TORCH, LYAPNET = str(Path(torch.__file__).parent), str(Path(__file__).parents[1])
 
 
 def batched(
@@ -62,10 +100,10 @@ def batched(
     arguments: Sequence[Tensor],
     axes: Sequence[int | None],
     out_axes: Sequence[int],
-    elsewhere: Sequence[Tensor] = (),
+    elsewhere: Sequence[Sequence[Tensor]] = (),
 ) -> GraphModule:
     """The trace of a function over an axis of some of its arguments: each of its operations on all members at once."""
-    one, other = _first_member(arguments, axes), _first_member(elsewhere, axes[len(axes) - len(elsewhere) :])
+    one, other = (_first_member(arguments, axes), [_first_member(o, axes[len(axes) - len(o) :]) for o in elsewhere])
     # traced before it is batched: by then no autograd is left that vmap could not enter
     return trace(vmap(trace(function, one, other), tuple(axes), tuple(out_axes)), arguments)
 
@@ -138,11 +176,12 @@ def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], a
     for result, value in zip(results, expected, strict=True):
         half = torch.finfo(value.dtype).eps ** 0.5
         try:
-            assert_close(result, value.detach(), rtol=half, atol=half * float(value.abs().max()), equal_nan=True)
+            scale = float(value.detach().nan_to_num(0, 0, 0).abs().max())
+            assert_close(result, value.detach(), rtol=half, atol=half * scale, equal_nan=True)
         except AssertionError as error:
             raise ValueError(
-                "Expected f, g, the cost and V to compute with torch alone, got code that leaves it (x.numpy(), "
-                "float(x), …) or that computes something else each time."
+                "Expected f, g, the cost and V to be functions of t and x alone, got code that leaves torch or computes "
+                "something else each time."
             ) from error
 
 
@@ -155,7 +194,9 @@ def _depends_on_values(node: Node) -> bool:
     """Whether the values of its arguments decide the shape of its result: nonzero, or indexing by a mask."""
     if node.target is torch.ops.aten.index.Tensor:  # by integers it does not
         return any(source.meta["val"].dtype == torch.bool for source in node.all_input_nodes[1:])
-    return torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ())
+    return node.target is torch.ops.aten._local_scalar_dense.default or (
+        torch.Tag.dynamic_output_shape in getattr(node.target, "tags", ())
+    )
 
 
 def _mutates(node: Node) -> bool:

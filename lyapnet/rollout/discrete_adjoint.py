@@ -25,6 +25,7 @@ from lyapnet.types import ControlPath, Jacobians, StagePath, State, StatePath, V
 
 _LOG = logging.getLogger(__name__)
 Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
+VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 
 
@@ -218,7 +219,7 @@ class DiscreteAdjoint:
         bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
         grid = self._grid(x0, self.steps + 1)
         node_arguments, block_arguments = [*state, t[0], dt[0], x0], [*state, t, dt, stages, *bars, nodes.clone()]
-        elsewhere = [t[0] + self.dt, dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]
+        elsewhere = self._visited(x0, theta)
         step, joint = self._with_state(self._step), self._with_state(self._linearise)
         if x0.ndim == 2:
             step, joint = trace(step, node_arguments, elsewhere), trace(joint, block_arguments)
@@ -229,6 +230,14 @@ class DiscreteAdjoint:
         prepare, step = cut(step, late=3, early_outputs=0, repeat=False)
         linearise, product = cut(joint, late=1, early_outputs=2)
         return TracedRoutines(prepare, step, linearise, product, block, [*state, *grid, x0], block_arguments)
+
+    def _visited(self, x0: Tensor, theta: Sequence[Tensor]) -> list[list[Tensor]]:
+        """(t, Δt, x) of some steps along the loop as it is written; with members, which it cannot have, near its start."""
+        t, dt = self._grid(x0, self.steps + 1)
+        if x0.ndim > 2:
+            return [[t[1], dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]]
+        path = self.integrate(self._as_written(x0), x0, theta).stages[:, 0]
+        return [[t[k], dt[k], path[k]] for k in torch.linspace(0, self.steps, VISITED).long()]
 
     def _as_written(self, x0: Tensor) -> Routines:
         """The work in Python, on the loop's own tensors."""

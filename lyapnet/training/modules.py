@@ -193,7 +193,7 @@ class ValueModule(TrainingModule):
         seed: of the points at which that condition is asked for.
 
     Raises:
-        ValueError: f, g or the cost break their contracts.
+        UsageError: f, g, the cost or V break their contracts.
     """
 
     def __init__(
@@ -207,6 +207,9 @@ class ValueModule(TrainingModule):
         seed: int = 0,
     ):
         problem.check()
+        if not any(p.is_floating_point() for p in V.parameters()):
+            raise UsageError(f"Expected a network with real weights to train, got {type(V).__name__} without.")
+        problem.check_value_function(V)
         rollout = Rollout(problem, HJBPolicy(problem, V), gradient="discrete") if rollout is None else rollout
         member = Learner(problem, V, rollout, program, pointwise, seed)
         super().__init__([member], optimizer or OptimizerOptions())

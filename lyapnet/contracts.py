@@ -1,0 +1,129 @@
+"""The one gate for functions of states that others wrote: f, g, the cost and V are held against what is asked of them.
+
+They are tried on states at random. What passes may still break its contract at a state that was not among them; a
+certificate does not rely on this gate (docs/trust.md).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.errors import UsageError
+
+STEP = 1e-6  # of central differences, relative to the spread of an argument
+DIRECTIONS = 4  # along which derivatives are compared at each state
+
+
+def check_function(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], shape: Sequence[int]) -> None:
+    """Hold a function of states against its contract.
+
+    It returns finite tensors in the precision of its arguments; each state's result is of that state alone, in a
+    batch of any shape; it changes no argument; and autograd's derivative is its derivative.
+
+    Args:
+        name: as messages say it, "Pendulum.f(x)".
+        arguments: batches (b, …) of float64 numbers, b even.
+        shape: of one state's result.
+
+    Raises:
+        UsageError: it breaks one of these; names which, and where.
+    """
+    given = [argument.detach().clone().requires_grad_() for argument in arguments]
+    value = called(name, function, given)
+    batch = len(given[0])
+    got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
+    if got != ((batch, *shape), given[0].dtype):
+        shapes = " and ".join(str(tuple(argument.shape)) for argument in given)
+        raise UsageError(
+            f"Expected {name} as a tensor of {(batch, *shape)} and {given[0].dtype} for arguments of shape {shapes}, "
+            f"got {got}; return one result for each state."
+        )
+    if any(not torch.equal(one, before) for one, before in zip(given, arguments, strict=True)):
+        raise UsageError(f"Expected {name} to leave its arguments as they are, got others; clone them first.")
+    value = value.detach()
+    bad = torch.nonzero(~value.isfinite().reshape(batch, -1).all(-1)).flatten()
+    if len(bad):
+        raise UsageError(
+            f"Expected finite {name}, got {_first_bad(value[bad[0]])} at {_at(arguments, int(bad[0]))}; correct it, or "
+            "choose an X₀ that avoids this state."
+        )
+    _check_each_for_itself(name, function, arguments, value)
+    _check_derivative(name, function, arguments, value)
+
+
+def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
+    """What a function of others returns; whatever it raises, sys.exit() included, as one line."""
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:
+        shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
+        line = " ".join(str(error).split())
+        raise UsageError(
+            f"Expected {name} for arguments of shape {shapes}, got {type(error).__name__}: {line}"
+        ) from error
+
+
+def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
+    """Refuse results that depend on the other states of a batch, on its shape, or on chance."""
+    tolerance = torch.finfo(value.dtype).eps ** 0.5
+    folded = called(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
+    alone = [called(name, function, [argument[i] for argument in arguments]) for i in range(3)]
+    for some, expected in ((folded, value.reshape(2, -1, *value.shape[1:])), *zip(alone, value[:3], strict=True)):
+        if (
+            not isinstance(some, Tensor)
+            or some.shape != expected.shape
+            or not torch.allclose(some, expected, rtol=tolerance, atol=tolerance * float(value.abs().max()))
+        ):
+            raise UsageError(
+                f"Expected {name} to be a function of each state by itself, in batches of any shape, got another "
+                f"result for a batch of {tuple(expected.shape[: expected.ndim - value.ndim + 1]) or 'one state'}; use "
+                "x[..., i] and sums over the last axis alone, and no random numbers."
+            )
+
+
+def _check_derivative(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
+    """Hold autograd against central differences, wherever these agree with those of half the step: at no kink."""
+    generator = torch.Generator().manual_seed(0)
+    weight = torch.randn(value.shape, generator=generator, dtype=value.dtype)
+    leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
+    with torch.enable_grad():
+        total = (weight * called(name, function, leaves)).sum()
+        slopes = (
+            torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+            if total.requires_grad
+            else [torch.zeros_like(leaf) for leaf in leaves]
+        )
+
+    def along(directions: Sequence[Tensor], step: float) -> Tensor:
+        sides = [[a + s * step * d for a, d in zip(arguments, directions, strict=True)] for s in (1, -1)]
+        with torch.no_grad():
+            ahead, behind = (weight * function(*side) for side in sides)
+        return (ahead - behind).reshape(len(value), -1).sum(1) / (2 * step)
+
+    rounding = 1e-13 / STEP * float((weight * value).abs().max())
+    for _ in range(DIRECTIONS):
+        directions = [
+            torch.randn(a.shape, generator=generator, dtype=a.dtype) * a.std(0).clamp_min(1e-3) for a in arguments
+        ]
+        slope = sum((s * d).reshape(len(value), -1).sum(1) for s, d in zip(slopes, directions, strict=True))
+        wide, narrow = along(directions, STEP), along(directions, STEP / 2)
+        tolerance = 1e-4 * torch.maximum(wide.abs(), slope.abs()) + rounding
+        wrong = torch.nonzero(((wide - narrow).abs() <= tolerance) & ~((slope - wide).abs() <= 3 * tolerance)).flatten()
+        if len(wrong):
+            i = int(wrong[0])
+            raise UsageError(
+                f"Expected {name} with autograd's derivative as its own, got a slope of {float(slope[i]):.4g} where "
+                f"differences have {float(wide[i]):.4g}, at {_at(arguments, i)}; stay in torch: no NumPy, detach or "
+                "float(x), and lyapnet.Table for a table."
+            )
+
+
+def _first_bad(result: Tensor) -> float:
+    return float(result[~result.isfinite()][0])
+
+
+def _at(arguments: Sequence[Tensor], i: int) -> str:
+    shown = ["(" + ", ".join(f"{v:.6g}" for v in a[i].detach().flatten().tolist()) + ")" for a in arguments]
+    return f"x = {shown[-1]}" if len(shown) == 1 else f"(t, x) = ({', '.join(shown)})"

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lyapnet.controller import Controller, load
     from lyapnet.cost import Cost, QuadraticCost
     from lyapnet.errors import LyapnetError
+    from lyapnet.interpolation import Table
     from lyapnet.policy import HJBPolicy, SontagPolicy
     from lyapnet.problem import Horizon, Problem
     from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
@@ -29,6 +30,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "controller": ["Controller", "load"],
     "cost": ["Cost", "QuadraticCost"],
     "errors": ["LyapnetError"],
+    "interpolation": ["Table"],
     "policy": ["HJBPolicy", "SontagPolicy"],
     "problem": ["Horizon", "Problem"],
     "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
@@ -58,6 +60,7 @@ __all__ = [
     "QuadraticCost",
     "Rollout",
     "SontagPolicy",
+    "Table",
     "Tolerances",
     "Trajectory",
     "Unbounded",

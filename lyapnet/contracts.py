@@ -16,7 +16,13 @@ STEP = 1e-6  # of central differences, relative to the spread of an argument
 DIRECTIONS = 4  # along which derivatives are compared at each state
 
 
-def check_function(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], shape: Sequence[int]) -> None:
+def check_function(
+    name: str,
+    function: Callable[..., Any],
+    arguments: Sequence[Tensor],
+    shape: Sequence[int],
+    differentiable: bool = True,
+) -> None:
     """Hold a function of states against its contract.
 
     It returns finite tensors in the precision of its arguments; each state's result is of that state alone, in a
@@ -26,6 +32,7 @@ def check_function(name: str, function: Callable[..., Any], arguments: Sequence[
         name: as messages say it, "Pendulum.f(x)".
         arguments: batches (b, …) of float64 numbers, b even.
         shape: of one state's result.
+        differentiable: whether its derivative is asked for too.
 
     Raises:
         UsageError: it breaks one of these; names which, and where.
@@ -50,7 +57,8 @@ def check_function(name: str, function: Callable[..., Any], arguments: Sequence[
             "choose an X₀ that avoids this state."
         )
     _check_each_for_itself(name, function, arguments, value)
-    _check_derivative(name, function, arguments, value)
+    if differentiable:
+        _check_derivative(name, function, arguments, value)
 
 
 def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:

@@ -35,7 +35,7 @@ class CompilationError(LyapnetError):
 
 
 class UntraceableError(CompilationError):
-    """A function reads the values of tensors, its control flow say; a closed loop then runs eagerly, which is slower."""
+    """A function reads the values of tensors, for its control flow say; a closed loop then runs eagerly."""
 
 
 class OracleError(LyapnetError):

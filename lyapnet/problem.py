@@ -134,6 +134,6 @@ class Problem(nn.Module):
         )
         if not same or not torch.allclose(value, own(t, x), rtol=1e-6):
             raise UsageError(
-                f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than autograd's: "
-                "correct it, or leave it out."
+                f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than "
+                "autograd's: correct it, or leave it out."
             )

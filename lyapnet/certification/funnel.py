@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
@@ -15,10 +16,11 @@ from lyapnet.certification.counterexamples import Counterexample, find_counterex
 from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, bounded_condition, prove
 from lyapnet.certification.verdict import Verdict
+from lyapnet.contracts import check_function
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
-from lyapnet.problem import Problem
+from lyapnet.problem import TRIED, Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Value
@@ -123,6 +125,7 @@ def sound_claim(
         states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
+    _check_states(condition, domain)
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
@@ -186,6 +189,18 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
+
+
+def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
+    """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
+    lower, upper = domain
+    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
+    points = lower + (upper - lower) * share
+
+    def both(t: Tensor, x: Tensor) -> Tensor:
+        return torch.stack([condition(t, x), condition.height(t, x)], -1)
+
+    check_function("the condition and V", both, [points[:, 0], points[:, 1:]], (2,), differentiable=False)
 
 
 def _require_continuous(V: Value, x_low: State, x_high: State) -> None:

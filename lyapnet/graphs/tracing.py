@@ -180,8 +180,8 @@ def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], a
             assert_close(result, value.detach(), rtol=half, atol=half * scale, equal_nan=True)
         except AssertionError as error:
             raise ValueError(
-                "Expected f, g, the cost and V to be functions of t and x alone, got code that leaves torch or computes "
-                "something else each time."
+                "Expected f, g, the cost and V to be functions of t and x alone, got code that leaves torch or "
+                "computes something else each time."
             ) from error
 
 

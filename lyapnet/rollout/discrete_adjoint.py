@@ -232,7 +232,7 @@ class DiscreteAdjoint:
         return TracedRoutines(prepare, step, linearise, product, block, [*state, *grid, x0], block_arguments)
 
     def _visited(self, x0: Tensor, theta: Sequence[Tensor]) -> list[list[Tensor]]:
-        """(t, Δt, x) of some steps along the loop as it is written; with members, which it cannot have, near its start."""
+        """(t, Δt, x) of some steps along the loop as it is written; near its start where there are members."""
         t, dt = self._grid(x0, self.steps + 1)
         if x0.ndim > 2:
             return [[t[1], dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]]

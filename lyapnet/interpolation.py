@@ -1,0 +1,84 @@
+"""Lookup tables in torch: what an engineer measured, as a function with a derivative, bounds and a translation."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from torch import Tensor, nn
+
+DEGREES = {"linear": 1, "cubic": 3}
+
+
+class Table(nn.Module):
+    """y(x₁, …, x_d) through measured values on a grid: piecewise linear, or a natural cubic spline along each axis.
+
+    On interval i of an axis, the share s_i = min(max((x − x_i)/(x_{i+1} − x_i), 0), 1) of it lies behind x. Every
+    interpolation of this kind is a linear map of 1, s_i (and s_i², s_i³ for cubic): y is a product of these maps, made
+    of operators that autograd, bounds and CasADi know. Beyond its ends a table keeps the value at the end. At a kink,
+    where a linear one has its nodes, its derivative is that from the left; certificates cover both sides.
+
+    friction = Table([[-2.0, 0.0, 1.0, 2.0]], [-0.4, 0.0, 0.3, 0.35])  # in __init__; one grid for each axis
+    f = friction(x[..., 1:2])  # the coordinates along the last axis: (*batch, d) ↦ (*batch,)
+
+    Args:
+        grid: for each of d axes its nodes, rising.
+        values: (K₁, …, K_d), one at each node.
+        method: linear, or cubic (d²y/dx² continuous, 0 at the ends).
+
+    Raises:
+        ValueError: nodes do not rise, numbers are not finite, or the values do not fit the grid.
+    """
+
+    values: Float[Tensor, "*nodes"]
+
+    def __init__(self, grid: Sequence[ArrayLike], values: ArrayLike, method: str = "linear"):
+        super().__init__()
+        if method not in DEGREES:
+            raise ValueError(f"Expected method linear or cubic, got {method!r}.")
+        axes = [torch.tensor(nodes, dtype=torch.float64) for nodes in grid]
+        table = torch.tensor(values, dtype=torch.float64)
+        for axis, nodes in enumerate(axes):
+            if nodes.ndim != 1 or len(nodes) < 2 or not bool((nodes.diff() > 0).all() & nodes.isfinite().all()):
+                raise ValueError(
+                    f"Expected two or more rising nodes on axis {axis}, got {nodes.tolist()}; give the grid as "
+                    "[[x₁, x₂, …]], one list for each axis."
+                )
+        if table.shape != (expected := tuple(map(len, axes))) or not bool(table.isfinite().all()):
+            raise ValueError(f"Expected finite values of shape {expected}, got {tuple(table.shape)}; one at each node.")
+        self.degree = DEGREES[method]
+        dtype = torch.get_default_dtype()
+        self.register_buffer("values", table.to(dtype), persistent=False)
+        for axis, nodes in enumerate(axes):
+            self.register_buffer(f"nodes_{axis}", nodes.to(dtype), persistent=False)
+            self.register_buffer(f"weights_{axis}", _cardinal(nodes, self.degree).to(dtype), persistent=False)
+
+    def forward(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch"]:
+        d = self.values.ndim
+        if x.shape[-1] != d:
+            raise ValueError(f"Expected coordinates (*batch, {d}), got {tuple(x.shape)}; take x[..., i:i+1] for one.")
+        y = self.values.expand(*x.shape[:-1], *self.values.shape)
+        for axis in range(d):
+            share = self._at(axis, x[..., axis])
+            y = (share.reshape(*share.shape, *[1] * (d - axis - 1)) * y).sum(axis - d)
+        return y
+
+    def _at(self, axis: int, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
+        """The weight of each node along an axis."""
+        nodes, weights = getattr(self, f"nodes_{axis}"), getattr(self, f"weights_{axis}")
+        r = (x[..., None] - nodes[:-1]) / nodes.diff()
+        s = torch.relu(r) - torch.relu(r - 1)  # at a node one interval alone has a slope; with clamp two would
+        basis = torch.cat([torch.ones_like(s[..., :1]), *(s**k for k in range(1, self.degree + 1))], -1)
+        return (weights * basis[..., None, :]).sum(-1)
+
+
+def _cardinal(nodes: Tensor, degree: int) -> Tensor:
+    """(K, 1 + (K − 1)·degree): the interpolations of the K unit vectors, as maps of 1 and the powers of each s_i."""
+    unit, h = torch.eye(len(nodes), dtype=torch.float64), nodes.diff()
+    if degree == 1:
+        powers = [unit[:, 1:] - unit[:, :-1]]
+    else:
+        coefficients = torch.as_tensor(CubicSpline(nodes.numpy(), unit.numpy(), axis=1, bc_type="natural").c)
+        powers = [coefficients[3 - k].mT * h**k for k in (1, 2, 3)]
+    return torch.cat([unit[:, :1], *powers], 1)

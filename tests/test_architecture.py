@@ -10,7 +10,18 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 
 # Each line imports only lines above it.
 LEVELS = (
-    {"drawing", "errors", "files", "linear_algebra", "provenance", "random_streams", "tables", "types"},
+    {
+        "contracts",
+        "drawing",
+        "errors",
+        "files",
+        "interpolation",
+        "linear_algebra",
+        "provenance",
+        "random_streams",
+        "tables",
+        "types",
+    },
     {"checkpoint", "cost", "graphs", "schema", "sets", "systems"},
     {"calculus", "problem"},
     {"networks", "policy"},
@@ -27,7 +38,7 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "calculus", "cost", "errors", "files", "graphs", "linear_algebra", "networks", "policy", "problem", "programs",
+    "calculus", "contracts", "cost", "errors", "files", "graphs", "interpolation", "linear_algebra", "networks", "policy", "problem", "programs",
     "random_streams", "rollout", "sets", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}

@@ -15,7 +15,7 @@ from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import OracleError
+from lyapnet.errors import LyapnetError, OracleError
 from lyapnet.graphs.tracing import Tensors, is_view, name_of, trace
 
 # torch counts them among its core, but has them in simpler operators too
@@ -29,12 +29,14 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
     """The trace of a function in few operators.
 
     Raises:
-        OracleError: the function's course depends on values, or it leaves torch.
+        OracleError: the function reads the values of tensors.
     """
     try:
         with torch.no_grad():
             simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
             return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
+    except LyapnetError as error:
+        raise OracleError(str(error)) from error
     except Exception as error:  # any kind: the function is the user's
         line = " ".join(str(error).split())[:200]
         raise OracleError(

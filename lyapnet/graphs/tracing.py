@@ -49,7 +49,7 @@ def trace(
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):
         raise UntraceableError(
             "Expected torch operations whose shapes do not depend on values, got one that reads them (x.item(), "
-            "x[mask], nonzero); use torch.where"
+            "x[mask], nonzero); use torch.where."
         )
     for node in list(graph_module.graph.nodes):
         if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
@@ -77,7 +77,7 @@ def _reading_values():
             raise
         raise UntraceableError(
             f"Expected torch operations, with control flow that does not depend on values, got code that reads the "
-            f"values of a tensor{_where(error)}; use torch.where, or lyapnet.Table for a table"
+            f"values of a tensor{_where(error)}; use torch.where, or lyapnet.Table for a table."
         ) from error
 
 

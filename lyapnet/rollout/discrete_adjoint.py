@@ -181,13 +181,15 @@ class DiscreteAdjoint:
 
     def _with_state(self, module: nn.Module) -> Callable[..., tuple[Tensor, ...]]:
         """(*state, *arguments) ↦ module(*arguments) with the loop made of `state`, its first part leaves of a graph."""
-        trained = [name for name, p in self.loop.named_parameters() if p.requires_grad]
-        names = [f"loop.{name}" for name in (*trained, *self.facts())]
+        trained, places = self.trained(), _places(self.loop)
+        names = [places[tensor] for tensor in (*trained, *self.facts().values())]
 
         def function(*tensors: Tensor) -> tuple[Tensor, ...]:
             leaves = [p.detach().requires_grad_() for p in tensors[: len(trained)]]
-            state = dict(zip(names, (*leaves, *tensors[len(trained) : len(names)]), strict=True))
-            return functional_call(module, state, tuple(tensors[len(names) :]))
+            made_of = zip(names, (*leaves, *tensors[len(trained) : len(names)]), strict=True)
+            state = {f"loop.{name}": tensor for of_one, tensor in made_of for name in of_one}
+            # ties are in `state`; torch, asked for them, leaves its own tensors in a module that occurs twice
+            return functional_call(module, state, tuple(tensors[len(names) :]), tie_weights=False)
 
         return function
 
@@ -293,6 +295,15 @@ class _Rollout(torch.autograd.Function):
             )
         x0_bar, theta_bar = ctx.adjoint.gradient(ctx.routines, theta, stages, bars[:3])
         return None, x0_bar, *theta_bar
+
+
+def _places(module: nn.Module) -> dict[Tensor, list[str]]:
+    """Parameter or buffer ↦ its names: several where modules share it, one in a module that occurs several times."""
+    places: dict[Tensor, list[str]] = {}
+    for prefix, part in module.named_modules():
+        for name, tensor in (*part.named_parameters(recurse=False), *part.named_buffers(recurse=False)):
+            places.setdefault(tensor, []).append(f"{prefix}.{name}" if prefix else name)
+    return places
 
 
 def _read(nodes: Nodes) -> Rolled:

@@ -258,10 +258,8 @@ class Branch(Cartpole):
         return super().forces(q, qdot) * (2 if q[..., 0].sum() > 0 else 1)
 
 
-@pytest.mark.parametrize(
-    ("system", "message"), [(Drag(), "got a trace that is off by"), (Branch(), "that torch can trace")]
-)
-def test_a_system_past_torch_is_refused(system, message):
+@pytest.mark.parametrize("system", [Drag(), Branch()])
+def test_a_system_past_torch_is_refused(system):
     weight = torch.eye(4)
-    with pytest.raises(OracleError, match=message):
+    with pytest.raises(OracleError, match=r"reads the values of a tensor at test_transcription\.py:\d+ \(return super"):
         oracle_of(problem_of(system, QuadraticCost(weight, [[1.0]], weight), 5))

@@ -480,7 +480,9 @@ def test_python_runs_once_unless_the_course_depends_on_values(build, once, pendu
 
 
 @in_either_form
-@pytest.mark.parametrize(("build", "named"), [(Pendulum, None), (LeavesTorch, "leaves it"), (Branching, "Error")])
+@pytest.mark.parametrize(
+    ("build", "named"), [(Pendulum, None), (LeavesTorch, "reads the values"), (Branching, "reads the values")]
+)
 def test_why_a_loop_runs_as_it_is_written_is_logged_once(build, named, pendulum_routes, caplog):
     discrete, _ = pendulum_routes(build())
     for batch in (3, 3, 5):

@@ -11,7 +11,6 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 # Each line imports only lines above it.
 LEVELS = (
     {
-        "contracts",
         "drawing",
         "errors",
         "files",
@@ -22,7 +21,7 @@ LEVELS = (
         "tables",
         "types",
     },
-    {"checkpoint", "cost", "graphs", "schema", "sets", "systems"},
+    {"checkpoint", "contracts", "cost", "graphs", "schema", "sets", "systems"},
     {"calculus", "problem"},
     {"networks", "policy"},
     {"rollout"},
@@ -38,8 +37,8 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "calculus", "contracts", "cost", "errors", "files", "graphs", "interpolation", "linear_algebra", "networks", "policy", "problem", "programs",
-    "random_streams", "rollout", "sets", "systems", "types",
+    "calculus", "contracts", "cost", "errors", "files", "graphs", "interpolation", "linear_algebra", "networks",
+    "policy", "problem", "programs", "random_streams", "rollout", "sets", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

@@ -99,7 +99,7 @@ def test_parts_that_break_their_contract_are_refused(problem):
             return super().f(x).detach()
 
     broken = problem.replaced(system=Detached())
-    with pytest.raises(lyapnet.LyapnetError, match=r"Detached\.f\(x\) differentiable"):
+    with pytest.raises(lyapnet.LyapnetError, match=r"Detached\.f\(x\)"):
         lyapnet.ValueModule(broken, Network(), lyapnet.ValueProgram())
 
 

@@ -106,6 +106,11 @@ class Problem(nn.Module):
             check_function(symbol, function, [x[:TRIED]], shape)
         cost.check(x)
         b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
+        if not torch.allclose(system.dynamics(x, b), ControlAffineSystem.dynamics(system, x, b), rtol=1e-6):
+            raise UsageError(
+                f"Expected {name}.dynamics(x, u) = f(x) + g(x)u, got another sum; a class that overrides f or g of "
+                "another system may have to override its dynamics too."
+            )
         u = own.controls.minimise(cost.R(x), 100 * b)
         inside = u.shape == b.shape and torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9)
         if not inside:

@@ -92,6 +92,8 @@ class Friction(lyapnet.SYSTEMS["double_integrator"]):
         super().__init__()
         self.friction = lyapnet.Table([NODES], VALUES)
 
+    dynamics = lyapnet.ControlAffineSystem.dynamics
+
     def f(self, x):
         return super().f(x) - torch.stack([torch.zeros_like(x[..., 0]), self.friction(x[..., 1:])], -1)
 

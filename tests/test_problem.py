@@ -17,7 +17,7 @@ from lyapnet.errors import UsageError
 from lyapnet.networks import FCN, Scaling
 from lyapnet.problem import Horizon
 from lyapnet.sets import Box, Unbounded
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.systems import ControlAffineSystem, DoubleIntegrator
 from tests.problems import problem_of
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -321,6 +321,8 @@ def test_value_function_that_breaks_its_contract_is_refused_by_name(V, named):
 
 def test_kinks_jumps_and_large_numbers_keep_the_contract():
     class Rough(Sound):
+        dynamics = ControlAffineSystem.dynamics
+
         def f(self, x):
             rough = x.abs() + torch.relu(x - 0.3) + torch.sign(x) + torch.floor(3 * x) + x.clamp(-0.5, 0.5)
             return 1e6 * super().f(x) + rough

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 import typer
 
 import lyapnet
@@ -13,6 +14,7 @@ from lyapnet.cli import app, main
 from lyapnet.comparison.plan import jobs_of, load_comparison
 from lyapnet.config import load_config
 from tests.pages import PAGES, README, REPORT, ROOT, blocks
+from tests.problems import problem_of
 
 SHORT = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4"]
 
@@ -139,6 +141,15 @@ def test_the_oracle_example_runs(workplace):
     (example,) = [block for block in blocks("python") if "oracle_of" in block]
     exec(example, names)
     assert names["optima"].cost.shape == (4,)
+
+
+def test_the_example_of_a_table_keeps_its_contract():
+    (example,) = [block for block in blocks("python") if "lyapnet.Table(" in block]
+    names: dict = {}
+    exec(example, names)
+    cart = names["Cart"]()
+    assert cart.f(torch.tensor([0.0, 2.0])).tolist() == pytest.approx([2.0, -0.5])
+    problem_of(cart).check()
 
 
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::UserWarning")  # Lightning's own

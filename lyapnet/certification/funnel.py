@@ -197,10 +197,10 @@ def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -
     share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
     points = lower + (upper - lower) * share
 
-    def both(t: Tensor, x: Tensor) -> Tensor:
-        return torch.stack([condition(t, x), condition.height(t, x)], -1)
+    def all_three(t: Tensor, x: Tensor) -> Tensor:
+        return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
 
-    check_function("the condition and V", both, [points[:, 0], points[:, 1:]], (2,), differentiable=False)
+    check_function("the condition, V and φ", all_three, [points[:, 0], points[:, 1:]], (3,), differentiable=False)
 
 
 def _require_continuous(V: Value, x_low: State, x_high: State) -> None:

@@ -1,13 +1,21 @@
-"""Checkpoint files: read without executing anything, written so that a crash leaves the previous one."""
+"""Checkpoint files: read without executing anything, written so that a crash leaves the previous one.
 
+Each carries a digest of all that it holds, so that a changed bit is noticed.
+"""
+
+import functools
+import hashlib
 import io
+import logging
 import pickle
 import warnings
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lyapnet.errors import CheckpointError, UsageError
 from lyapnet.files import write_atomically
@@ -18,21 +26,80 @@ UNREADABLE = (
     pickle.UnpicklingError, zipfile.BadZipFile,
 )  # fmt: skip
 KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
+DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.2
 
 
 def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dict[str, Any]:
-    """The content of a lyapnet checkpoint.
+    """The content of a lyapnet checkpoint, as it was written: its digest is verified, and left out.
+
+    A note is logged for a file without a digest, as version 0.1 wrote them; the checksums of its archive are verified.
 
     Raises:
         UsageError: no such file.
-        CheckpointError: truncated, not a checkpoint of lyapnet's, or holding anything but plain data.
+        CheckpointError: truncated, changed since it was written, not a checkpoint of lyapnet's, or holding anything but
+            plain data.
     """
     content = read_plain_data(path, device)
     if not isinstance(content, dict) or not all(isinstance(content.get(k), dict) for k in (KEY, "state_dict")):
         raise CheckpointError(
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which another program wrote; use one from logs/."
         )
+    if not _is_as_written(Path(path), content, content.pop(DIGEST, None)):
+        raise CheckpointError(
+            f"Expected the checkpoint that was written, got {str(path)!r}, which was changed or damaged since; use "
+            "another checkpoint of the run, or a copy of this one."
+        )
     return content
+
+
+def digest_of(content: Any) -> str:
+    """The SHA-256 of plain data in a canonical form: every key and value with its type, in the order of the keys, and
+    of every tensor its dtype, shape and entries, bit for bit. The device does not count.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, content)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value if value.layout == torch.strided else value.to_dense()
+        storage, strides = value.detach(), ()
+        if value.nbytes > value.untyped_storage().nbytes():  # expanded: what it is made of, not what it would fill
+            strides = (value.stride(), value.storage_offset())
+            storage = torch.empty(0, dtype=torch.uint8, device=value.device).set_(value.untyped_storage())
+        digest.update(f"tensor {value.dtype} {tuple(value.shape)} {strides};".encode())
+        digest.update(storage.cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping {len(value)};".encode())
+        for key in sorted(value, key=lambda key: (type(key).__name__, repr(key))):
+            _feed(digest, key)
+            _feed(digest, value[key])
+    elif isinstance(value, list | tuple | set | frozenset):
+        digest.update(f"{type(value).__name__} {len(value)};".encode())
+        for entry in value if isinstance(value, list | tuple) else sorted(value, key=repr):
+            _feed(digest, entry)
+    else:
+        text = repr(value).encode()
+        digest.update(f"{type(value).__name__} {len(text)};".encode() + text)
+
+
+def _is_as_written(path: Path, content: dict[str, Any], digest: Any) -> bool:
+    """Whether a file's content has its digest; one without it, whether its archive has its checksums."""
+    try:
+        if digest is not None:
+            return digest == digest_of(content)
+        with zipfile.ZipFile(path) as archive:
+            intact = archive.testzip() is None
+    except Exception:  # of any kind: what is checked may be hostile
+        return False
+    _note_missing_digest(path)
+    return intact
+
+
+@functools.cache  # once for each file: training reads it for its config, and Lightning for its weights
+def _note_missing_digest(path: Path) -> None:
+    logging.getLogger(__name__).warning("note: %s has no digest, as lyapnet 0.1 left it; it is taken as it is.", path)
 
 
 def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any:
@@ -65,13 +132,13 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
 
 
 def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
-    """Write a checkpoint, all or nothing.
+    """Write a checkpoint with its digest, all or nothing.
 
     Raises:
         CheckpointError: the disk is full, the folder cannot be written; the previous file is untouched.
     """
     buffer = io.BytesIO()
-    torch.save(content, buffer)
+    torch.save({**content, DIGEST: digest_of(content)}, buffer)
     try:
         write_atomically(Path(path), buffer.getbuffer())
     except OSError as error:

@@ -1,27 +1,33 @@
-"""Files that are written whole or not at all, and numbers as JSON has them."""
+"""Files that are written whole or not at all, digests by which a change is noticed, and numbers as JSON has them."""
 
 import contextlib
+import hashlib
 import json
 import math
 import os
+import secrets
+import socket
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from lyapnet.errors import LyapnetError
 
 
 def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """Write to a temporary file beside the target, synchronise, then rename it over the target.
 
     Whatever stops this, a full disk or a lost process, the target holds its old content or the new one. The temporary
-    name is always the same: what a killed write left behind, the next one replaces.
+    name is this call's own and names the process: what a killed one left behind, the next write replaces.
 
     Raises:
         OSError: the disk is full, the folder cannot be written; the temporary file is gone.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
+    prefix = f".{path.name[:60]}.{socket.gethostname()[:60]}."
+    temporary = path.with_name(f"{prefix}{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
@@ -30,6 +36,48 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
+    for other in path.parent.iterdir():
+        if other.name.startswith(prefix) and other.suffix == ".tmp" and not _runs(other.name.split(".")[-3]):
+            other.unlink(missing_ok=True)
+
+
+def _runs(pid: str) -> bool:
+    """Whether there is a process of this number."""
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OverflowError, PermissionError):  # no number, or another user's
+        return True
+    return True
+
+
+def digest_of_file(path: Path) -> str:
+    """The SHA-256 of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_json(path: Path, remedy: str) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        LyapnetError: it cannot be read, or holds something else; ends with the remedy.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(content, dict):
+            return content
+        reason = f"holds {type(content).__name__}"
+    except OSError as error:
+        reason = f"cannot be read ({error.strerror})"
+    except (ValueError, RecursionError) as error:
+        reason = f"is none ({' '.join(str(error).split())})"
+    raise LyapnetError(f"Expected a JSON object, got {str(path)!r}, which {reason}; {remedy}.")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

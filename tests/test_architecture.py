@@ -10,19 +10,9 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 
 # Each line imports only lines above it.
 LEVELS = (
-    {
-        "drawing",
-        "errors",
-        "files",
-        "interpolation",
-        "linear_algebra",
-        "provenance",
-        "random_streams",
-        "tables",
-        "types",
-    },
-    {"checkpoint", "contracts", "cost", "graphs", "schema", "sets", "systems"},
-    {"calculus", "problem"},
+    {"drawing", "errors", "interpolation", "linear_algebra", "provenance", "random_streams", "tables", "types"},
+    {"contracts", "cost", "files", "schema", "sets", "systems"},
+    {"calculus", "checkpoint", "graphs", "problem"},
     {"networks", "policy"},
     {"rollout"},
     {"programs"},

@@ -9,21 +9,23 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import lightning as L
 import torch
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from lyapnet import __version__
 from lyapnet.calculus import ValueFunction
-from lyapnet.checkpoint import KEY, write_checkpoint
+from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.errors import CheckpointError, CompilationError, DivergenceError, UsageError
 from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program
 from lyapnet.random_streams import POINTS
 from lyapnet.rollout import ADAPTIVE_METHODS, DiscreteAdjoint, Rollout, Trajectory
+from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.learner import Learner
 
@@ -145,6 +147,21 @@ class TrainingModule(L.LightningModule):
         present = {type(callback) for callback in self.trainer.callbacks}  # pyright: ignore
         stopwatch = Stopwatch()
         return [c for c in (stopwatch, ScalarLogger(stopwatch)) if type(c) not in present]
+
+    def setup(self, stage: str) -> None:
+        """Have any trainer write checkpoints with a digest, and verify it; one with files of its own keeps them."""
+        if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
+            self.trainer.strategy.checkpoint_io = CheckpointFiles()
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: str | Path, *args: Any, **kwargs: Any) -> Self:
+        """Lightning's, of a file whose digest holds and in which nothing is executed.
+
+        Raises:
+            LyapnetError: as read_checkpoint.
+        """
+        read_checkpoint(checkpoint_path)
+        return super().load_from_checkpoint(checkpoint_path, *args, **{"weights_only": True, **kwargs})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what `lyapnet.load` needs, as plain data."""

@@ -1,14 +1,11 @@
-"""The Lightning trainer of a run: its loggers, its callbacks, and how it writes and reads checkpoint files."""
-
-from typing import Any
+"""The Lightning trainer of a run: its loggers and its callbacks."""
 
 import lightning as L
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 
-from lyapnet.checkpoint import read_plain_data, write_checkpoint
 from lyapnet.config import configs_of_seeds
 from lyapnet.training.certified_share import CertifiedShare
+from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.checkpoints import Checkpoints
 from lyapnet.training.compilation import Compilation, earns_compilation
 from lyapnet.training.curves import ScalarLogger, Stopwatch
@@ -19,16 +16,6 @@ from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
 from lyapnet.training.trainer_options import trainer_options
 from lyapnet.training.validation_optimum import ValidationOptimum
-
-
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's door to checkpoint files: all or nothing on writing, nothing executed on reading."""
-
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        write_checkpoint(checkpoint, path)
-
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
-        return read_plain_data(path, map_location or "cpu")
 
 
 def build_trainer(plan: Plan, console: Console) -> L.Trainer:
@@ -46,7 +33,7 @@ def build_trainer(plan: Plan, console: Console) -> L.Trainer:
         default_root_dir=plan.run.folder,
         logger=loggers,
         callbacks=_callbacks(plan, console),
-        plugins=[AtomicCheckpointIO()],
+        plugins=[CheckpointFiles()],
         **trainer_options(config),
     )
 

@@ -3,8 +3,10 @@
 import errno
 import importlib
 import io
+import logging
 import os
 import pickle
+import random
 import resource
 import signal
 import subprocess
@@ -18,7 +20,7 @@ import torch
 
 import lyapnet
 from lyapnet.build import build_problem, build_value_function
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.checkpoint import DIGEST, KEY, digest_of, read_checkpoint, write_checkpoint
 from lyapnet.config import load_config, to_plain
 from lyapnet.errors import CheckpointError, LyapnetError, UsageError
 
@@ -129,6 +131,121 @@ def test_folder_is_refused(tmp_path):
     with pytest.raises(UsageError) as raised:
         lyapnet.load(tmp_path)
     is_one_line_that_names(tmp_path, raised.value)
+
+
+# A changed bit is noticed
+
+
+@pytest.fixture
+def trained(content):
+    """The content with what a training adds: the state of an optimizer, of callbacks, of loops."""
+    weights = list(content["state_dict"].values())
+    state = {i: {"step": torch.tensor(7.0), "exp_avg": w / 3, "exp_avg_sq": w * w} for i, w in enumerate(weights)}
+    groups = [{"lr": 1e-3, "betas": (0.9, 0.99), "weight_decay": 0, "params": list(state)}]
+    callbacks = {"Checkpoints": {"best_loss": 0.25}, "Stopwatch": {"seconds": 1.5}}
+    return {**content, "optimizer_states": [{"state": state, "param_groups": groups}], "callbacks": callbacks}
+
+
+def flip(whole, bit):
+    flipped = bytearray(whole)
+    flipped[bit // 8] ^= 1 << bit % 8
+    return bytes(flipped)
+
+
+def bits_of_tensors(whole):
+    """Where the bits of tensors are in a torch file."""
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        for entry in archive.infolist():
+            if "/data/" in entry.filename:
+                begin = whole.index(archive.read(entry), entry.header_offset)
+                yield range(8 * begin, 8 * (begin + entry.file_size))
+
+
+def used(path, whole):
+    """Whether a file is read, and then whether its content is that of the whole one."""
+    before = digest_of(read_checkpoint(whole))
+    try:
+        return True, digest_of(read_checkpoint(path)) == before
+    except CheckpointError as error:
+        is_one_line_that_names(path, error)
+        return False, False
+
+
+@pytest.mark.parametrize("digest", [True, False])
+def test_flipped_bits_are_never_used_in_silence(digest, trained, tmp_path):
+    """40 anywhere, and 20 in tensors. A file without a digest has the checksums of its archive at least."""
+    good, bad, chance = tmp_path / "good.ckpt", tmp_path / "bad.ckpt", random.Random(0)
+    write_checkpoint(trained, good) if digest else torch.save(trained, good)
+    whole = good.read_bytes()
+    tensors = list(bits_of_tensors(whole))
+    anywhere = [chance.randrange(8 * len(whole)) for _ in range(40)]
+    for bit in anywhere:
+        bad.write_bytes(flip(whole, bit))
+        read, equal = used(bad, good)
+        assert equal or not read, bit
+    for bit in [chance.choice(chance.choice(tensors)) for _ in range(20)]:
+        bad.write_bytes(flip(whole, bit))
+        assert used(bad, good) == (False, False), bit
+        assert torch.load(bad, weights_only=True).keys() >= trained.keys(), "the twin: torch itself takes it"
+
+
+CHANGES = {
+    "a weight": lambda c: c["state_dict"][next(iter(c["state_dict"]))].view(-1)[0].add_(1e-15),
+    "a sign of zero": lambda c: c["optimizer_states"][0]["param_groups"][0].update(weight_decay=-0.0),
+    "a type": lambda c: c["optimizer_states"][0]["param_groups"][0].update(weight_decay=False),
+    "a tuple": lambda c: c["optimizer_states"][0]["param_groups"][0].update(betas=[0.9, 0.99]),
+    "an optimizer's state": lambda c: c["optimizer_states"][0]["state"][1]["exp_avg_sq"].mul_(2),
+    "a callback's state": lambda c: c["callbacks"]["Checkpoints"].update(best_loss=0.26),
+    "the config": lambda c: c[KEY]["config"]["system"].update(name="pendulum"),
+    "a further key": lambda c: c.update(further=1),
+    "a shape": lambda c: c["state_dict"].update({k: w.reshape(-1) for k, w in c["state_dict"].items()}),
+    "a dtype": lambda c: c["state_dict"].update({k: w.view(torch.int64) for k, w in c["state_dict"].items()}),
+    "the digest": lambda c: c.update({DIGEST: "0" * 64}),
+    "the digest's type": lambda c: c.update({DIGEST: 0}),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_content_that_was_changed_is_refused(change, trained, path):
+    write_checkpoint(trained, path)
+    content = torch.load(path, weights_only=True)
+    torch.save(content, path)
+    read_checkpoint(path)  # the twin: saved again as it was
+    CHANGES[change](content)
+    torch.save(content, path)
+    with pytest.raises(CheckpointError, match="changed or damaged") as raised:
+        lyapnet.load(path)
+    is_one_line_that_names(path, raised.value)
+
+
+def test_checkpoint_without_a_digest_loads_with_a_note(content, path, caplog):
+    with caplog.at_level(logging.WARNING):
+        read_checkpoint(path)
+        assert not caplog.messages
+        torch.save(content, path)
+        lyapnet.load(path)
+        lyapnet.load(path)
+    (note,) = caplog.messages
+    assert str(path) in note
+    assert "no digest" in note
+
+
+def test_digest_is_of_the_content_alone():
+    """Not of the order of keys, of strides or of a device; expanded tensors take no memory for it."""
+    a, b = torch.arange(6.0).view(2, 3), torch.arange(6.0).view(2, 3).mT.contiguous().mT
+    assert digest_of({"x": 1, "y": a}) == digest_of({"y": b, "x": 1})
+    assert digest_of(a) != digest_of(a.mT)
+    assert digest_of([a]) != digest_of((a,))
+    assert digest_of({"x": [1, 2], "y": []}) != digest_of({"x": [1], "y": [2]})
+    assert len({digest_of(torch.ones(1, dtype=torch.int8).expand(n)) for n in (2, 10**15)}) == 2
+    for value in (
+        torch.zeros(0),
+        torch.tensor(1j),
+        torch.tensor(True),
+        torch.ones(2).bfloat16(),
+        torch.eye(2).to_sparse(),
+    ):
+        assert digest_of(value) == digest_of(value.clone()) != digest_of(torch.zeros(9))
 
 
 # A checkpoint is data: nothing in it runs.
@@ -280,6 +397,21 @@ from lyapnet.checkpoint import write_checkpoint
 os.fsync = lambda descriptor: os.kill(os.getpid(), signal.SIGKILL)
 write_checkpoint({"state_dict": {"V.x": torch.zeros(9)}}, sys.argv[1])
 """
+
+
+def test_writes_at_the_same_time_do_not_meet(content, path, monkeypatch):
+    """A second write begins while the first has yet to be named: both end, and the file is one of theirs."""
+    fsync = os.fsync
+
+    def meanwhile(descriptor):
+        monkeypatch.setattr(os, "fsync", fsync)
+        write_checkpoint({**content, "global_step": 8}, path)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    write_checkpoint({**content, "global_step": 9}, path)
+    assert read_checkpoint(path)["global_step"] == 9
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 def test_kill_while_writing_keeps_the_previous_checkpoint_and_the_next_write_tidies_up(path, content):

@@ -2,7 +2,7 @@
 
 import math
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,11 +24,13 @@ class Checkpoints(Checkpoint):
         last: the checkpoint of the whole run.
         best: label ↦ each member's best checkpoint.
         every: steps between validations; the last step is validated and saved whether a multiple or not.
+        saved: called when the last checkpoint is written for the first time in this process.
     """
 
-    def __init__(self, last: Path, best: Mapping[str, Path], every: int):
+    def __init__(self, last: Path, best: Mapping[str, Path], every: int, saved: Callable[[], None]):
         super().__init__()
         self.last, self.best, self.every = last, best, every
+        self._saved: Callable[[], None] | None = saved
         self.best_loss = dict.fromkeys(best, math.inf)
         self._signal: int | None = None
         self._previous: dict[int, Any] = {}
@@ -51,6 +53,8 @@ class Checkpoints(Checkpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
+        if not self.last.parents[1].is_dir():  # writing would make a new one, without what makes it a run
+            raise FileNotFoundError(self.last.parents[1])
         if step % self.every == 0 or step == trainer.max_epochs:
             self._save_best(trainer, pl_module)
             self._save_last(trainer)
@@ -77,6 +81,9 @@ class Checkpoints(Checkpoint):
     def _save_last(self, trainer: Trainer) -> None:
         _flush(trainer)
         trainer.save_checkpoint(self.last)
+        if trainer.is_global_zero and self._saved is not None:
+            self._saved()
+            self._saved = None
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if self._signal is not None:  # the second time, the user means now

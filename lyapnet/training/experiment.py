@@ -5,6 +5,7 @@ import shlex
 import statistics
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from rich.console import Console
 from lyapnet.build import parts_of
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
 from lyapnet.controller import load
-from lyapnet.errors import DivergenceError, Interrupted
+from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
 from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
 from lyapnet.training.build import build_data
@@ -70,6 +71,19 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
         LyapnetError: a file of the run cannot be read or written.
     """
+    with plan.lock or nullcontext():
+        try:
+            return _fit(plan, console, again)
+        except Exception as error:
+            if plan.run.folder.is_dir():
+                raise
+            raise LyapnetError(
+                f"Expected the folder of the run that trains, got none at {str(plan.run.folder)!r}, which was removed "
+                "meanwhile; what it held is lost: start again."
+            ) from error
+
+
+def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     config, run, module = plan.config, plan.run, plan.module
     trainer = build_trainer(plan, console)
     if trainer.is_global_zero:
@@ -87,7 +101,7 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         kept = f" Kept: {run.last}." if run.last.exists() else ""
         raise DivergenceError(f"{error}{kept}") from error
     finally:
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and run.folder.is_dir():
             _note_what_it_took(run, time.perf_counter() - started)
     return _finish(trainer, plan, console) if trainer.is_global_zero else {}
 
@@ -104,8 +118,8 @@ def _prepare_folder(plan: Plan) -> None:
 def _note_what_it_took(run: Run, seconds: float) -> None:
     """Add this process's share to the run's record."""
     record, peak = run.record(), 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # Linux counts in KiB
-    total = record.get("training_seconds", 0.0) + seconds
-    run.note(training_seconds=round(total, 2), peak_bytes=max(record.get("peak_bytes", 0), peak))
+    total = record["training_seconds"] + seconds
+    run.note(training_seconds=round(total, 2), peak_bytes=max(record["peak_bytes"], peak))
 
 
 def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:

@@ -1,7 +1,9 @@
 """What a training is to do: start a run, resume one, or start one from the weights of another."""
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
@@ -9,11 +11,12 @@ import torch
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.controller import config_of, load_value_function
-from lyapnet.errors import UsageError
+from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
-from lyapnet.training.runs import CONFIG, LAST, PROVENANCE, Run, last_run, new_run
+from lyapnet.training.run_lock import RunLock
+from lyapnet.training.runs import CONFIG, LAST, PROVENANCE, Run, is_further_process, last_run, new_run
 from lyapnet.training.trainer_options import check_trainer_options
 
 CHANGEABLE_ON_RESUME = (
@@ -24,7 +27,10 @@ CHANGEABLE_ON_RESUME = (
 
 @dataclass(frozen=True)
 class Plan:
-    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step."""
+    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step.
+
+    The lock is held for `fit`, which releases it; a finished plan has none.
+    """
 
     config: Config
     module: TrainingModule
@@ -32,6 +38,7 @@ class Plan:
     run: Run
     resume_from: Path | None = None  # a checkpoint
     step: int = 0  # at which that was written
+    lock: RunLock | None = None  # on the folder; the first process has it
 
     @property
     def finished(self) -> bool:
@@ -60,20 +67,43 @@ def plan_run(config: Config, resume: str | None = None, finetune: Path | None = 
     module = build_module(config)
     if not resume:
         _start_from(module, finetune)
-        return Plan(config, module, callbacks, new_run(config, finetune))
+        run, lock = new_run(config, finetune)
+        return Plan(config, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
-    if resume == LAST and not run.last.exists():  # stopped before its first checkpoint: it stands where it began
-        written = run.folder / CONFIG
-        if written.exists():
-            _require_same_experiment(config, load_config(written), written)
-        _start_from(module, run.finetuned_from)
-        return Plan(config, module, callbacks, run)
     checkpoint = run.last if resume == LAST else Path(resume)
-    content = read_checkpoint(checkpoint)
     if not (run.folder / PROVENANCE).is_file():
+        read_checkpoint(checkpoint)
         raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
-    _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
-    return Plan(config, module, callbacks, run, checkpoint, int(content["global_step"]))
+    with ExitStack() as stack:
+        lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
+        if resume == LAST and not run.begun:
+            _start_as(run, config, module)
+            plan = Plan(config, module, callbacks, run, lock=lock)
+        else:
+            content = _read(checkpoint, run)
+            _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
+            plan = Plan(config, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
+        if not plan.finished:
+            stack.pop_all()
+    return plan
+
+
+def _read(checkpoint: Path, run: Run) -> dict[str, Any]:
+    """A checkpoint to go on from; where the last one is lost, a refusal that names the best one."""
+    try:
+        return read_checkpoint(checkpoint)
+    except LyapnetError as error:
+        if checkpoint != run.last or not run.best.is_file():
+            raise
+        raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
+
+
+def _start_as(run: Run, config: Config, module: TrainingModule) -> None:
+    """Begin a run again that was stopped before its first checkpoint: it stands where it began."""
+    written = run.folder / CONFIG
+    if written.exists():
+        _require_same_experiment(config, load_config(written), written)
+    _start_from(module, run.finetuned_from)
 
 
 def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:

@@ -1,7 +1,8 @@
 """The folder of a run: what it holds, how it is made, and which one is the last."""
 
-import json
+import errno
 import os
+import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +10,19 @@ from typing import Any
 
 from lyapnet.config import Config, configs_of_seeds, label_of
 from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.files import write_json
+from lyapnet.files import read_json, write_json
 from lyapnet.provenance import commit, versions
+from lyapnet.training.run_lock import RunLock
 
 LAST, BEST = "last", "best"
 CONFIG = "config.yaml"
 PROVENANCE = "run.json"
 EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
+RECORDED = {  # what is read of run.json: its types, and what version 0.1 leaves out
+    "finetuned_from": (str | None, ...), "compiled": (bool, False), "saved": (bool | None, None),
+    "training_seconds": (float | int, 0.0), "peak_bytes": (int, 0),
+}  # fmt: skip
+REPAIR = "restore it, or start a new run with --finetune"
 
 
 @dataclass(frozen=True)
@@ -53,11 +60,27 @@ class Run:
     @property
     def compiled(self) -> bool:
         """Whether the run is compiled, as it then goes on: machine code rounds differently."""
-        return self.record().get("compiled", False)
+        return self.record()["compiled"]
+
+    @property
+    def begun(self) -> bool:
+        """Whether it has left something that starting again would destroy, its last checkpoint or what came with it."""
+        saved = self.record()["saved"]  # None under version 0.1, which did not record it
+        return os.path.lexists(self.last) or self.finished or (self.best.exists() if saved is None else saved)
 
     def record(self) -> dict[str, Any]:
-        """What made the run, and what it took."""
-        return json.loads((self.folder / PROVENANCE).read_text(encoding="utf-8"))
+        """What made the run, and what it took.
+
+        Raises:
+            LyapnetError: run.json cannot be read, or is another file.
+        """
+        path = self.folder / PROVENANCE
+        record = {key: default for key, (_, default) in RECORDED.items()} | read_json(path, REPAIR)
+        for key, (kinds, _) in RECORDED.items():
+            if not isinstance(record[key], kinds):
+                got = "none" if record[key] is ... else repr(record[key])[:40]
+                raise LyapnetError(f"Expected {key} in {str(path)!r}, got {got}; {REPAIR}.")
+        return record
 
     def note(self, **facts: Any) -> None:
         """Add to the record, or replace in it."""
@@ -74,25 +97,51 @@ class Run:
 
         For several seeds: mean, spread, and each.
         """
-        return json.loads((self.folder / EVALUATION).read_text(encoding="utf-8"))
+        return read_json(self.folder / EVALUATION, "resume the run with more iterations, which writes it anew")
 
 
-def new_run(config: Config, finetuned_from: Path | None) -> Run:
-    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on."""
-    if int(os.environ.get("LOCAL_RANK", "0")) > 0:  # a further process of a run whose folder the first one made
-        return last_run(config)
+def is_further_process() -> bool:
+    """Whether this is a further process of a run whose folder and lock belong to the first one."""
+    return int(os.environ.get("LOCAL_RANK", "0")) > 0
+
+
+def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock | None]:
+    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on.
+
+    It is locked, and for a further process the newest run, without a lock.
+
+    Raises:
+        LyapnetError: it cannot be made.
+    """
+    if is_further_process():
+        return last_run(config), None
     root = Path(config.logs) / config.experiment
     try:
         root.mkdir(parents=True, exist_ok=True)
         draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
-        draft.chmod(0o755)
-        write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
-        newest = max((number for number, _ in _versions(root)), default=-1)
-        return Run(draft.rename(root / f"version_{newest + 1}"))
+        try:
+            draft.chmod(0o755)
+            write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
+            lock = RunLock(draft)
+            return Run(_numbered(draft)), lock
+        except BaseException:
+            shutil.rmtree(draft, ignore_errors=True)
+            raise
     except OSError as error:
         raise LyapnetError(
             f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
         ) from error
+
+
+def _numbered(draft: Path) -> Path:
+    """The folder under the next number, which another process may take meanwhile: then the one after it."""
+    while True:
+        newest = max((number for number, _ in _versions(draft.parent)), default=-1)
+        try:
+            return draft.rename(draft.with_name(f"version_{newest + 1}"))
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
 
 
 def last_run(config: Config) -> Run:
@@ -110,13 +159,14 @@ def last_run(config: Config) -> Run:
 
 def runs_of(config: Config) -> list[Run]:
     """The runs of an experiment, oldest first."""
-    return [Run(path) for _, path in sorted(_versions(Path(config.logs) / config.experiment))]
+    return [Run(path) for _, path in sorted(_versions(Path(config.logs) / config.experiment)) if path.is_dir()]
 
 
 def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
     return {
         "seed": config.seed,
         "compiled": False,
+        "saved": False,  # whether last.ckpt was ever written
         "training_seconds": 0.0,  # of the processes that came to an end, kill -9 aside
         "peak_bytes": 0,  # of memory, in the process that held most
         "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
@@ -127,4 +177,4 @@ def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
 
 def _versions(root: Path) -> list[tuple[int, Path]]:
     numbered = [(path.name.removeprefix("version_"), path) for path in root.glob("version_*")]
-    return [(int(number), path) for number, path in numbered if number.isdigit()]
+    return [(int(number), path) for number, path in numbered if number.isascii() and number.isdigit()]

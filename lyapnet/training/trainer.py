@@ -1,5 +1,7 @@
 """The Lightning trainer of a run: its loggers and its callbacks."""
 
+from functools import partial
+
 import lightning as L
 from rich.console import Console
 
@@ -54,7 +56,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         *([certified] if options.certify_every else []),
         TrainingProgress(console),
         *plan.callbacks,
-        Checkpoints(run.last, best, every),
+        Checkpoints(run.last, best, every, partial(run.note, saved=True)),
     ]
 
 

@@ -1,8 +1,10 @@
 """Traced functions as machine code, kept on disk from run to run (torch.export and AOTInductor)."""
 
 import hashlib
+import logging
 import os
 import platform
+import stat
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +17,7 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 
 from lyapnet.errors import CompilationError, LyapnetError
+from lyapnet.files import digest_of_file, write_atomically
 
 
 class Scan(nn.Module):
@@ -61,28 +64,53 @@ def is_on_disk(module: nn.Module, arguments: Sequence[Tensor]) -> bool:
 def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
     """The function of a traced module for arguments like these, from disk, or compiled now.
 
+    What is on disk is run only where nobody else can have written it, and where its digest holds.
+
     Raises:
-        CompilationError: there is no C++ compiler.
+        CompilationError: there is no C++ compiler; or the cache is not the user's own.
         Exception: of torch or the compiler, of any kind.
     """
     from torch._inductor import aoti_compile_and_package, aoti_load_package
 
     path = file_of(module, arguments)
+    digest = path.with_suffix(".sha256")
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    _require_own(path.parent)
     if path.is_file():
         try:
-            return aoti_load_package(str(path))
-        except Exception:  # of any kind: a file that was cut short or exchanged
-            path.unlink(missing_ok=True)
+            _require_own(path)
+            if digest.read_text(encoding="ascii") == digest_of_file(path):
+                return aoti_load_package(str(path))
+            reason = "another digest than what was compiled"
+        except Exception as error:  # of any kind: a file that was cut short or exchanged
+            reason = " ".join(str(error).split())[:200]
+        logging.getLogger(__name__).warning("note: compiling again what is in %s: got %s.", path, reason)
+        path.unlink(missing_ok=True)
     if not has_compiler():
         raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's, about itself
             program = torch.export.export(module, tuple(arguments))
             package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
+        Path(package).chmod(0o600)
+        write_atomically(digest, digest_of_file(Path(package)).encode())
         Path(package).replace(path)
     return aoti_load_package(str(path))
+
+
+def _require_own(path: Path) -> None:
+    """Refuse a folder or file of machine code that another user owns or may write.
+
+    Raises:
+        CompilationError: naming it.
+    """
+    facts = path.stat()
+    if facts.st_uid != os.getuid() or facts.st_mode & 0o022:
+        raise CompilationError(
+            f"Expected machine code that only you can write, got {str(path)!r} with {stat.filemode(facts.st_mode)} of "
+            f"user {facts.st_uid}; run chmod go-w on it, or choose another folder with LYAPNET_CACHE"
+        )
 
 
 @contextmanager

@@ -62,7 +62,10 @@ def test_a_scan_as_machine_code_computes_the_same(cache):
     assert found["after"] is True
     assert found["error"] < 1e-12
     assert found["difference_with_another_weight"] > 1e-3
-    assert len(list(cache.iterdir())) == 1
+    assert len(list(cache.glob("*.pt2"))) == 1
+    assert found["twice"] is True
+    assert found["refused"] == dict.fromkeys(("flipped", "exchanged", "writable", "without a digest"), True)
+    assert "only you can write" in found["folder"]
 
 
 def measure_scan():
@@ -79,7 +82,40 @@ def measure_scan():
             for given in (arguments, [2 * w, t, dt, x])
         )
     after = compilation.is_on_disk(scan, arguments)
-    print(json.dumps({"before": before, "after": after, "error": error, "difference_with_another_weight": difference}))
+    found = {"before": before, "after": after, "error": error, "difference_with_another_weight": difference}
+    print(json.dumps({**found, **measure_what_is_refused(compilation.file_of(scan, arguments), scan, arguments)}))
+
+
+def measure_what_is_refused(path, scan, arguments):
+    """Whether a changed file is taken for missing, where there is no compiler to replace it; and a folder's refusal."""
+    whole, digest = path.read_bytes(), path.with_suffix(".sha256").read_text()
+    compilation.has_compiler = lambda: False
+
+    def refusal():
+        try:
+            compilation.compiled(scan, arguments)
+        except CompilationError as error:
+            return str(error)
+        return ""
+
+    middle = len(whole) // 2
+    changes = {
+        "flipped": lambda: path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]),
+        "exchanged": lambda: path.write_bytes(b"PK evil"),
+        "writable": lambda: path.chmod(0o620),
+        "without a digest": lambda: path.with_suffix(".sha256").unlink(),
+    }
+    found: dict = {"twice": refusal() == "", "refused": {}}
+    for name, change in changes.items():
+        change()
+        found["refused"][name] = "compiler" in refusal() and not path.exists()
+        path.write_bytes(whole)
+        path.chmod(0o600)
+        path.with_suffix(".sha256").write_text(digest)
+        assert refusal() == "", "the twin"
+    path.parent.chmod(0o770)
+    found["folder"] = refusal()
+    return found
 
 
 @pytest.mark.slow
@@ -88,7 +124,7 @@ def test_machine_code_computes_the_same_and_is_kept(cache):
     found = measured("rollout")
     assert found["before"] is False
     assert found["after"] is True
-    assert len(list(cache.iterdir())) == 3  # nothing is left of the compilation but its results
+    assert len(list(cache.iterdir())) == 6  # with digests; nothing is left of the compilation but its results
     assert found["gradient_error"] < 1e-10
     assert found["error_in_slices"] < 1e-10
     assert found["error_from_a_transposed_batch"] < 1e-10
@@ -158,16 +194,38 @@ def test_everything_has_to_be_on_disk(monkeypatch):
         assert rollout_of()[0].discrete.is_on_disk(torch.zeros(3, 2)) is all(answers)
 
 
-def test_a_file_of_machine_code_that_was_cut_short_is_replaced(cache, no_compiler):
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
+def test_folder_that_others_can_write_is_refused(mode, cache):
+    graph = trace(lambda x: (torch.sin(x),), (torch.zeros(3),))
+    cache.mkdir()
+    cache.chmod(mode)
+    with pytest.raises(CompilationError, match="only you can write") as raised:
+        compilation.compiled(graph, [torch.zeros(3)])
+    assert str(cache) in str(raised.value)
+    assert "chmod go-w" in str(raised.value)
+
+
+def test_folder_of_another_user_is_refused(cache, monkeypatch):
+    graph = trace(lambda x: (torch.sin(x),), (torch.zeros(3),))
+    cache.mkdir(mode=0o700)
+    monkeypatch.setattr(compilation.os, "getuid", lambda: cache.stat().st_uid + 1)
+    with pytest.raises(CompilationError, match="only you can write"):
+        compilation.compiled(graph, [torch.zeros(3)])
+
+
+def test_a_file_of_machine_code_that_was_cut_short_is_replaced(cache, no_compiler, caplog):
     """Without a compiler, it is missed instead."""
     x = torch.zeros(3)
     graph = trace(lambda x: (torch.sin(x),), (x,))
-    cache.mkdir()
+    cache.mkdir(mode=0o700)
     path = compilation.file_of(graph, [x])
     path.write_bytes(b"PK\x03\x04 cut short")
     with pytest.raises(CompilationError, match=r"C\+\+ compiler"):
         compilation.compiled(graph, [x])
     assert not path.exists()
+    (note,) = caplog.messages
+    assert str(path) in note
+    assert "\n" not in note
 
 
 @pytest.mark.parametrize("change", ["constant", "operation", "shape", "dtype"])

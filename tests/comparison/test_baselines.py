@@ -1,8 +1,11 @@
 """Baselines: what SB3 is asked for, that it learns, and that a training which was stopped goes on as if it had not."""
 
 import json
+import os
+import pickle
 import shutil
 import textwrap
+import zipfile
 
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ from lyapnet.comparison.baselines.checkpoints import best_checkpoint, checkpoint
 from lyapnet.comparison.baselines.settings import SETTINGS
 from lyapnet.comparison.baselines.training import BaselineTraining, costs_of_best
 from lyapnet.comparison.reference_problems import bounded_problem
-from lyapnet.errors import UsageError
+from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.problem import Horizon
 
 SMALL = {
@@ -169,6 +172,60 @@ def test_normalisation_is_kept_with_the_model(tmp_path):
     expected, _ = training.policy.predict(observation)
     np.testing.assert_array_equal(policy.predict(observation)[0], expected)
     assert not np.array_equal(policy.model.predict(observation, deterministic=True)[0], expected)
+
+
+class Malice:
+    """Unpickling this makes a folder."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.marker),)
+
+
+def evil(path, marker):
+    """The same file with something to run in it."""
+    if path.suffix == ".zip":
+        model = SAC.load(path) if "ent_coef_optimizer.pth" in zipfile.ZipFile(path).namelist() else PPO.load(path)
+        model.further = Malice(marker)
+        model.save(path)
+    else:
+        path.write_bytes(pickle.dumps(Malice(marker)))
+
+
+@pytest.mark.parametrize("name", ["model.zip", "normalisation.pkl", "replay.pkl", "streams.pt", "progress.json"])
+def test_what_another_program_wrote_is_not_unpickled(name, tmp_path):
+    baseline, folder = baseline_of("sac_tuned", 1200), tmp_path / "job"
+    with pytest.raises(KeyboardInterrupt):
+        trained(folder, baseline, pieces=1)
+    last, marker = checkpoints(folder)[-1], tmp_path / "executed"
+    evil(last.folder / name, marker)
+    for use in (lambda: BaselineTraining(baseline, folder), lambda: last.file(name) or last.progress):
+        with pytest.raises(LyapnetError) as raised:
+            use()
+        assert str(last.folder / name) in str(raised.value)
+        assert "\n" not in str(raised.value)
+    assert not marker.exists()
+    if name == "model.zip":  # even with a digest: a policy is read from its weights alone
+        last.seal()
+        last.policy(baseline)
+        assert not marker.exists()
+        last.model(baseline, baseline.wrapped(baseline.environment()))
+        assert marker.exists(), "the twin: the same file is malicious indeed"
+
+
+def test_baseline_without_digests_is_refused(tmp_path):
+    baseline = baseline_of("ppo_tuned", 1200)
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path, baseline, pieces=1)
+    last = checkpoints(tmp_path)[-1]
+    kept = (last.folder / "digests.json").read_text()
+    (last.folder / "digests.json").unlink()
+    with pytest.raises(LyapnetError, match="trains it again"):
+        BaselineTraining(baseline, tmp_path)
+    (last.folder / "digests.json").write_text(kept)
+    BaselineTraining(baseline, tmp_path)
 
 
 def test_unknown_method_is_refused():

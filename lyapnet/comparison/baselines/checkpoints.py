@@ -1,6 +1,5 @@
 """The checkpoints of a baseline's training, and the policy that one holds."""
 
-import json
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,9 +9,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from lyapnet.comparison.baselines.baseline import Baseline
+from lyapnet.errors import CheckpointError
+from lyapnet.files import digest_of_file, read_json, write_json
 
 MODEL, NORMALISATION, REPLAY = "model.zip", "normalisation.pkl", "replay.pkl"
-PROGRESS, STREAMS = "progress.json", "streams.pt"
+PROGRESS, STREAMS, DIGESTS = "progress.json", "streams.pt", "digests.json"
 
 
 class BaselinePolicy(NamedTuple):
@@ -43,19 +44,42 @@ class Checkpoint(NamedTuple):
     @property
     def progress(self) -> dict[str, Any]:
         """Seconds, validations, and the step of the best one, so far."""
-        return json.loads((self.folder / PROGRESS).read_text(encoding="utf-8"))
+        return read_json(self.folder / PROGRESS, self._remedy)
+
+    @property
+    def _remedy(self) -> str:
+        return f"remove {str(self.folder.parent)!r}, and the same command trains it again"
+
+    def seal(self) -> None:
+        """Keep a digest of every file, by which `file` knows what this comparison wrote."""
+        write_json(self.folder / DIGESTS, {path.name: digest_of_file(path) for path in self.folder.iterdir()})
+
+    def file(self, name: str) -> Path | None:
+        """One of its files as it was written; None if it has none of that name. SB3 unpickles some: that runs code.
+
+        Raises:
+            CheckpointError: it was changed since, or has no digest, as under version 0.1.
+        """
+        path = self.folder / name
+        if not path.is_file():
+            return None
+        if read_json(self.folder / DIGESTS, self._remedy).get(name) != digest_of_file(path):
+            raise CheckpointError(f"Expected {str(path)!r} as it was written, got another file; {self._remedy}.")
+        return path
 
     def policy(self, baseline: Baseline) -> BaselinePolicy:
-        """The policy as it was then."""
-        kept = self.folder / NORMALISATION
-        environment = baseline.wrapped(baseline.environment(), kept if kept.is_file() else None)
-        return BaselinePolicy(self.model(baseline), environment if isinstance(environment, VecNormalize) else None)
+        """The policy as it was then, of weights alone."""
+        environment = baseline.wrapped(baseline.environment(), self.file(NORMALISATION))
+        model = baseline.model(environment)
+        model.set_parameters(str(self.file(MODEL)), device="cpu")
+        return BaselinePolicy(model, environment if isinstance(environment, VecNormalize) else None)
 
-    def model(self, baseline: Baseline, environment: VecEnv | None = None) -> BaseAlgorithm:
-        """The model as it was then."""
+    def model(self, baseline: Baseline, environment: VecEnv) -> BaseAlgorithm:
+        """The model as it was then, with all that its training goes on from."""
         with warnings.catch_warnings():  # SB3 takes its own buffer of returns of several steps for the user's
             warnings.filterwarnings("ignore", ".*n_steps=.* is ignored because a custom.*")
-            return baseline.setting.algorithm.load(self.folder / MODEL, environment, device="cpu", force_reset=False)
+            path = str(self.file(MODEL))
+            return baseline.setting.algorithm.load(path, environment, device="cpu", force_reset=False)
 
 
 def checkpoints(folder: Path) -> list[Checkpoint]:

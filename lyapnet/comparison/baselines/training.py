@@ -17,6 +17,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecNormalize
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lyapnet.checkpoint import read_plain_data
 from lyapnet.comparison.baselines.baseline import Baseline
 from lyapnet.comparison.baselines.checkpoints import (
     MODEL,
@@ -130,6 +131,7 @@ class BaselineTraining:
         torch.save({**self.episodes.position(), **_random_streams(), **self._begun()}, draft / STREAMS)
         progress = {"seconds": self.seconds, "best": self.best, "curve": [asdict(point) for point in self.curve]}
         write_json(draft / PROGRESS, progress)
+        Checkpoint(draft).seal()
         draft.rename(root / f"step_{self.model.num_timesteps}")
         *earlier, _ = checkpoints(self.folder)
         for checkpoint in earlier:
@@ -148,12 +150,11 @@ class BaselineTraining:
         return {name: torch.from_numpy(values) for name, values in known.items()}
 
     def _resume(self, checkpoint: Checkpoint) -> None:
-        kept = checkpoint.folder / NORMALISATION
-        self.environment = self.baseline.wrapped(self.episodes, kept if kept.is_file() else None)
+        self.environment = self.baseline.wrapped(self.episodes, checkpoint.file(NORMALISATION))
         self.model = checkpoint.model(self.baseline, self.environment)
-        if isinstance(self.model, OffPolicyAlgorithm) and (checkpoint.folder / REPLAY).is_file():  # not at its end
-            self.model.load_replay_buffer(checkpoint.folder / REPLAY)
-        streams = torch.load(checkpoint.folder / STREAMS, weights_only=True)
+        if isinstance(self.model, OffPolicyAlgorithm) and (replay := checkpoint.file(REPLAY)):  # not at its end
+            self.model.load_replay_buffer(replay)
+        streams = read_plain_data(checkpoint.file(STREAMS) or STREAMS)
         self.episodes.resume(streams)  # after loading, which seeds everything anew
         _restore(streams)
         for name, values in self._begun().items():

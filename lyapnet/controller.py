@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from lyapnet.build import (
-    REGISTRIES,
     Parts,
     build_problem,
     build_program,
     build_rollout,
     build_value_function,
     parameters_of,
+    require_parts,
 )
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
@@ -202,13 +202,7 @@ def load(
     content = read_checkpoint(path, device)
     config = config_of(content, path)
     parts = Parts(system=system, cost=cost, controls=controls, network=network, program=program)
-    for argument, (registry, _) in REGISTRIES.items():
-        name = getattr(config, argument).name
-        if getattr(parts, argument) is None and name not in registry:
-            raise UsageError(
-                f"Expected {argument}=… for {str(path)!r}, got none; it was trained with {name}, and loading a file "
-                f"never imports what the file names: pass {argument}=… to load, or --{argument} to lyapnet evaluate."
-            )
+    require_parts(config, parts, path)
     problem = build_problem(config, parts)
     V = build_value_function(config, problem, network)
     load_value_function(V, content, path)

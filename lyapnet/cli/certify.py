@@ -12,7 +12,17 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+from lyapnet.cli.options import (
+    Checkpoint,
+    Controls,
+    Cost,
+    Debug,
+    Network,
+    Program,
+    System,
+    load_controller,
+    parts_given,
+)
 from lyapnet.errors import UsageError
 
 DEFAULT = "statistical"
@@ -223,7 +233,8 @@ def sound(
     if refine:
         from lyapnet.training.refinement import refine as train_on
 
-        checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes)
+        parts = parts_given(checkpoint, **own)
+        checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes, parts)
     else:
         certificate = certified(checkpoint)
     _write(certificate, checkpoint, own, as_json, figure, report)

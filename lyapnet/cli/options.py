@@ -14,16 +14,22 @@ Controls = Annotated[str | None, typer.Option(help="module:Class of a control se
 Program = Annotated[str | None, typer.Option(help="module:Class of a program of your own.")]
 
 
-def load_controller(checkpoint: Path, **own: str | None) -> Any:
-    """The controller of a checkpoint, with the user's own parts, each by its option's name, where one is given."""
-    import torch
-
-    from lyapnet.build import parts_named
+def parts_given(checkpoint: Path, **own: str | None) -> Any:
+    """The user's own parts, each by its option's name, where one is given; made with the config of a checkpoint."""
+    from lyapnet.build import Parts, parts_named
     from lyapnet.checkpoint import read_checkpoint
-    from lyapnet.controller import config_of, load
+    from lyapnet.controller import config_of
 
     named = {part: name for part, name in own.items() if name is not None}
-    parts = parts_named(config_of(read_checkpoint(checkpoint), checkpoint), named) if named else None
-    controller = load(checkpoint, **(vars(parts) if parts else {}))
+    return parts_named(config_of(read_checkpoint(checkpoint), checkpoint), named) if named else Parts()
+
+
+def load_controller(checkpoint: Path, **own: str | None) -> Any:
+    """The controller of a checkpoint, with the user's own parts."""
+    import torch
+
+    from lyapnet.controller import load
+
+    controller = load(checkpoint, **vars(parts_given(checkpoint, **own)))
     torch.set_num_threads(controller.config.training.threads)
     return controller

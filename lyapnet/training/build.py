@@ -28,13 +28,16 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.modules import EnsembleModule, OptimizerOptions, TrainingModule, ValueModule
 
 
-def build_module(config: Config) -> TrainingModule:
+def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
     """What trains a config: one V, or an ensemble of seeds.
+
+    Args:
+        parts: taken instead of those that the config names.
 
     Raises:
         UsageError: as build_problem and its like; or the seeds cannot train as one batch.
     """
-    parts = parts_of(config)
+    parts = parts_of(config) if parts is None else parts
     problem, options = build_problem(config, parts), _optimizer_options(config.training)
     if config.seeds == 1:
         one = build_learner(config, problem, parts)

@@ -13,7 +13,7 @@ import lightning as L
 import torch
 from rich.console import Console
 
-from lyapnet.build import parts_of
+from lyapnet.build import Parts
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
 from lyapnet.controller import load
 from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
@@ -35,6 +35,7 @@ def train(
     resume: str | None = None,
     finetune: str | Path | None = None,
     console: Console | None = None,
+    parts: Parts | None = None,
 ) -> Run:
     """Train one experiment, as `lyapnet train` does; its run, with `folder`, `best` and `evaluation`.
 
@@ -44,6 +45,7 @@ def train(
         resume: "last", or the path of a checkpoint: go on with that run. One that is finished is left as it is.
         finetune: a checkpoint whose weights a new run starts from.
         console: where the progress is shown; None: the terminal.
+        parts: of the user's own, taken instead of those that the config names, none of which is then imported.
 
     Raises:
         LyapnetError: as plan_run and fit.
@@ -54,7 +56,7 @@ def train(
     else:
         content = to_plain(config) if isinstance(config, Config) else config
         resolved, again = config_from_plain(content, overrides), 'lyapnet.train(…, resume="last")'
-    plan = plan_run(resolved, resume, None if finetune is None else Path(finetune))
+    plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
     if not plan.finished:
         fit(plan, console or Console(highlight=False), again)
     return plan.run
@@ -125,10 +127,10 @@ def _note_what_it_took(run: Run, seconds: float) -> None:
 def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     """Evaluate each best checkpoint, log it as its run's final metrics, and mark the run as finished."""
     config, options = plan.config, plan.config.evaluation
-    parts, results = parts_of(config), []
+    results = []
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
     for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
-        controller = load(run.best, **vars(parts))
+        controller = load(run.best, **vars(plan.parts))
         with optimum_progress(console) as progress:
             results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
         log_result(own, one, results[-1], trainer.global_step)

@@ -8,6 +8,7 @@ from typing import Any
 import lightning as L
 import torch
 
+from lyapnet.build import Parts, parts_of, require_parts
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.controller import config_of, load_value_function
@@ -33,6 +34,7 @@ class Plan:
     """
 
     config: Config
+    parts: Parts  # of the user's own
     module: TrainingModule
     callbacks: list[L.Callback]
     run: Run
@@ -46,12 +48,15 @@ class Plan:
         return self.resume_from is not None and self.run.finished and self.step >= self.config.training.iterations
 
 
-def plan_run(config: Config, resume: str | None = None, finetune: Path | None = None) -> Plan:
+def plan_run(
+    config: Config, resume: str | None = None, finetune: Path | None = None, parts: Parts | None = None
+) -> Plan:
     """Build everything that a config names, and last of all, for a new run, its folder.
 
     Args:
         resume: "last", or the path of a checkpoint: go on with that run.
         finetune: a checkpoint whose weights a new run starts from.
+        parts: as for `train`.
 
     Raises:
         UsageError: config and checkpoint contradict each other, or there is nothing to resume.
@@ -64,11 +69,14 @@ def plan_run(config: Config, resume: str | None = None, finetune: Path | None = 
     require_libraries(config.loggers)
     callbacks = build_callbacks(config)
     torch.set_num_threads(config.training.threads)  # compiled functions are kept for a number of threads
-    module = build_module(config)
+    if parts is not None:
+        require_parts(config, parts, config.experiment)
+    parts = parts_of(config) if parts is None else parts
+    module = build_module(config, parts)
     if not resume:
         _start_from(module, finetune)
         run, lock = new_run(config, finetune)
-        return Plan(config, module, callbacks, run, lock=lock)
+        return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if not (run.folder / PROVENANCE).is_file():
@@ -78,11 +86,11 @@ def plan_run(config: Config, resume: str | None = None, finetune: Path | None = 
         lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
         if resume == LAST and not run.begun:
             _start_as(run, config, module)
-            plan = Plan(config, module, callbacks, run, lock=lock)
+            plan = Plan(config, parts, module, callbacks, run, lock=lock)
         else:
             content = _read(checkpoint, run)
             _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
-            plan = Plan(config, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
+            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
         if not plan.finished:
             stack.pop_all()
     return plan

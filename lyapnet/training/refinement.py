@@ -10,15 +10,18 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from lyapnet.build import Parts
 from lyapnet.certification import DecreaseCondition, violations
 from lyapnet.certification.sound_certificate import SoundCertificate
-from lyapnet.config import config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.training.experiment import train
 from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
 
 POINTS_FILE = "points.csv"
+CALLBACKS = "callbacks="  # how an override that names them begins
 FURTHER = 256  # counterexamples, and as many undecided points, of each round
 
 
@@ -28,6 +31,7 @@ def refine(
     rounds: int,
     overrides: Sequence[str],
     console: Console,
+    parts: Parts | None = None,
 ) -> tuple[Path, SoundCertificate]:
     """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
 
@@ -38,11 +42,13 @@ def refine(
 
     Args:
         certified: makes the sound certificate of the controller of a checkpoint.
+        parts: those of the user's own that it is made with; nothing else that a checkpoint names is imported.
 
     Raises:
+        UsageError: a checkpoint names a part that is missing there, or callbacks that the overrides do not name.
         Interrupted: Ctrl-C or SIGTERM while it trains.
     """
-    home = checkpoint.resolve().parent.parent
+    home, parts = checkpoint.resolve().parent.parent, parts or Parts()
     for k in range(1, rounds + 1):
         folder = home / f"refine_{k}"
         run = _finished_run(folder)
@@ -51,8 +57,8 @@ def refine(
             if certificate.claim.verdict == "certified":
                 return checkpoint, certificate
             if not (folder / CONFIG).exists():
-                _prepare(folder, certificate, overrides)
-            run = _train(folder, checkpoint, console)
+                _prepare(folder, certificate, overrides, parts)
+            run = _train(folder, checkpoint, overrides, console, parts)
         checkpoint = run.best
     return checkpoint, certified(checkpoint)
 
@@ -82,11 +88,16 @@ def _finished_run(folder: Path) -> Run | None:
     return runs[-1] if runs and runs[-1].finished else None
 
 
-def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[str]) -> None:
+def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[str], parts: Parts) -> None:
     """Write what a round trains on, and its config last."""
-    folder.mkdir(parents=True, exist_ok=True)
     controller = certificate.controller
+    _require_named_callbacks(controller.config, overrides)
+    folder.mkdir(parents=True, exist_ok=True)
     config = to_plain(controller.config)
+    for part, own in vars(parts).items():
+        if own is not None:  # whatever the checkpoint calls it; to be passed with each checkpoint of the round
+            cls = own if isinstance(own, type) else type(own)
+            config[part]["name"] = f"{cls.__module__}:{cls.__qualname__}"
     pointwise, earlier = config["pointwise"], config["pointwise"]["counterexamples"]
     rows = [["t", *controller.system.state_names], *failing_points(certificate).tolist()]
     if earlier is not None:
@@ -103,8 +114,19 @@ def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[st
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())
 
 
-def _train(folder: Path, checkpoint: Path, console: Console) -> Run:
+def _train(folder: Path, checkpoint: Path, overrides: Sequence[str], console: Console, parts: Parts) -> Run:
     """Train a round to its end, from where it stands."""
-    begun = runs_of(load_config(folder / CONFIG))
-    resume, finetune = (LAST, None) if begun else (None, checkpoint)
-    return train(folder / CONFIG, resume=resume, finetune=finetune, console=console)
+    named, config = [change for change in overrides if change.startswith(CALLBACKS)], load_config(folder / CONFIG)
+    _require_named_callbacks(config, named)
+    resume, finetune = (LAST, None) if runs_of(config) else (None, checkpoint)
+    return train(folder / CONFIG, named, resume=resume, finetune=finetune, console=console, parts=parts)
+
+
+def _require_named_callbacks(config: Config, overrides: Sequence[str]) -> None:
+    """Refuse callbacks that a file names and the user does not: they would be imported."""
+    if config.callbacks and not any(change.startswith(CALLBACKS) for change in overrides):
+        listed = ",".join(config.callbacks)
+        raise UsageError(
+            f"Expected callbacks named by the command, got {listed} from a checkpoint's config; append "
+            f"callbacks=[{listed}] to train on with them, or callbacks=[] to do without."
+        )

@@ -23,8 +23,7 @@ class RunLock:
 
     def __init__(self, folder: Path):
         try:
-            opened = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-            self._file = os.fdopen(opened, "r+", encoding="utf-8", errors="replace")
+            self._file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
         except OSError as error:
             raise LyapnetError(
                 f"Expected a writable folder of a run, got {str(folder)!r} ({error.strerror}); check its permissions."
@@ -32,20 +31,22 @@ class RunLock:
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            holder = " ".join(self._file.read(200).split()) or "another process"
-            self._file.close()
+            holder = " ".join(os.read(self._file, 200).decode(errors="replace").split()) or "another process"
             raise UsageError(
                 f"Expected a run that nobody trains, got {str(folder)!r}, which {holder} is training; wait for it, or "
                 "stop it with Ctrl-C, which saves."
             ) from error
         except OSError:  # a file system without locks
             pass
-        self._file.truncate(0)
-        self._file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        self._file.flush()
+        os.ftruncate(self._file, 0)
+        os.write(self._file, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
 
     def __enter__(self) -> "RunLock":
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._file.close()
+        if (held := self.__dict__.pop("_file", None)) is not None:
+            os.close(held)
+
+    def __del__(self) -> None:
+        self.__exit__()

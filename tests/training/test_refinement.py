@@ -6,18 +6,23 @@ Most rounds are of a claim that is made up, as a proof takes seconds; one goes t
 import csv
 import json
 import shutil
+import sys
 from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 from rich.console import Console
 
 import lyapnet
+from lyapnet.build import Parts
 from lyapnet.certification import DecreaseCondition, SoundClaim, sound_certificate
 from lyapnet.certification.sound_certificate import SoundCertificate
+from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
-from lyapnet.errors import Interrupted
+from lyapnet.errors import Interrupted, UsageError
 from lyapnet.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
@@ -53,9 +58,11 @@ def best(folder):
     return folder / "checkpoints/best.ckpt"
 
 
-def claimed(checkpoint, rho=-float("inf"), undecided=((0.01, 0.2, -0.3), (0.02, 1.5, 2.5)), level=20.0):
+def claimed(
+    checkpoint, rho=-float("inf"), undecided=((0.01, 0.2, -0.3), (0.02, 1.5, 2.5)), level=20.0, controller=None
+):
     """A claim about the controller of a checkpoint: nothing is proved, and two boxes are undecided."""
-    controller = lyapnet.load(checkpoint)
+    controller = controller or lyapnet.load(checkpoint)
     D, centers = Box([-1.6, -2.6], [1.6, 2.6]), torch.tensor(undecided).reshape(-1, 3)
     duration = controller.horizon.duration
     claim = SoundClaim(ALPHA, DELTA, duration, D, rho, level, level, 0.0, 0.0, None, 9, 1.0, 0.5, centers, [])
@@ -202,6 +209,115 @@ def test_the_command(run, capsys, monkeypatch):
     assert runs(run / "refine_1") == ["version_0"]
     no_training(monkeypatch)
     assert main([*command, "--refine=1", "seed=5"]) == 0
+
+
+PART = """
+from pathlib import Path
+from lyapnet.systems import DoubleIntegrator
+import lightning as L
+
+Path({mark!r}).touch()
+
+class Cart(DoubleIntegrator):
+    pass
+
+class Quiet(L.Callback):
+    pass
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Two modules, `named` and `trap`, that leave a mark where they are imported."""
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("named", "trap"):
+        (tmp_path / f"{name}.py").write_text(PART.format(mark=str(tmp_path / f"{name} imported")))
+    yield lambda name: (tmp_path / f"{name} imported").exists()
+    for name in ("named", "trap"):
+        sys.modules.pop(name, None)
+
+
+def rewrite(checkpoint, **sections):
+    """Give the config of a checkpoint other sections, as a file from elsewhere may have them."""
+    content = read_checkpoint(checkpoint)
+    content[KEY]["config"].update(sections)
+    write_checkpoint(content, checkpoint)
+
+
+TRAPS = {
+    "its system": {"system": {"name": "trap:Cart", "parameters": {}}},
+    "its callbacks": {"callbacks": ["trap:Quiet"]},
+}
+
+
+@pytest.fixture
+def undecided(monkeypatch):
+    """A sound claim that takes no time and proves nothing."""
+    monkeypatch.setattr(
+        sound_certificate, "sound_certificate", lambda controller, *_: claimed(best(Path()), controller=controller)
+    )
+    monkeypatch.setattr("lyapnet.certification.tables.certificate_table", lambda *_: "")
+    monkeypatch.setattr(SoundCertificate, "numbers", lambda self: {"system": type(self.controller.system).__name__})
+
+
+@pytest.mark.parametrize("what", TRAPS)
+def test_refining_imports_nothing_that_a_checkpoint_names(what, run, own, undecided, capsys):
+    rewrite(best(run), **TRAPS[what])
+    for command in ([], ["callbacks=[named:Quiet]"] if what == "its system" else ["--system=named:Cart"]):
+        assert main(["certify", "sound", str(best(run)), *FEW, "--refine=1", *command]) == 2
+        printed = capsys.readouterr().err.splitlines()
+        assert "Expected" in printed[-1]
+        assert "trap:" in printed[-1]
+        assert not list(run.glob("refine_*"))
+    assert not own("trap")
+
+
+@pytest.mark.parametrize("what", TRAPS)
+def test_refining_trains_with_what_the_command_names(what, run, own, undecided, capsys):
+    rewrite(best(run), **TRAPS[what])
+    capsys.readouterr()
+    command = ["--system=named:Cart"] if what == "its system" else ["callbacks=[named:Quiet]"]
+    assert main(["certify", "sound", str(best(run)), *FEW, "--refine=1", "--json", *command]) == 0
+    assert own("named")
+    assert not own("trap")
+    config = load_config(run / "refine_1/config.yaml")
+    assert (config.system.name, config.callbacks) in [("named:Cart", []), ("double_integrator", ["named:Quiet"])]
+    assert json.loads(capsys.readouterr().out)["system"] == ("Cart" if what == "its system" else "DoubleIntegrator")
+
+
+@pytest.mark.parametrize("what", TRAPS)
+def test_a_round_that_lies_there_is_trained_with_nothing_that_it_names(what, run, own, undecided, capsys, monkeypatch):
+    """Its config came with the folder."""
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment, "fit", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            refine(run)
+    path = run / "refine_1/config.yaml"
+    path.write_text(OmegaConf.to_yaml({**OmegaConf.load(path), **TRAPS[what]}))
+    assert main(["certify", "sound", str(best(run)), *FEW, "--refine=1"]) == 2
+    assert "trap:" in capsys.readouterr().err.splitlines()[-1]
+    assert not own("trap")
+
+
+def test_parts_from_python_are_trained_with(run):
+    """Also where their class cannot be imported; and their name stands in for what the checkpoint said."""
+
+    class Heavy(lyapnet.systems.DoubleIntegrator):
+        pass
+
+    rewrite(best(run), system={"name": "trap:Cart", "parameters": {}})
+    system = Heavy(mass=2.0)
+
+    def certified(checkpoint):
+        return claimed(checkpoint, controller=lyapnet.load(checkpoint, system=system))
+
+    with pytest.raises(UsageError, match="trap:Cart"):
+        refinement.refine(best(run), certified, 1, FEW, Console(quiet=True))
+    shutil.rmtree(run / "refine_1")
+    checkpoint, _ = refinement.refine(best(run), certified, 1, FEW, Console(quiet=True), Parts(system=system))
+    assert load_config(run / "refine_1/config.yaml").system.name.endswith("Heavy")
+    with pytest.raises(UsageError, match="Heavy"):
+        lyapnet.load(checkpoint)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ class EvaluationConfig:
 class Config:
     """One experiment."""
 
-    experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.")
+    experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
     logs: str = option("logs", "The folder of all runs.")
     seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0)
     seeds: int = option(1, "Runs trained together as one batch, with the seeds seed, seed + 1, …", at_least=1)

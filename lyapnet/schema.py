@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import math
 import operator
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
@@ -22,13 +23,19 @@ def option(
     *,
     choices: Sequence[str] = (),
     user_class: bool = False,
+    folder: bool = False,
     above: float | None = None,
     at_least: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A field with its sentence and the values it admits; `user_class` also admits module:Class."""
+    """A field with its sentence and the values it admits.
+
+    Args:
+        user_class: module:Class is admitted too.
+        folder: it names a folder within another one, which it must not leave.
+    """
     bounds = {">": above, "≥": at_least, "<": below}
-    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "bounds": bounds}
+    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "folder": folder, "bounds": bounds}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=rule)
     return field(default=default, metadata=rule)
@@ -74,7 +81,11 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
     try:
         layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
         for layer in layers:
-            _refuse_unknown_keys(OmegaConf.to_container(layer, resolve=False), schema, "")
+            given: Any = OmegaConf.to_container(layer, resolve=False)
+            _refuse_unknown_keys(given, schema, "")
+            for f in dataclasses.fields(schema):  # pyright: ignore
+                if f.metadata.get("folder") and re.search(r"\$\{[^}]*:", str(given.get(f.name, ""))):
+                    raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
         merged = OmegaConf.merge(OmegaConf.structured(schema), *layers)
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
@@ -163,6 +174,10 @@ def check_values(config: Any, prefix: str = "") -> None:
 
 
 def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
+    if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
+        raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; {rule['doc']}")
+    if isinstance(value, str) and any(character < " " for character in value):
+        raise UsageError(f"Expected {key} without control characters, got {value!r}; {rule['doc']}")
     choices = rule["choices"]
     if choices and isinstance(value, list):
         for entry in value:

@@ -103,6 +103,24 @@ MISTYPED = {
     "horizon.steps=${nothing}": ("horizon.steps", "nothing"),
 }
 OUT_OF_RANGE = {
+    **{
+        f"experiment={name}": ("experiment", name)
+        for name in (
+            "..",
+            "../..",
+            "/tmp/elsewhere",
+            ".",
+            "a//b",
+            "a/",
+            "a/../../b",
+            "./a",
+            "${oc.env:HOME}",
+        )
+    },
+    "experiment=''": ("experiment", "''"),
+    r"experiment='a\..'": ("experiment", r"a\\.."),
+    'experiment="a\\nb"': ("experiment", r"a\nb"),
+    'experiment="a\\0b"': ("experiment", r"a\x00b"),
     "horizon.dt=-0.01": ("horizon.dt", "> 0", "-0.01"),
     "horizon.dt=0": ("horizon.dt", "> 0"),
     "horizon.dt=.nan": ("horizon.dt", "nan"),
@@ -231,6 +249,19 @@ def test_bad_file_is_refused(name, outcomes):
 
 def test_without_bad_values_the_config_trains(outcomes):
     assert outcomes[""] == [0, "", True]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("paper/reacher", "paper/reacher"), ("a b", "a b"), ("${system.name}", "double_integrator")]
+)
+def test_names_of_experiments_within_the_folder_of_all_runs_are_taken(name, expected, plain):
+    plain["experiment"] = name
+    assert config_from_plain(plain).experiment == expected
+
+
+def test_control_characters_in_paths_are_refused(plain):
+    with pytest.raises(UsageError, match=r"^Expected logs without control characters, got 'a\\x00b'"):
+        config_from_plain({**plain, "logs": "a\0b"})
 
 
 @pytest.mark.parametrize("override", ["horizon.stepz=5", "horizon.dt=-1", "cost.R=[-1]", "cost.R=[1, 1]"])

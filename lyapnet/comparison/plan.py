@@ -42,7 +42,7 @@ class ComparedTask:
 class ComparisonConfig:
     """One comparison: every method on every task, from several seeds."""
 
-    comparison: str = option("compare", "Its name: everything goes to <logs>/<comparison>.")
+    comparison: str = option("compare", "Its name: everything goes to <logs>/<comparison>.", folder=True)
     logs: str = option("logs", "The folder of all runs.")
     methods: list[str] = option(list(METHODS), "What is compared.")
     seeds: int = option(5, "Seeds of lyapnet: 0, 1, …", at_least=1)

@@ -12,6 +12,7 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from lyapnet.errors import Interrupted
 from lyapnet.training.modules import labelled
+from lyapnet.training.runs import Run
 
 
 class Checkpoints(Checkpoint):
@@ -53,7 +54,7 @@ class Checkpoints(Checkpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
-        if not self.last.parents[1].is_dir():  # writing would make a new one, without what makes it a run
+        if not Run(self.last.parents[1]).exists:  # writing would make another folder
             raise FileNotFoundError(self.last.parents[1])
         if step % self.every == 0 or step == trainer.max_epochs:
             self._save_best(trainer, pl_module)

@@ -77,7 +77,7 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         try:
             return _fit(plan, console, again)
         except Exception as error:
-            if plan.run.folder.is_dir():
+            if plan.run.exists:
                 raise
             raise LyapnetError(
                 f"Expected the folder of the run that trains, got none at {str(plan.run.folder)!r}, which was removed "
@@ -103,7 +103,7 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         kept = f" Kept: {run.last}." if run.last.exists() else ""
         raise DivergenceError(f"{error}{kept}") from error
     finally:
-        if trainer.is_global_zero and run.folder.is_dir():
+        if trainer.is_global_zero and run.exists:
             _note_what_it_took(run, time.perf_counter() - started)
     return _finish(trainer, plan, console) if trainer.is_global_zero else {}
 

@@ -17,7 +17,7 @@ from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
 from lyapnet.training.run_lock import RunLock
-from lyapnet.training.runs import CONFIG, LAST, PROVENANCE, Run, is_further_process, last_run, new_run
+from lyapnet.training.runs import CONFIG, LAST, Run, is_further_process, last_run, new_run
 from lyapnet.training.trainer_options import check_trainer_options
 
 CHANGEABLE_ON_RESUME = (
@@ -79,7 +79,7 @@ def plan_run(
         return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
-    if not (run.folder / PROVENANCE).is_file():
+    if not run.exists:
         read_checkpoint(checkpoint)
         raise UsageError(f"Expected a checkpoint in its run's folder, got {resume!r}; start a new run with --finetune.")
     with ExitStack() as stack:

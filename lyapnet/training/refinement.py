@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from lyapnet.build import Parts
+from lyapnet.build import Parts, require_parts
 from lyapnet.certification import DecreaseCondition, violations
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
@@ -91,6 +91,7 @@ def _finished_run(folder: Path) -> Run | None:
 def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[str], parts: Parts) -> None:
     """Write what a round trains on, and its config last."""
     controller = certificate.controller
+    require_parts(controller.config, parts, folder.parent)
     _require_named_callbacks(controller.config, overrides)
     folder.mkdir(parents=True, exist_ok=True)
     config = to_plain(controller.config)

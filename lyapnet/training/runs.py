@@ -32,6 +32,11 @@ class Run:
     folder: Path
 
     @property
+    def exists(self) -> bool:
+        """Whether there is such a run."""
+        return (self.folder / PROVENANCE).is_file()
+
+    @property
     def checkpoints(self) -> Path:
         """Where last.ckpt and best.ckpt are."""
         return self.folder / "checkpoints"

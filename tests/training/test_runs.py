@@ -1,7 +1,9 @@
 """Training as a user meets it: killed, interrupted, resumed, fine-tuned, failed, and what it shows meanwhile."""
 
 import csv
+import ctypes
 import functools
+import io
 import json
 import math
 import os
@@ -9,9 +11,13 @@ import random
 import resource
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import threading
 import time
+import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -23,13 +29,16 @@ import lyapnet
 from lyapnet.build import build_problem, build_value_function
 from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
-from lyapnet.config import load_config
+from lyapnet.config import config_from_plain, load_config
 from lyapnet.controller import Controller, load_value_function
-from lyapnet.errors import UsageError
+from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.networks import FCN
 from lyapnet.random_streams import VALIDATION, stream
 from lyapnet.systems import DoubleIntegrator
 from lyapnet.training import loggers, metrics_file
+from lyapnet.training.plan import plan_run
+from lyapnet.training.run_lock import RunLock
+from lyapnet.training.runs import new_run
 from tests.runs import (
     MEASURED_TIME,
     SMALL,
@@ -437,6 +446,207 @@ def test_truncated_last_checkpoint_is_refused_and_the_best_one_loads(finished, a
     assert message.count("\n") == 1
     assert "last.ckpt" in message
     lyapnet.load(finished.run / "checkpoints" / "best.ckpt")
+
+
+# A last checkpoint that is lost
+
+
+LOSSES = {
+    "missing": lambda last: last.unlink(),
+    "a loop": lambda last: (last.unlink(), last.symlink_to(last)),
+    "a dangling link": lambda last: (last.unlink(), last.symlink_to("nowhere")),
+    "empty": lambda last: last.write_bytes(b""),
+    "a folder": lambda last: (last.unlink(), last.mkdir()),
+    "flipped": lambda last: last.write_bytes(flipped(last.read_bytes())),
+}
+
+
+def flipped(whole):
+    """With one bit of its largest tensor changed."""
+    with zipfile.ZipFile(io.BytesIO(whole)) as archive:
+        largest = max((e for e in archive.infolist() if "/data/" in e.filename), key=lambda e: e.file_size)
+        place = whole.index(archive.read(largest))
+    return whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :]
+
+
+def contents(folder):
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("kept", ["everything", "no evaluation", "no best", "only the event files"])
+def test_without_its_last_checkpoint_a_run_is_not_begun_again(loss, kept, finished, ask):
+    if kept in ("no evaluation", "only the event files"):
+        (finished.run / "evaluation.json").unlink()
+    if kept in ("no best", "only the event files"):
+        finished.best().unlink()
+    LOSSES[loss](finished.last)
+    before = contents(finished.run)
+    status, _, message = ask(finished, "--resume", "last", "training.iterations=40")
+    assert status in (1, 2)
+    assert message.count("\n") == 1
+    assert "last.ckpt" in message
+    assert (f"--resume {finished.best().relative_to(finished.folder)}" in message) is finished.best().exists()
+    assert contents(finished.run) == before
+
+
+def test_run_of_version_0_1_is_not_begun_again_where_a_best_checkpoint_is(finished, ask):
+    """Its record does not say whether the last one was written."""
+    record = finished.run / "run.json"
+    record.write_text(json.dumps({k: v for k, v in json.loads(record.read_text()).items() if k != "saved"}))
+    (finished.run / "evaluation.json").unlink()
+    finished.last.unlink()
+    status, _, message = ask(finished, "--resume", "last")
+    assert status == 2
+    assert "best.ckpt" in message
+
+
+def test_from_its_best_checkpoint_a_run_goes_on_to_the_same_end(desk, reference):
+    prepare = functools.partial(both, without_figures, functools.partial(dies_at, MODULE, "training_step", 13))
+    assert desk.train(prepare=prepare)[0] == -signal.SIGKILL
+    desk.last.unlink()
+    assert desk.train("--resume", "last", prepare=without_figures)[0] == 2
+    assert desk.train("--resume", str(desk.best()), prepare=without_figures)[0] == 0
+    assert_same_end(desk, reference, pictures=False)
+
+
+RECORDS = {
+    "garbage": "{",
+    "empty": "",
+    "a list": "[]",
+    "not text": "\udcff",
+    "deep": "[" * 100_000,
+    "no origin": '{"compiled": false}',
+    "another origin": '{"finetuned_from": 3}',
+    "another kind": '{"finetuned_from": null, "saved": "yes"}',
+    "seconds": '{"finetuned_from": null, "training_seconds": "many"}',
+}
+
+
+@pytest.mark.parametrize("record", RECORDS)
+def test_record_that_was_damaged_is_one_line(record, finished, ask):
+    (finished.run / "run.json").write_bytes(RECORDS[record].encode(errors="surrogateescape"))
+    before = contents(finished.run)
+    status, _, message = ask(finished, "--resume", "last", "training.iterations=40")
+    assert status == 1
+    assert message.count("\n") == 1
+    assert "run.json" in message
+    assert "Traceback" not in message
+    assert contents(finished.run) == before
+
+
+def test_folders_that_are_numbered_otherwise_are_no_runs(finished, ask):
+    for name in ("version_²", "version_x", "version_-1", "version_"):
+        (finished.run.parent / name).mkdir()
+    (finished.run.parent / "version_7").touch()
+    assert ask(finished, "--resume", "last")[0] == 0
+
+
+# At the same time
+
+
+def test_run_in_progress_is_not_resumed_by_another_process(desk, ask):
+    process = desk.start("training.iterations=100000", prepare=without_figures)
+    desk.wait_for("step 5/", process)
+    for resume in ("last", str(desk.last), str(desk.best())):
+        status, _, message = ask(desk, "--resume", resume, "training.iterations=100001")
+        assert status == 2
+        assert message.count("\n") == 1
+        assert f"process {process.pid} on" in message
+    os.kill(process.pid, signal.SIGKILL)
+    desk.end(process)
+    content = read_checkpoint(desk.last)  # the lock went with the process
+    assert f"process {process.pid} on" in (desk.run / ".lock").read_text()
+    status, _, errors = desk.train("--resume", "last", f"training.iterations={content['global_step'] + 1}")
+    assert (status, errors) == (0, "")
+
+
+def test_of_two_that_resume_at_the_same_time_one_is_refused(finished, tmp_path):
+    (tmp_path / "other").mkdir()
+    desks = [finished, Desk(tmp_path / "other")]
+    (tmp_path / "other" / "logs").symlink_to(finished.folder / "logs")
+    arguments = ("--resume", "last", "training.iterations=300")
+    processes = [desk.start(*arguments, prepare=without_figures) for desk in desks]
+    ends = [desk.end(process) for desk, process in zip(desks, processes, strict=True)]
+    (_, _, quiet), (_, _, refusal) = sorted(ends)
+    assert sorted(status for status, _, _ in ends) == [0, 2]
+    assert quiet == ""
+    assert refusal.count("\n") == 1
+    assert "is training" in refusal
+    assert [step for step, _ in logged(finished.run)["loss/train"]] == list(range(1, 301))
+
+
+def test_runs_that_start_at_the_same_time_have_folders_of_their_own(tmp_path):
+    config = config_from_plain({**SMALL, "logs": str(tmp_path)})
+    together = threading.Barrier(8)
+
+    def start(_):
+        together.wait()
+        run, lock = new_run(config, None)
+        return run.folder.name, lock
+
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(start, range(8)))
+    assert sorted(name for name, _ in found) == [f"version_{k}" for k in range(8)]
+    assert sorted(path.name for path in (tmp_path / "small").iterdir()) == [f"version_{k}" for k in range(8)]
+
+
+def test_further_process_of_a_run_is_not_refused(desk, monkeypatch):
+    config = config_from_plain({**SMALL, "logs": str(desk.folder)})
+    first = plan_run(config)
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    second = plan_run(config)
+    assert second.run == first.run
+    assert second.lock is None
+    assert plan_run(config, "last").run == first.run
+    monkeypatch.delenv("LOCAL_RANK")
+    with pytest.raises(UsageError, match=f"process {os.getpid()} on"):  # the twin
+        plan_run(config, "last")
+
+
+def test_lock_is_no_way_to_another_file(desk):
+    precious = desk.folder / "precious"
+    precious.write_text("kept")
+    (desk.folder / "run").mkdir()
+    (desk.folder / "run" / ".lock").symlink_to(precious)
+    with pytest.raises(LyapnetError, match="Expected a writable folder"):
+        RunLock(desk.folder / "run")
+    assert precious.read_text() == "kept"
+
+
+@pytest.mark.parametrize("removed", ["version_0", "small", "logs"])
+def test_folder_that_is_removed_while_it_trains_is_one_line(removed, desk):
+    process = desk.start("training.iterations=3000", "training.validate_every=50", prepare=without_figures)
+    desk.wait_for("step 50/", process)
+    shutil.rmtree({"version_0": desk.run, "small": desk.run.parent, "logs": desk.run.parent.parent}[removed])
+    status, _, errors = desk.end(process)
+    assert status == 1
+    assert errors.count("\n") == 1, errors
+    assert "removed" in errors
+    assert "logs/small/version_0" in errors
+
+
+def reads_only(folder):
+    """Make a folder and all in it read-only, for root too, who loses the right to pass over that."""
+    without_figures()
+    for path in (folder, *folder.rglob("*")):
+        path.chmod(path.stat().st_mode & ~0o222)
+    header, none = struct.pack("Ii", 0x20080522, 0), struct.pack("6I", *[0] * 6)
+    assert ctypes.CDLL(None, use_errno=True).capset(header, none) == 0
+
+
+def test_read_only_folders_are_one_line(finished):
+    before = contents(finished.run)
+    for arguments in (("--resume", "last", "training.iterations=40"), ()):
+        status, _, errors = finished.train(*arguments, prepare=functools.partial(reads_only, finished.folder / "logs"))
+        assert status == 1
+        assert errors.count("\n") == 1, errors
+        assert "Expected a writable folder" in errors
+        assert "logs/small" in errors
+    for path in (finished.folder / "logs", *(finished.folder / "logs").rglob("*")):
+        path.chmod(0o755)
+    assert contents(finished.run) == before
+    assert finished.runs == ["version_0"]
 
 
 # With classes of the user's own

@@ -78,24 +78,6 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
     return Parts(**{part: builders[part]() for part in names})
 
 
-def require_parts(config: Config, parts: Parts, origin: str | Path) -> None:
-    """Refuse a config that names a part which is not registered and was not passed: it would have to be imported.
-
-    Args:
-        origin: the file that the config comes from.
-
-    Raises:
-        UsageError: naming the part.
-    """
-    for part, (registry, _) in REGISTRIES.items():
-        name = getattr(config, part).name
-        if getattr(parts, part) is None and name not in registry:
-            raise UsageError(
-                f"Expected {part}=… for {str(origin)!r}, got none; it was trained with {name}, and loading a file "
-                f"never imports what the file names: pass {part}=… to load, or --{part} to the command."
-            )
-
-
 def build_problem(config: Config, parts: Parts | None = None) -> Problem:
     """The problem of a config, in its precision.
 

@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from lyapnet.build import (
+    REGISTRIES,
     Parts,
     build_problem,
     build_program,
     build_rollout,
     build_value_function,
     parameters_of,
-    require_parts,
 )
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
@@ -210,6 +210,21 @@ def load(
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
     return Controller(problem, V, build_rollout(config, problem, V), own, config)
+
+
+def require_parts(config: Config, parts: Parts, origin: str | Path) -> None:
+    """Refuse a config, of a file `origin`, that names a part which is neither registered nor passed: to be imported.
+
+    Raises:
+        UsageError: naming the part.
+    """
+    for part, (registry, _) in REGISTRIES.items():
+        name = getattr(config, part).name
+        if getattr(parts, part) is None and name not in registry:
+            raise UsageError(
+                f"Expected {part}=… for {str(origin)!r}, got none; it was trained with {name}, and loading a file "
+                f"never imports what the file names: pass {part}=… to load, or --{part} to the command."
+            )
 
 
 def config_of(content: dict[str, Any], path: str | Path) -> Config:

@@ -36,28 +36,17 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
         raise
-    for other in path.parent.iterdir():
-        if other.name.startswith(prefix) and other.suffix == ".tmp" and not _runs(other.name.split(".")[-3]):
+    for other in [other for other in path.parent.iterdir() if other.name.startswith(prefix)]:
+        try:
+            os.kill(int(other.name.split(".")[-3]), 0)
+        except ProcessLookupError:
             other.unlink(missing_ok=True)
-
-
-def _runs(pid: str) -> bool:
-    """Whether there is a process of this number."""
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OverflowError, PermissionError):  # no number, or another user's
-        return True
-    return True
+        except (IndexError, ValueError, OverflowError, PermissionError):  # no such name, or another user's process
+            pass
 
 
 def digest_of_file(path: Path) -> str:
-    """The SHA-256 of a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """The SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

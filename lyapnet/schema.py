@@ -28,12 +28,8 @@ def option(
     at_least: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A field with its sentence and the values it admits.
-
-    Args:
-        user_class: module:Class is admitted too.
-        folder: it names a folder within another one, which it must not leave.
-    """
+    """A field with its sentence and the values it admits; `user_class` also admits module:Class, and `folder` only what
+    does not leave the folder that it is in."""
     bounds = {">": above, "≥": at_least, "<": below}
     rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "folder": folder, "bounds": bounds}
     if isinstance(default, list | dict):

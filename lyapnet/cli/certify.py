@@ -12,17 +12,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import (
-    Checkpoint,
-    Controls,
-    Cost,
-    Debug,
-    Network,
-    Program,
-    System,
-    load_controller,
-    parts_given,
-)
+from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
 from lyapnet.errors import UsageError
 
 DEFAULT = "statistical"
@@ -231,6 +221,7 @@ def sound(
         return certificate
 
     if refine:
+        from lyapnet.cli.options import parts_given
         from lyapnet.training.refinement import refine as train_on
 
         parts = parts_given(checkpoint, **own)

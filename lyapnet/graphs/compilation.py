@@ -100,11 +100,7 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
 
 
 def _require_own(path: Path) -> None:
-    """Refuse a folder or file of machine code that another user owns or may write.
-
-    Raises:
-        CompilationError: naming it.
-    """
+    """Refuse a folder or file of machine code that another user owns or may write."""
     facts = path.stat()
     if facts.st_uid != os.getuid() or facts.st_mode & 0o022:
         raise CompilationError(

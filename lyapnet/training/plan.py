@@ -8,10 +8,10 @@ from typing import Any
 import lightning as L
 import torch
 
-from lyapnet.build import Parts, parts_of, require_parts
+from lyapnet.build import Parts, parts_of
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
-from lyapnet.controller import config_of, load_value_function
+from lyapnet.controller import config_of, load_value_function, require_parts
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
@@ -28,10 +28,7 @@ CHANGEABLE_ON_RESUME = (
 
 @dataclass(frozen=True)
 class Plan:
-    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step.
-
-    The lock is held for `fit`, which releases it; a finished plan has none.
-    """
+    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step."""
 
     config: Config
     parts: Parts  # of the user's own
@@ -40,7 +37,7 @@ class Plan:
     run: Run
     resume_from: Path | None = None  # a checkpoint
     step: int = 0  # at which that was written
-    lock: RunLock | None = None  # on the folder; the first process has it
+    lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
 
     @property
     def finished(self) -> bool:
@@ -69,9 +66,8 @@ def plan_run(
     require_libraries(config.loggers)
     callbacks = build_callbacks(config)
     torch.set_num_threads(config.training.threads)  # compiled functions are kept for a number of threads
-    if parts is not None:
-        require_parts(config, parts, config.experiment)
     parts = parts_of(config) if parts is None else parts
+    require_parts(config, parts, config.experiment)
     module = build_module(config, parts)
     if not resume:
         _start_from(module, finetune)
@@ -93,7 +89,7 @@ def plan_run(
             plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
         if not plan.finished:
             stack.pop_all()
-    return plan
+        return plan
 
 
 def _read(checkpoint: Path, run: Run) -> dict[str, Any]:

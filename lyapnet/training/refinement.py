@@ -10,10 +10,11 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from lyapnet.build import Parts, require_parts
+from lyapnet.build import Parts
 from lyapnet.certification import DecreaseCondition, violations
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.controller import require_parts
 from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
 from lyapnet.random_streams import CERTIFICATION, stream

@@ -13,9 +13,6 @@ LOCK = ".lock"
 class RunLock:
     """Held from its making to the end of its `with`. The kernel releases that of a dead process: none is ever stale.
 
-    Args:
-        folder: of the run.
-
     Raises:
         UsageError: another process holds it; names that process.
         LyapnetError: the folder cannot be written.

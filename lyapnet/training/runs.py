@@ -74,16 +74,12 @@ class Run:
         return os.path.lexists(self.last) or self.finished or (self.best.exists() if saved is None else saved)
 
     def record(self) -> dict[str, Any]:
-        """What made the run, and what it took.
-
-        Raises:
-            LyapnetError: run.json cannot be read, or is another file.
-        """
+        """What made the run, and what it took."""
         path = self.folder / PROVENANCE
         record = {key: default for key, (_, default) in RECORDED.items()} | read_json(path, REPAIR)
         for key, (kinds, _) in RECORDED.items():
             if not isinstance(record[key], kinds):
-                got = "none" if record[key] is ... else repr(record[key])[:40]
+                got = repr(record[key])[:40].replace("Ellipsis", "none")
                 raise LyapnetError(f"Expected {key} in {str(path)!r}, got {got}; {REPAIR}.")
         return record
 
@@ -111,9 +107,7 @@ def is_further_process() -> bool:
 
 
 def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock | None]:
-    """A folder of its own that says what it is from its first moment on, so that a stopped run can always go on.
-
-    It is locked, and for a further process the newest run, without a lock.
+    """A folder that says what it is from its first moment on, so that a stopped run can always go on; and its lock.
 
     Raises:
         LyapnetError: it cannot be made.

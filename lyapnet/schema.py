@@ -172,7 +172,7 @@ def check_values(config: Any, prefix: str = "") -> None:
 def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
     if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
         raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; {rule['doc']}")
-    if isinstance(value, str) and any(character < " " for character in value):
+    if any(character < " " for character in (value if isinstance(value, str) else "")):
         raise UsageError(f"Expected {key} without control characters, got {value!r}; {rule['doc']}")
     choices = rule["choices"]
     if choices and isinstance(value, list):

@@ -175,7 +175,7 @@ def controller_cost(path, seed):
 
 def test_folder_of_an_ensemble(ensemble):
     assert {path.name for path in ensemble.run.iterdir()} == {
-        "config.yaml", "run.json", "evaluation.json", "checkpoints", *FOLDERS
+        ".lock", "config.yaml", "run.json", "evaluation.json", "checkpoints", *FOLDERS
     }  # fmt: skip
     assert [path.name for path in (ensemble.run / "checkpoints").iterdir()] == ["last.ckpt"]
     assert load_config(ensemble.run / "config.yaml").seeds == SEEDS

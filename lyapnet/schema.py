@@ -170,10 +170,7 @@ def check_values(config: Any, prefix: str = "") -> None:
 
 
 def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
-    if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
-        raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; {rule['doc']}")
-    if any(character < " " for character in (value if isinstance(value, str) else "")):
-        raise UsageError(f"Expected {key} without control characters, got {value!r}; {rule['doc']}")
+    _check_text(key, value, rule)
     choices = rule["choices"]
     if choices and isinstance(value, list):
         for entry in value:
@@ -191,3 +188,10 @@ def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
         for number in value if isinstance(value, list) else [value]:
             if not (holds[symbol](number, bound) and math.isfinite(number)):
                 raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")
+
+
+def _check_text(key: str, value: Any, rule: Mapping[str, Any]) -> None:
+    if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
+        raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; {rule['doc']}")
+    if isinstance(value, str) and any(character < " " for character in value):
+        raise UsageError(f"Expected {key} without control characters, got {value!r}; {rule['doc']}")

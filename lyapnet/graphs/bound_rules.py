@@ -40,7 +40,7 @@ def rule(*operators: Any) -> Callable[[Rule], Rule]:
 def _add(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     """x + αy."""
     if alpha != 1:
-        y = _multiply(y, alpha) if isinstance(y, TaylorForm) else y * alpha
+        y = _multiply(y, alpha) if isinstance(y, TaylorForm) else _tensor(y) * alpha
     if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
         return taylor.add(x, y)
     return taylor.shift(x, _tensor(y)) if isinstance(x, TaylorForm) else taylor.shift(y, _tensor(x))
@@ -49,7 +49,7 @@ def _add(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
 @rule(aten.sub.Tensor, aten.sub.Scalar)
 def _subtract(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     """x − αy."""
-    return _add(x, taylor.negate(y) if isinstance(y, TaylorForm) else -y, alpha)
+    return _add(x, taylor.negate(y) if isinstance(y, TaylorForm) else -_tensor(y), alpha)
 
 
 @rule(aten.rsub.Scalar, aten.rsub.Tensor)
@@ -85,7 +85,7 @@ def _power(x: TaylorForm, exponent: float) -> Any:
         return functions.reciprocal(_power(x, -exponent))
     if exponent == 0.5:
         return functions.sqrt(x)
-    if exponent != int(exponent):
+    if not float(exponent).is_integer():
         raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
     if exponent == 1:
         return x
@@ -117,10 +117,8 @@ def _dot(x: Any, y: Any) -> TaylorForm:
 
 
 @rule(aten._to_copy.default)
-def _to_copy(x: TaylorForm, dtype: Any = None, **keywords: Any) -> TaylorForm:
-    """x: truths as numbers, in float64."""
-    if dtype not in (None, torch.float64):
-        raise UsageError(f"Expected float64 throughout, got {dtype} in between; leave the dtype to follow the input.")
+def _to_copy(x: TaylorForm, **keywords: Any) -> TaylorForm:
+    """x: truths as numbers; the gate refuses any dtype but float64."""
     return x
 
 
@@ -179,16 +177,16 @@ def _tanh(x: TaylorForm) -> TaylorForm:
 
 @rule(aten.softplus.default)
 def _softplus(x: TaylorForm, beta: float = 1, threshold: float = 20) -> TaylorForm:
-    """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is lower by at most e^{−threshold}/β."""
-    smooth = _divide(functions.softplus(_multiply(x, beta) if beta != 1 else x), beta)
-    return _loosened_above(smooth, x, beta, threshold, 1 / beta)
+    """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is off by at most e^{−threshold}/|β|."""
+    y = _multiply(x, beta) if beta != 1 else x
+    return _loosened_above(_divide(functions.softplus(y), beta), y, threshold, 1 / abs(beta))
 
 
 @rule(aten.softplus_backward.default)
 def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: float) -> TaylorForm:
     """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
-    slope = functions.sigmoid(_multiply(x, beta) if beta != 1 else x)
-    return _multiply(gradient, _loosened_above(slope, x, beta, threshold, 1.0))
+    y = _multiply(x, beta) if beta != 1 else x
+    return _multiply(gradient, _loosened_above(functions.sigmoid(y), y, threshold, 1.0))
 
 
 @rule(aten.silu.default)
@@ -216,9 +214,10 @@ def _tanh_backward(gradient: Any, y: TaylorForm) -> TaylorForm:
     return _multiply(gradient, _subtract(1.0, functions.square(y)))
 
 
-def _loosened_above(y: TaylorForm, x: TaylorForm, beta: float, threshold: float, factor: float) -> TaylorForm:
-    above = x.interval()[1] * beta > threshold
-    return y.with_parts(y.terms, y.radius + above * (factor * torch.exp(torch.tensor(-threshold, dtype=torch.float64))))
+def _loosened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
+    """The form with room for factor · e^{−threshold}, and its rounding, where y may exceed the threshold."""
+    room = 1.001 * factor * torch.exp(-_tensor(threshold))
+    return smooth.with_parts(smooth.terms, smooth.radius + torch.where(y.interval()[1] > threshold, room, 0.0))
 
 
 # Arrangements: entries copied, moved or left out, without arithmetic
@@ -286,8 +285,20 @@ def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
     return taylor.add(x, moved)
 
 
-SUMS = (_add, _index_add)
-"""The rules that read truths as numbers; torch reads 1 + 1 as true."""
+@rule(aten.index_put.default)
+def _index_put(x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> TaylorForm:
+    """x with the values added to its entries at some indices, as the derivative of an indexing is written."""
+    if not accumulate:
+        raise UsageError("Expected values that are added to entries, got entries that are replaced; use torch.where.")
+    like = x if isinstance(x, TaylorForm) else values
+    x, values = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, values))
+    values = values.rounded(values.shape.numel())
+    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_put(indices, y, accumulate=True), x, values)
+    return taylor.add(x, moved)
+
+
+OF_TRUTHS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
+"""The operators whose rules hold for truths as results too: 1 · 0 is a conjunction, 1 + 1 is not a truth."""
 
 
 def _of_shape(operation: Any) -> Rule:
@@ -311,4 +322,4 @@ def _unsqueezed(x: Any, axis: int) -> Any:
 
 
 def _tensor(number: Any) -> Tensor:
-    return torch.as_tensor(number).to(torch.float64)
+    return torch.as_tensor(number, dtype=torch.float64)

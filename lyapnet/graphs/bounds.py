@@ -3,7 +3,10 @@
 The function is the one that training and control use, traced at one point (t, x). What is done with each operator is in
 lyapnet.graphs.bound_rules; an operator without a rule is refused by name. The arithmetic of forms, and what is covered
 of rounding, is in lyapnet.graphs.taylor. Numbers that do not depend on the point (weights, W → softplus(W), a constant
-mass matrix) are computed once, in float64: bounds are those of the function with these numbers.
+mass matrix) are computed once, by torch: bounds are those of the function with these numbers.
+
+Every operator passes one gate, _apply. What depends on the point stays in float64, or is a truth: torch would round it
+in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the shape that the trace recorded.
 """
 
 import hashlib
@@ -17,7 +20,7 @@ from torch.utils._pytree import tree_map
 
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.graphs import taylor
-from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES, SUMS
+from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
 from lyapnet.graphs.simplification import with_known_truths, without_copies
 from lyapnet.graphs.taylor import TaylorForm, box_form
 from lyapnet.graphs.tracing import trace
@@ -91,7 +94,9 @@ class BoundedFunction:
         found = hashlib.sha256(str(self._graph.graph).encode())
         for node in self._nodes:
             if node.op == "get_attr":
-                found.update(self._constants[node].contiguous().numpy().tobytes())
+                value = self._constants[node]
+                found.update(f"{value.dtype} {tuple(value.shape)}".encode())
+                found.update((value.double() if value.is_floating_point() else value).contiguous().numpy().tobytes())
         return found.hexdigest()
 
     def bounds(self, lower: Corners, upper: Corners) -> list[tuple[OnBoxes, OnBoxes]]:
@@ -107,29 +112,57 @@ class BoundedFunction:
         self._constants: dict[Node, Any] = {}
         for node in self._nodes:
             if node.op == "get_attr":
-                value = _attribute(self._graph, str(node.target))
-                self._constants[node] = value.double() if value.is_floating_point() else value
+                self._constants[node] = _attribute(self._graph, str(node.target))
             elif node.op == "call_function" and all(source in self._constants for source in node.all_input_nodes):
                 arguments, keywords = _values(node, self._constants)
                 self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
 
 
 def _apply(node: Node, values: dict[Node, Any]) -> Any:
+    """What the node's operator makes of its arguments, by its rule where one of them depends on the point.
+
+    Raises:
+        UsageError: the operator has no rule; or its rule does not cover these arguments, or this result.
+    """
     arguments, keywords = _values(node, values)
-    if not any(isinstance(values[source], TaylorForm | list) for source in node.all_input_nodes):
-        return node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
-    found = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
-    if found is None or (found in SUMS and _of_truths(node)):
+    rule = node.target
+    if any(isinstance(values[source], TaylorForm | list) for source in node.all_input_nodes):
+        rule = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
+    if rule is None:
         raise UsageError(
             f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
             "lyapnet.graphs.bound_rules.RULES."
         )
-    return found(*arguments, **keywords)
+    try:
+        result = rule(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+    except LyapnetError:
+        raise
+    except Exception as error:
+        raise UsageError(
+            f"Expected arguments that the rule for bounds of {node.target} covers, got {' '.join(str(error).split())}; "
+            "write it with other operators."
+        ) from error
+    recorded = node.meta.get("val")
+    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # constant: of the shape of its argument alone
+        return result.to(recorded.dtype)
+    for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
+        if isinstance(form, TaylorForm):
+            _require_covered(node.target, form, value)
+    return result
 
 
-def _of_truths(node: Node) -> bool:
-    """Whether torch reads 1 + 1 as true there."""
-    return getattr(node.meta.get("val"), "dtype", None) == torch.bool
+def _require_covered(target: Any, form: TaylorForm, value: Tensor) -> None:
+    """Refuse bounds of other numbers than torch computes there."""
+    if value.dtype != torch.float64 and not (value.dtype == torch.bool and target in OF_TRUTHS):
+        raise UsageError(
+            f"Expected operators with a rule for bounds, got {target} in {value.dtype}; stay in x.dtype, to which "
+            "truths convert."
+        )
+    if form.shape != value.shape:
+        raise UsageError(
+            f"Expected a result of shape {tuple(value.shape)}, got bounds of {tuple(form.shape)} from {target}; write "
+            "it with other operators."
+        )
 
 
 def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:

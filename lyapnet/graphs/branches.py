@@ -154,7 +154,7 @@ def _forms(*values: Any) -> list[TaylorForm]:
     """Constants as forms, beside forms."""
     like = next(value for value in values if isinstance(value, TaylorForm))
     return [
-        value if isinstance(value, TaylorForm) else constant_form(torch.as_tensor(value).to(like.radius), like)
+        value if isinstance(value, TaylorForm) else constant_form(torch.as_tensor(value, dtype=torch.float64), like)
         for value in values
     ]
 
@@ -170,7 +170,7 @@ def threshold_backward(gradient: Any, x: Any, threshold: float) -> TaylorForm:
 def leaky_relu_backward(gradient: Any, x: Any, negative_slope: float, self_is_result: bool) -> TaylorForm:
     """The gradient where x > 0, else a multiple of it."""
     gradient, x = _forms(gradient, x)
-    return where(positive(x), gradient, taylor.scale(gradient, torch.as_tensor(negative_slope).to(x.radius)))
+    return where(positive(x), gradient, taylor.scale(gradient, torch.as_tensor(negative_slope, dtype=torch.float64)))
 
 
 KINKS: dict[Any, Callable[..., TaylorForm]] = {

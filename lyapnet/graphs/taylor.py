@@ -154,8 +154,8 @@ def interval_form(lower: Corners, upper: Corners) -> TaylorForm:
 def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
     """A value that is the same everywhere, beside the forms of `like`."""
     boxes = len(like.radius)
-    center = value.expand(boxes, *value.shape)
-    coefficients = torch.zeros(len(like.terms) - 1, *center.shape, dtype=value.dtype)
+    center = value.to(like.radius.dtype).expand(boxes, *value.shape)
+    coefficients = torch.zeros(len(like.terms) - 1, *center.shape, dtype=center.dtype)
     return like.with_parts(torch.cat([center[None], coefficients]), torch.zeros_like(center))
 
 

@@ -17,7 +17,7 @@ from lyapnet.graphs.bounds import BoundedFunction
 aten = torch.ops.aten
 AXES = 3
 WIDTHS = (2.0, 0.5, 0.1, 1e-2, 1e-3, 1e-5)
-INDEX = torch.tensor([2, 0])
+INDEX, TWICE = torch.tensor([2, 0]), torch.tensor([2, 2])
 
 CASES = {
     aten.relu.default: lambda y, z, M, N: aten.relu(y),
@@ -98,6 +98,7 @@ CASES = {
     aten.sigmoid_backward.default: lambda y, z, M, N: aten.sigmoid_backward(z, y),
     aten.tanh_backward.default: lambda y, z, M, N: aten.tanh_backward(z, y),
     aten.index_add.default: lambda y, z, M, N: aten.index_add(y, 0, INDEX, z[:2]),
+    aten.index_put.default: lambda y, z, M, N: aten.index_put(y, [TWICE], M[0, :2] * z[:2], True),
     **{
         operation: lambda y, z, M, N, operation=operation, extra=extra: operation(y, *extra) * z + y
         for operation, extra in {

@@ -1,11 +1,13 @@
 """The condition that a sound certificate proves, as a function of (t, x)."""
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 
-from lyapnet.calculus import time_derivative
+from lyapnet.calculus import ValueFunction, gradients, time_derivative
 from lyapnet.errors import UsageError
+from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.rollout import ClosedLoop
-from lyapnet.types import PerState, State, Time
+from lyapnet.types import Corner, PerState, State, Time
 
 
 class DecreaseCondition(nn.Module):
@@ -34,3 +36,61 @@ class DecreaseCondition(nn.Module):
     def height(self, t: Time, x: State) -> PerState:
         """W(t, x) = V(t, x) − δt: where c ≤ 0, Ẇ ≤ −αℓ ≤ 0, so that sublevel sets of W hold what starts in them."""
         return self.V(t, x) - self.delta * t
+
+
+class OwnOperations(ValueFunction):
+    """V at one (t, x) as the torch operations that it runs: its gradient is theirs, by torch's derivative of each.
+
+    What V says of its gradient has no say here: an autograd.Function with another backward pass, hooks, `detach` and
+    `no_grad` leave no trace among the operations of V itself, and `value_and_state_gradient` is not asked.
+    """
+
+    def __init__(self, V: ValueFunction, domain: tuple[Corner, Corner]):
+        super().__init__()
+        self.graph = BoundedFunction(lambda t, x: (V(t, x),), domain).graph
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.graph(t, x)[0]
+
+
+def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
+    """(c, W) with bounds on boxes, where the V_t and V_x of V̇ are those of V's own operations.
+
+    So c ≤ 0 proves that V falls, whatever gradient V declares; the control law is the one that runs.
+    """
+    declared = condition.V
+    try:
+        condition.V = OwnOperations(declared, domain)
+        return BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
+    finally:
+        condition.V = declared
+
+
+def require_own_gradient(V: ValueFunction, domain: tuple[Corner, Corner], points: int = 500) -> None:
+    """Refuse a V that declares another gradient than that of its own operations: training and control would use it.
+
+    The difference of the two is bounded, rounding included, at random points of the domain. What differs nowhere but
+    in a small part of the domain can escape; a proof does not rest on this check, but on bounded_condition.
+
+    Raises:
+        UsageError: the bounds at a point exclude 0.
+    """
+    own = OwnOperations(V, domain)
+
+    def difference(t: Time, x: State) -> tuple[Tensor, Tensor, Tensor]:
+        (V_t, V_x), true = gradients(V, t, x), torch.hstack(gradients(own, t, x))
+        declared = torch.stack([torch.hstack([V_t, V_x]), torch.hstack([V_t, V.value_and_state_gradient(t, x)[1]])])
+        return declared - true, declared, true
+
+    (lower, upper), generator = domain, torch.Generator().manual_seed(0)
+    at = lower + (upper - lower) * torch.rand(points, len(lower), generator=generator, dtype=torch.float64)
+    (low, high), (declared, _), (true, _) = BoundedFunction(difference, domain, degree=1).bounds(at, at)
+    wrong = torch.nonzero((low > 0) | (high < 0)).tolist()
+    if wrong:
+        k, way, axis = wrong[0]
+        raise UsageError(
+            f"Expected a V whose gradient is its derivative, got ∂V/∂{f'x[{axis - 1}]' if axis else 't'} = "
+            f"{float(declared[k, way, axis]):.6g} where V's own operations give {float(true[k, axis]):.6g}, at "
+            f"(t, x) = {[round(y, 6) for y in at[k].tolist()]}; mend its backward pass, detach, hooks or "
+            "value_and_state_gradient."
+        )

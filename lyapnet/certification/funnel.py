@@ -11,10 +11,10 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
-from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.condition import DecreaseCondition, bounded_condition, require_own_gradient
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.ignorable_states import ignorable_states
-from lyapnet.certification.proof import Progress, bounded_condition, prove
+from lyapnet.certification.proof import Progress, prove
 from lyapnet.certification.verdict import Verdict
 from lyapnet.contracts import check_function
 from lyapnet.errors import UsageError
@@ -126,6 +126,7 @@ def sound_claim(
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
     _check_states(condition, domain)
+    require_own_gradient(condition.V, domain)
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))

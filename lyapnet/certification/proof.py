@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import Budget, Question, Search, axis_to_cut, just_below
-from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
 from lyapnet.certification.kept_proofs import KeptProof, Unfinished
 from lyapnet.certification.verdict import Verdict
@@ -106,11 +106,6 @@ def prove(
     proved = -torch.inf if question.settled else min(question.level, just_below(search.least))
     remaining = float(search.frontier.volumes(lower, upper).sum())
     return Proof(proved, wanted, question.worst, search.boxes, seconds, remaining, search.frontier.center[:KEPT])
-
-
-def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
-    """(c, W), with bounds on boxes."""
-    return BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
 
 
 @dataclass

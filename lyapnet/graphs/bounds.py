@@ -38,6 +38,9 @@ class BoundedFunction:
         sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
         degree: of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
 
+    Attributes:
+        graph: the function as its torch operations, at one (t, x).
+
     Raises:
         UsageError: the function cannot be traced; or it has an operator without a rule, which is named.
     """
@@ -54,7 +57,7 @@ class BoundedFunction:
         share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            self._graph = trace(function, first, others)
+            self.graph = trace(function, first, others)
         except LyapnetError as error:
             raise UsageError(str(error)) from error
         except Exception as error:
@@ -62,7 +65,7 @@ class BoundedFunction:
             raise UsageError(
                 f"Expected f, g, the cost and V in torch operations, each state's result its own, got {line}"
             ) from error
-        self._nodes = list(with_known_truths(without_copies(self._graph.graph)).nodes)
+        self._nodes = list(with_known_truths(without_copies(self.graph.graph)).nodes)
         self._fold_constants()
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
         self.forms(lower[None], upper[None])  # an operator without a rule is found here
@@ -91,7 +94,7 @@ class BoundedFunction:
     @property
     def fingerprint(self) -> str:
         """A hash of the function: its operations and every number in them."""
-        found = hashlib.sha256(str(self._graph.graph).encode())
+        found = hashlib.sha256(str(self.graph.graph).encode())
         for node in self._nodes:
             if node.op == "get_attr":
                 value = self._constants[node]
@@ -112,7 +115,7 @@ class BoundedFunction:
         self._constants: dict[Node, Any] = {}
         for node in self._nodes:
             if node.op == "get_attr":
-                self._constants[node] = _attribute(self._graph, str(node.target))
+                self._constants[node] = _attribute(self.graph, str(node.target))
             elif node.op == "call_function" and all(source in self._constants for source in node.all_input_nodes):
                 arguments, keywords = _values(node, self._constants)
                 self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]

@@ -8,7 +8,7 @@ import torch
 from lyapnet.bench.conditions import Bounded, condition_of_chain
 from lyapnet.bench.enclosures import ENCLOSURES, Enclosure, enclosure
 from lyapnet.certification import Budget, prove
-from lyapnet.certification.branch_and_bound import Boxes
+from lyapnet.certification.boxes import single
 
 CERTIFIER = "certifier"
 METHODS = (CERTIFIER, *ENCLOSURES)
@@ -60,7 +60,7 @@ def bisect(case: Bounded, enclose: Enclosure, budget: Budget) -> tuple[str, int]
     Nothing of what the certifier adds: no search beyond the middles of boxes, no choice of axis by remainder.
     """
     sides = torch.where(case.upper > case.lower, case.upper - case.lower, 1.0)
-    frontier = Boxes(case.lower[None], case.upper[None], torch.zeros(1, dtype=torch.float64))
+    frontier = single(case.lower, case.upper, 0.0)
     boxes = 0
     while len(frontier.key):
         if budget.spent(boxes):
@@ -72,6 +72,6 @@ def bisect(case: Bounded, enclose: Enclosure, budget: Budget) -> tuple[str, int]
         if (case.condition(center[:, 0], center[:, 1:]) > 0).any():
             return "falsified", boxes
         widths = (chunk.upper - chunk.lower) / sides
-        deeper = Boxes(chunk.lower, chunk.upper, widths.amax(-1))  # `first` takes smallest keys: depth first
+        deeper = chunk._replace(key=widths.amax(-1))  # `first` takes smallest keys: depth first
         frontier = frontier.joined(deeper.halves(widths.argmax(-1)))
     return "certified", boxes

@@ -4,17 +4,19 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Integer
 from torch import Tensor
 
 from lyapnet.types import Corner, Corners, PerBox
 
 
 class Boxes(NamedTuple):
-    """Boxes of (t, x), 1 + n axes each, time first, and a number for each by which they are sorted."""
+    """Boxes of (t, x), 1 + n axes each, time first, with a number for each by which they are sorted, and a name."""
 
     lower: Corners
     upper: Corners
     key: PerBox
+    node: Integer[Tensor, "boxes"]  # of the CutTree that it comes from
 
     def __getitem__(self, chosen: Tensor) -> "Boxes":  # pyright: ignore[reportIncompatibleMethodOverride]
         return Boxes(*(y[chosen] for y in tuple(self)))
@@ -50,16 +52,67 @@ class Boxes(NamedTuple):
         sides = torch.where(upper > lower, upper - lower, 1.0)
         return torch.where(upper > lower, (self.upper - self.lower) / sides, 1.0).prod(-1)
 
-    def halves(self, axis: Tensor) -> "Boxes":
-        """Each box cut in two in the middle of an axis of its own."""
+    def halves(self, axis: Tensor, cuts: Tensor | None = None) -> "Boxes":
+        """Each box cut in two in the middle of an axis of its own, by cuts of these numbers in a CutTree."""
         cut = torch.nn.functional.one_hot(axis, self.lower.shape[-1]).bool()
         lower, upper = torch.where(cut, self.center, self.lower), torch.where(cut, self.center, self.upper)
-        return Boxes(self.lower, upper, self.key).joined(Boxes(lower, self.upper, self.key))
+        first = self.node if cuts is None else 1 + 2 * cuts
+        return Boxes(self.lower, upper, self.key, first).joined(Boxes(lower, self.upper, self.key, first + 1))
+
+
+def roots(lower: Corners, upper: Corners, key: float = float("-inf")) -> Boxes:
+    """Boxes that no cut made."""
+    return Boxes(lower, upper, lower.new_full((len(lower),), key), torch.zeros(len(lower), dtype=torch.long))
 
 
 def single(lower: Corner, upper: Corner, key: float = float("-inf")) -> Boxes:
     """One box."""
-    return Boxes(lower[None], upper[None], lower.new_full((1,), key))
+    return roots(lower[None], upper[None], key)
+
+
+class CutTree:
+    """How one box was cut in two, again and again: cut k parts node n_k in the middle of axis a_k.
+
+    Node 0 is the box, 1 + 2k and 2 + 2k are the halves that cut k makes. Whatever the cuts are, the nodes that none of
+    them parts, the leaves, cover the box exactly: two halves share the very number at which they meet.
+    """
+
+    def __init__(self, node: Tensor | None = None, axis: Tensor | None = None):
+        self._cuts = [] if node is None or axis is None else [(node.long(), axis.long())]
+        self.size = 0 if node is None else len(node)
+
+    def cut(self, boxes: Boxes, axis: Tensor) -> Boxes:
+        """The halves of boxes, recorded."""
+        numbers = torch.arange(self.size, self.size + len(axis))
+        self._cuts.append((boxes.node, axis.byte()))
+        self.size += len(axis)
+        return boxes.halves(axis, numbers)
+
+    @property
+    def cuts(self) -> tuple[Integer[Tensor, "cuts"], Integer[Tensor, "cuts"]]:
+        """(n_k, a_k) of each cut k."""
+        empty = (torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.uint8))
+        nodes, axes = zip(empty, *self._cuts, strict=True)
+        return torch.cat(nodes), torch.cat(axes)
+
+    def leaves(self, lower: Corner, upper: Corner) -> Boxes:
+        """The leaves of the tree of this box, in any order.
+
+        Raises:
+            ValueError: it is no tree of cuts.
+        """
+        node, axis = self.cuts
+        number = torch.full((2 * self.size + 1,), -1)
+        number[node] = torch.arange(self.size)
+        level, found = single(lower, upper), []
+        while len(level.key):
+            cut = number[level.node]
+            found.append(level[cut < 0])
+            level = level[cut >= 0].halves(axis[cut[cut >= 0]].long(), cut[cut >= 0])
+        leaves = Boxes(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        if len(leaves.key) != self.size + 1:  # a node cut twice, or one that no cut makes
+            raise ValueError("Expected cuts that part a box and its halves, got others.")
+        return leaves
 
 
 def faces(lower: Corner, upper: Corner, axes: Iterable[int]) -> tuple[Corners, Corners]:

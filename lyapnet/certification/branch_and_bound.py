@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import Boxes, single
+from lyapnet.certification.boxes import Boxes, CutTree, roots, single
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import TaylorForm, wide_axes
 from lyapnet.types import Corner, Corners, PerBox, Value
@@ -96,6 +96,7 @@ class Search:
     frontier: Boxes
     boxes: int = 0  # bounded so far
     given_up: float = float("inf")  # the least key among boxes for which there was no room
+    tree: CutTree = field(default_factory=CutTree)
 
     @property
     def least(self) -> float:
@@ -113,7 +114,7 @@ class Search:
             self.boxes += len(lowest.key)
             for undecided, axis in run(question.undecided, lowest.split(budget.chunk)):
                 question.look_at(undecided)
-                rest = rest.joined(undecided.halves(axis))
+                rest = rest.joined(self.tree.cut(undecided, axis))
             self.frontier, beyond = rest[rest.key <= question.highest].first(budget.frontier)
             self.given_up = min(self.given_up, beyond.least)
             yield
@@ -146,7 +147,7 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
         return some
     axes = torch.arange(widths.shape[-1])
     probes = boxes[some.repeat_interleave(len(axes))]
-    lower, upper, _ = probes.halves(axes.repeat(len(some)))
+    lower, upper, *_ = probes.halves(axes.repeat(len(some)))
     halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[0].excess
     drop = excess[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
     m = (drop.clamp_min(0) / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
@@ -183,7 +184,7 @@ class LeastValue(Question):
         close = self.best - self.tolerance * max(abs(self.best), self.unit) if self.best < torch.inf else torch.inf
         possible, done = w_low <= self.level, f_low >= min(close, self.enough)
         self.found = min(self.found, _least(f_low[possible & done]))
-        boxes, chosen = Boxes(boxes.lower, boxes.upper, f_low), possible & ~done
+        boxes, chosen = boxes._replace(key=f_low), possible & ~done
         return boxes[chosen], axis_to_cut(self.bounded, f, boxes, chosen)
 
 
@@ -211,8 +212,7 @@ def minimum(
     where = where or function
     bounded = BoundedFunction(lambda t, x: (function(t, x), where(t, x)), (lower.amin(0), upper.amax(0)))
     question = LeastValue(function, where, bounded, level, enough, unit, tolerance)
-    everything = Boxes(lower, upper, lower.new_full((len(lower),), -torch.inf))
-    left = searched(question, everything, budget).least
+    left = searched(question, roots(lower, upper), budget).least
     return min(question.found, left)
 
 
@@ -235,7 +235,7 @@ class ShareBelow(Question):
         volume = boxes.volumes(self.lower, self.upper)
         self.inside += float(volume[high <= self.level].sum())
         chosen = (low <= self.level) & ~(high <= self.level) & (volume > 1e-7)
-        boxes = Boxes(boxes.lower, boxes.upper, -volume / 2)  # the largest halves first
+        boxes = boxes._replace(key=-volume / 2)  # the largest halves first
         return boxes[chosen], axis_to_cut(self.bounded, form, boxes, chosen)
 
 

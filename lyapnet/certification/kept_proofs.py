@@ -1,16 +1,29 @@
-"""Unfinished proofs in files, from which they go on."""
+"""Proofs in files, finished or not: how the domain was cut, from which they go on, and which others can check.
+
+A file says what it is about, how the domain was cut (5 bytes a cut), which leaves are closed and which wait, and what
+has lowered the level; before all that stands its SHA-256. What is read is believed only as far as this goes:
+
+* A flipped bit, a truncated file or one of an earlier format fails the digest or the first line.
+* The leaves are made from the cuts, so that they cover the domain exactly; closed and waiting ones must be all of them.
+* The level is computed from the counterexample, which is evaluated again.
+* A finished proof is not believed: its leaves are bounded again.
+
+Someone who edits a file and its digest can still call closed what waits in an unfinished proof. Resuming trusts the
+digest there; `lyapnet certify check` does not, since it bounds every leaf and reads neither of the two lists.
+"""
 
 import hashlib
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 
-from lyapnet.certification.boxes import Boxes
-from lyapnet.certification.branch_and_bound import Search
+from lyapnet.certification.boxes import CutTree
+from lyapnet.certification.branch_and_bound import Search, just_below
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
@@ -36,13 +49,21 @@ def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     return found.hexdigest()
 
 
-class Unfinished(NamedTuple):
-    """A proof on the way."""
+class Standing(NamedTuple):
+    """Where a proof stands."""
 
     search: Search
     level: float  # under which the rest is proved
     worst: Counterexample | None  # what has lowered the level
     seconds: float = 0.0
+
+    @property
+    def proved(self) -> float:
+        """The level up to which c ≤ 0 is known."""
+        return min(self.level, just_below(self.search.least))
+
+
+FORMAT = b"lyapnet proof 2\n"
 
 
 @dataclass(frozen=True)
@@ -50,54 +71,94 @@ class KeptProof:
     """The file of a proof of one function on one box up to one level, by the rules of this version.
 
     Args:
-        fingerprint: of the bounded function.
-        lower, upper: the box.
-        wanted: the level.
+        about: what is proved; plain data.
+        wanted: the level up to which it is tried.
     """
 
     path: Path
-    fingerprint: str
-    lower: Corner
-    upper: Corner
+    about: dict[str, Any]
     wanted: float
 
     @property
     def identity(self) -> list[Any]:
         """What the proof is about, and the rules that it was made by: others might not have dropped what it dropped."""
-        return [self.fingerprint, hash_of_sources(), self.lower.tolist(), self.upper.tolist(), self.wanted]
+        return [self.about, self.wanted, hash_of_sources()]
 
-    def write(self, proof: Unfinished) -> None:
+    def write(self, proof: Standing) -> None:
         """Keep a proof, all or nothing."""
         search, worst = proof.search, proof.worst
+        node, axis = search.tree.cuts
+        closed = torch.ones(2 * len(node) + 1, dtype=torch.bool)
+        closed[torch.cat([node, search.frontier.node])] = False
         content = {
-            "of": self.identity, "frontier": list(search.frontier), "boxes": search.boxes,
-            "given_up": search.given_up, "level": proof.level, "worst": None if worst is None else worst._asdict(),
+            "of": self.identity, "node": node.int(), "axis": axis.byte(), "closed": closed.nonzero().flatten().int(),
+            "frontier": search.frontier.node.int(), "key": search.frontier.key, "given_up": search.given_up,
+            "boxes": search.boxes, "proved": proof.proved, "worst": None if worst is None else worst._asdict(),
             "seconds": proof.seconds,
         }  # fmt: skip
         buffer = io.BytesIO()
         torch.save(content, buffer)
-        write_atomically(self.path, buffer.getbuffer())
+        payload = buffer.getvalue()
+        write_atomically(self.path, FORMAT + hashlib.sha256(payload).digest() + payload)
 
-    def read(self) -> Unfinished | None:
+    def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> Standing | None:
         """The proof that the file keeps; None where there is no file.
+
+        Args:
+            level: of a proof with this counterexample; it may refuse it by a ValueError.
 
         Raises:
             UsageError: the file holds something else.
         """
         if not self.path.exists():
             return None
-        name = str(self.path)
-        try:
-            content = torch.load(self.path, weights_only=True)
-            same = content["of"] == self.identity
-            found, search = content["worst"], Search(Boxes(*content["frontier"]), content["boxes"], content["given_up"])
-            kept = Unfinished(
-                search, content["level"], None if found is None else Counterexample(**found), content["seconds"]
-            )
-        except Exception as error:
-            raise UsageError(f"Expected a proof in {name!r}, got another file; name a new one.") from error
-        if not same:
+        content = read_content(self.path)
+        if content["of"] != self.identity:
             raise UsageError(
-                f"Expected the proof of this V, α, δ, set and version in {name!r}, got another; take a new file."
+                f"Expected the proof of this V, α, δ, set and version in {str(self.path)!r}, got another; take a new "
+                "file."
             )
-        return kept
+        with _refusing(self.path):
+            tree, key = CutTree(content["node"], content["axis"]), content["key"]
+            leaves, frontier = tree.leaves(*domain), content["frontier"].long()
+            named = torch.cat([content["closed"].long(), frontier])
+            place = torch.full((2 * tree.size + 1,), -1)
+            place[leaves.node] = torch.arange(len(leaves.key))
+            if len(named) != len(leaves.key) or not named.sort().values.equal(leaves.node.sort().values):
+                raise ValueError("closed boxes and waiting ones are not all")
+            found = content["worst"]
+            worst = None if found is None else Counterexample(**found)
+            reached = level(worst)
+            waiting = leaves[place[frontier]]._replace(key=key.double())
+            if len(key) != len(frontier) or not bool((key <= reached).all()):
+                raise ValueError("a waiting box has no place in the order")
+            finished = not len(frontier)  # then all is bounded once more
+            given_up = float("inf") if finished else content["given_up"]
+            search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
+            return Standing(search, reached, worst, content["seconds"])
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """What a file of a proof holds, as it was written.
+
+    Raises:
+        UsageError: there is no such file; or it is another, of an earlier version, or changed since.
+    """
+    with _refusing(path):
+        content = path.read_bytes()
+        start = len(FORMAT) + hashlib.sha256().digest_size
+        head, payload = content[:start], content[start:]
+        if head != FORMAT + hashlib.sha256(payload).digest():
+            raise ValueError("another first line or digest")
+        return torch.load(io.BytesIO(payload), weights_only=True)
+
+
+@contextmanager
+def _refusing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        raise UsageError(
+            f"Expected a proof in this version's format, unchanged since, in {str(path)!r}, got "
+            f"{'no' if isinstance(error, OSError) else 'another'} file; name a new one."
+        ) from error

@@ -1,20 +1,21 @@
 """Where a condition c ≤ 0 holds: on sublevel sets of W = V − δt, proved on boxes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import Boxes, single
-from lyapnet.certification.branch_and_bound import Budget, Question, Search, axis_to_cut, just_below
+from lyapnet.certification.boxes import Boxes, CutTree, single
+from lyapnet.certification.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.certification.kept_proofs import KeptProof, Unfinished
+from lyapnet.certification.kept_proofs import KeptProof, Standing, read_content
 from lyapnet.certification.verdict import Verdict
+from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner, Points
 
@@ -33,6 +34,7 @@ class Proof:
     seconds: float
     remaining_volume: float  # share of the box
     undecided: Points  # centres (t, x) of boxes that remain
+    fingerprint: str  # of (c, W) as it was traced: what the proof is about
 
     @property
     def verdict(self) -> Verdict:
@@ -76,7 +78,7 @@ def prove(
         domain: (lower, upper) of (t, x).
         stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
         report: is told how far it is, after every few thousand boxes.
-        keep: a file in which an unfinished proof is kept, and from which it goes on.
+        keep: a file in which the proof is kept, and from which it goes on; a finished one is bounded once more.
 
     Raises:
         UsageError: the file keeps the proof of something else.
@@ -84,28 +86,93 @@ def prove(
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
     bounded = bounded_condition(condition, (lower, upper))
-    kept = None if keep is None else KeptProof(keep, bounded.fingerprint, lower, upper, wanted)
-    begun = None if kept is None else kept.read()
+    about = about_of(condition, bounded, lower, upper)
+    kept = None if keep is None else KeptProof(keep, about, wanted)
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample)
+    begun = None if kept is None else kept.read((lower, upper), question.again)
     if begun is None:
         question.lower_to(find_counterexample(condition, bounded, lower, upper, wanted, generator))
-        begun = Unfinished(Search(single(lower, upper)), question.level, question.worst)
-    search, question.level, question.worst, earlier = begun
-    saved = budget.elapsed
+        begun = Standing(Search(single(lower, upper)), question.level, question.worst)
+    search, earlier, saved = begun.search, begun.seconds, budget.elapsed
+
+    def standing() -> Standing:
+        return Standing(search, question.level, question.worst, earlier + budget.elapsed)
+
+    for _ in _rounds(search, question, budget, (lower, upper), report, earlier):
+        if kept is not None and budget.elapsed > saved + KEEP_EVERY:
+            kept.write(standing())
+            saved = budget.elapsed
+    if kept is not None:
+        kept.write(standing())
+    return _proof(standing(), question, wanted, (lower, upper))
+
+
+def replay(
+    condition: DecreaseCondition,
+    domain: tuple[Corner, Corner],
+    wanted: float,
+    budget: Budget,
+    stop_at_counterexample: bool,
+    generator: torch.Generator | None,
+    report: Callable[[Progress], None] | None,
+    keep: Path,
+) -> Proof:
+    """The proof that a file holds, with every leaf of its cuts bounded anew: no search, and nothing in it is believed.
+
+    The cuts say where to look, the claimed level how far; were either of them wrong, a leaf would stay undecided. Of
+    leaves 1 % may be cut again: what the search inherited from larger boxes, or another machine rounded.
+
+    Raises:
+        UsageError: the file holds another proof, or none.
+    """
+    lower, upper = (side.double() for side in domain)
+    bounded = bounded_condition(condition, (lower, upper))
+    content = read_content(keep)
+    if content["of"][:1] != [about_of(condition, bounded, lower, upper)]:
+        raise UsageError(
+            f"Expected the proof of this V, α, δ and set in {str(keep)!r}, got another; name its checkpoint."
+        )
+    leaves = CutTree(content["node"], content["axis"]).leaves(lower, upper)
+    budget = replace(budget, boxes=len(leaves.key) + len(leaves.key) // 100 + 100)
+    question = WhereItHolds(condition, bounded, min(wanted, content["proved"]), stop_at_counterexample)
+    search = Search(leaves)
+    for _ in _rounds(search, question, budget, (lower, upper), report):
+        pass
+    return _proof(Standing(search, question.level, question.worst, budget.elapsed), question, wanted, (lower, upper))
+
+
+def about_of(condition: DecreaseCondition, bounded: BoundedFunction, lower: Corner, upper: Corner) -> dict[str, Any]:
+    """What a proof is about, as plain data."""
+    return {
+        "fingerprint": bounded.fingerprint, "lower": lower.tolist(), "upper": upper.tolist(),
+        "alpha": condition.alpha, "delta": condition.delta,
+    }  # fmt: skip
+
+
+def _rounds(
+    search: Search,
+    question: "WhereItHolds",
+    budget: Budget,
+    domain: tuple[Corner, Corner],
+    report: Callable[[Progress], None] | None,
+    earlier: float = 0.0,
+) -> Iterator[None]:
+    """The rounds of a search in threads, reported."""
     with ThreadPoolExecutor(budget.workers) as pool:
         for _ in search.rounds(question, budget, pool.map):
-            seconds = earlier + budget.elapsed
-            if kept is not None and budget.elapsed > saved + KEEP_EVERY:
-                kept.write(Unfinished(search, question.level, question.worst, seconds))
-                saved = budget.elapsed
+            yield
             if report is not None:
-                report(Progress(search.boxes, float(search.frontier.volumes(lower, upper).sum()), seconds))
-    seconds, unfinished = earlier + budget.elapsed, len(search.frontier.key) and not question.settled
-    if kept is not None and unfinished:
-        kept.write(Unfinished(search, question.level, question.worst, seconds))
-    proved = -torch.inf if question.settled else min(question.level, just_below(search.least))
-    remaining = float(search.frontier.volumes(lower, upper).sum())
-    return Proof(proved, wanted, question.worst, search.boxes, seconds, remaining, search.frontier.center[:KEPT])
+                remaining = float(search.frontier.volumes(*domain).sum())
+                report(Progress(search.boxes, remaining, earlier + budget.elapsed))
+
+
+def _proof(standing: Standing, question: "WhereItHolds", wanted: float, domain: tuple[Corner, Corner]) -> Proof:
+    search, proved = standing.search, -torch.inf if question.settled else standing.proved
+    remaining = float(search.frontier.volumes(*domain).sum())
+    return Proof(
+        proved, wanted, standing.worst, search.boxes, standing.seconds, remaining, search.frontier.center[:KEPT],
+        question.bounded.fingerprint,
+    )  # fmt: skip
 
 
 @dataclass
@@ -121,7 +188,7 @@ class WhereItHolds(Question):
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         c, W = self.bounded.forms(boxes.lower, boxes.upper)
         (_, c_high), (W_low, _) = c.interval(), W.interval()
-        boxes = Boxes(boxes.lower, boxes.upper, torch.maximum(W_low, boxes.key))
+        boxes = boxes._replace(key=torch.maximum(W_low, boxes.key))
         chosen = ~(c_high <= 0) & (boxes.key <= self.level)
         return boxes[chosen], axis_to_cut(self.bounded, c, boxes, chosen)
 
@@ -132,6 +199,20 @@ class WhereItHolds(Question):
         """Go on under a counterexample, if there is one."""
         if found is not None:
             self.worst, self.level = found, found.height - BELOW * abs(found.height)
+
+    def again(self, worst: Counterexample | None) -> float:
+        """The level under a counterexample of an earlier search, which is evaluated again.
+
+        Raises:
+            ValueError: it is none.
+        """
+        if worst is not None:
+            point = torch.tensor([[worst.t, *worst.x]], dtype=torch.float64)
+            found = lowest_violation(self.condition, self.bounded, point, float("inf"))
+            if found is None or not abs(found.height - worst.height) <= MARGIN * abs(found.height):
+                raise ValueError("the condition does not fail there")
+        self.lower_to(worst)
+        return self.level
 
     @property
     def highest(self) -> float:

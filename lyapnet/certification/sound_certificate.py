@@ -43,6 +43,7 @@ class SoundCertificate(Certificate):
         "remaining_volume": "share of [0, T] × D undecided",
         "boxes": "boxes",
         "seconds": "seconds",
+        "fingerprint": "fingerprint of what was bounded",
     }
     claim: SoundClaim
 
@@ -57,6 +58,7 @@ class SoundCertificate(Certificate):
             "guaranteed_cost_ratio": guaranteed_cost_ratio(self.controller, claim), "boxes": claim.boxes,
             "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
             "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
+            "fingerprint": claim.fingerprint,
         }  # fmt: skip
 
     def in_words(self) -> str:
@@ -66,7 +68,9 @@ class SoundCertificate(Certificate):
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
             f"model: no closed loop that starts in it leaves the funnel, or D, up to T = {claim.duration:g} s, and its "
-            f"cost is bounded as below. It holds at least {floored(claim.volume_share)} of X₀ by volume."
+            f"cost is bounded as below. It holds at least {floored(claim.volume_share)} of X₀ by volume. It is about "
+            "the operations that f, g, ℓ, V and u were traced to, of this fingerprint; whatever else their code reads "
+            "(globals, counters, files) is frozen as it was then."
         )
 
     def in_formulas(self) -> list[str]:

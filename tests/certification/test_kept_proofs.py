@@ -18,6 +18,7 @@ from lyapnet.certification import (
     prove,
     violations,
 )
+from lyapnet.certification.boxes import CutTree
 from lyapnet.errors import UsageError
 from lyapnet.graphs import bound_rules, bounds, simplification, taylor, tracing
 from tests.certification.planted import Planted, domain, loop, riccati
@@ -93,7 +94,9 @@ def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
     monkeypatch.setattr(kept_proofs.KeptProof, "identity", [])
     kept.unlink()
     go_on(dipped(P), kept, boxes=200)
-    lower, upper, _ = torch.load(kept, weights_only=True)["frontier"]
+    content = kept_proofs.read_content(kept)
+    leaves = CutTree(content["node"], content["axis"]).leaves(*domain())
+    lower, upper, _, _ = leaves[torch.isin(leaves.node, content["frontier"].long())]
     corners = torch.cartesian_prod(*(torch.linspace(0.1, 0.9, 9) for _ in range(3)))
     points = domain()[0] + (domain()[1] - domain()[0]) * corners
     points = points[(loop(P).policy.V(points[:, 0], points[:, 1:]) < 1.5)]
@@ -153,10 +156,11 @@ def test_a_broken_file_is_refused(kind, P, kept):
 
 
 def test_a_kept_proof_is_plain_data(kept):
-    content = torch.load(kept, weights_only=True)
-    assert content.keys() == {"of", "frontier", "worst", "level", "boxes", "seconds", "given_up"}
+    content = kept_proofs.read_content(kept)
+    lists = {"node", "axis", "closed", "frontier", "key"}
+    assert content.keys() == {"of", "worst", "proved", "boxes", "seconds", "given_up", *lists}
     assert content["boxes"] >= 60
-    assert all(isinstance(side, torch.Tensor) for side in content["frontier"])
+    assert all(isinstance(content[name], torch.Tensor) for name in lists)
 
 
 # Threads

@@ -118,7 +118,7 @@ class KeptProof:
                 f"Expected the proof of this V, α, δ, set and version in {str(self.path)!r}, got another; take a new "
                 "file."
             )
-        with _refusing(self.path):
+        with refusing(self.path):
             tree, key = CutTree(content["node"], content["axis"]), content["key"]
             leaves, frontier = tree.leaves(*domain), content["frontier"].long()
             named = torch.cat([content["closed"].long(), frontier])
@@ -144,7 +144,7 @@ def read_content(path: Path) -> dict[str, Any]:
     Raises:
         UsageError: there is no such file; or it is another, of an earlier version, or changed since.
     """
-    with _refusing(path):
+    with refusing(path):
         content = path.read_bytes()
         start = len(FORMAT) + hashlib.sha256().digest_size
         head, payload = content[:start], content[start:]
@@ -154,7 +154,8 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _refusing(path: Path) -> Iterator[None]:
+def refusing(path: Path) -> Iterator[None]:
+    """Whatever fails while a file is read is a UsageError that names the file."""
     try:
         yield
     except Exception as error:

@@ -13,7 +13,7 @@ from lyapnet.certification.boxes import Boxes, CutTree, single
 from lyapnet.certification.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.certification.kept_proofs import KeptProof, Standing, read_content
+from lyapnet.certification.kept_proofs import KeptProof, Standing, read_content, refusing
 from lyapnet.certification.verdict import Verdict
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
@@ -132,9 +132,10 @@ def replay(
         raise UsageError(
             f"Expected the proof of this V, α, δ and set in {str(keep)!r}, got another; name its checkpoint."
         )
-    leaves = CutTree(content["node"], content["axis"]).leaves(lower, upper)
+    with refusing(keep):
+        leaves, claimed = CutTree(content["node"], content["axis"]).leaves(lower, upper), float(content["proved"])
     budget = replace(budget, boxes=len(leaves.key) + len(leaves.key) // 100 + 100)
-    question = WhereItHolds(condition, bounded, min(wanted, content["proved"]), stop_at_counterexample)
+    question = WhereItHolds(condition, bounded, min(wanted, claimed), stop_at_counterexample)
     search = Search(leaves)
     for _ in _rounds(search, question, budget, (lower, upper), report):
         pass

@@ -42,7 +42,7 @@ def _shown(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_shown('', entry)}" for name, entry in value.items() if entry is not None)
     if isinstance(value, str):
-        return value
+        return value[:16] if key == "fingerprint" else value
     if key == "states_left_out":
         return ", ".join(value)
     if isinstance(value, int):
@@ -53,7 +53,7 @@ def _shown(key: str, value: Any) -> str:
         return f"1 − {1 - value:.2g}"
     if key.endswith(("bound", "volume_share")):
         return floored(value)
-    return f"{value:.3%}" if key.endswith(("share", "volume")) else f"{value:.4g}"
+    return f"{value:.3%}" if key.endswith(("share", "volume", "share_of_search")) else f"{value:.4g}"
 
 
 def floored(share: float) -> str:

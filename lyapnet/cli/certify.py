@@ -1,4 +1,4 @@
-"""lyapnet certify sampled | statistical | sound."""
+"""lyapnet certify sampled | statistical | sound | check."""
 
 import json
 import math
@@ -182,7 +182,7 @@ def sound(
     ] = 60.0,
     workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
     keep: Annotated[
-        str | None, typer.Option(help="Keep an unfinished proof there, and go on from it.", metavar="FILE")
+        str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
     ] = None,
     refine: Annotated[
         int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
@@ -229,6 +229,36 @@ def sound(
     else:
         certificate = certified(checkpoint)
     _write(certificate, checkpoint, own, as_json, figure, report)
+
+
+@app.command()
+def check(
+    proof: Annotated[Path, typer.Argument(help="The file of --keep.", metavar="PROOF")],
+    checkpoint: Checkpoint,
+    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
+    as_json: AsJson = False,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    program: Program = None,
+    debug: Debug = False,
+) -> None:
+    """Whether a kept proof proves the sound claim: its leaves are bounded anew, without a search."""
+    from lyapnet.certification.checking import LABELS
+    from lyapnet.certification.checking import check as checked
+    from lyapnet.certification.tables import certificate_table, proof_progress
+
+    controller = load_controller(
+        checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
+    )
+    with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
+        result = checked(controller, proof, workers, progress)
+    if as_json:
+        print(json.dumps(result, allow_nan=False))
+    else:
+        Console(highlight=False).print(certificate_table(f"{proof}, {checkpoint}", result, LABELS))
+    raise typer.Exit(result["verdict"] != "certified")
 
 
 def _show(certificate: Any, checkpoint: Path, as_json: bool) -> None:

@@ -1,5 +1,7 @@
 """Proofs that are kept in a file and go on, in several threads, and report how far they are."""
 
+import hashlib
+import io
 import math
 import pickle
 import shutil
@@ -18,7 +20,7 @@ from lyapnet.certification import (
     prove,
     violations,
 )
-from lyapnet.certification.boxes import CutTree
+from lyapnet.certification.boxes import CutTree, single
 from lyapnet.errors import UsageError
 from lyapnet.graphs import bound_rules, bounds, simplification, taylor, tracing
 from tests.certification.planted import Planted, domain, loop, riccati
@@ -161,6 +163,157 @@ def test_a_kept_proof_is_plain_data(kept):
     assert content.keys() == {"of", "worst", "proved", "boxes", "seconds", "given_up", *lists}
     assert content["boxes"] >= 60
     assert all(isinstance(content[name], torch.Tensor) for name in lists)
+
+
+# What a changed file does
+
+
+def rewritten(path, change):
+    """The file after a change of its content, by someone who computes the digest again."""
+    content = kept_proofs.read_content(path)
+    change(content)
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    payload = buffer.getvalue()
+    path.write_bytes(kept_proofs.FORMAT + hashlib.sha256(payload).digest() + payload)
+
+
+def checked(condition, path, wanted=2.0):
+    return proof.replay(condition, domain(), wanted, Budget(60, chunk=64), True, None, None, path)
+
+
+@pytest.fixture
+def finished(P, kept):
+    assert go_on(dipped(P), kept).verdict == "certified"
+    return kept
+
+
+def test_no_flipped_bit_is_used(P, finished):
+    content, generator = finished.read_bytes(), torch.Generator().manual_seed(0)
+    places = torch.randint(8 * len(content), (40,), generator=generator).tolist()
+    for bit in [0, 8 * len(content) - 1, *places]:
+        changed = bytearray(content)
+        changed[bit // 8] ^= 1 << bit % 8
+        finished.write_bytes(changed)
+        with pytest.raises(UsageError, match="another file; name a new one"):
+            kept_proofs.read_content(finished)
+    finished.write_bytes(content)
+    assert kept_proofs.read_content(finished)["proved"] == 2.0
+
+
+def test_one_of_version_0_1_is_refused(P, kept):
+    content = {"of": [], "frontier": [], "boxes": 0, "given_up": 0.0, "level": 2.0, "worst": None, "seconds": 0.0}
+    torch.save(content, kept)
+    with pytest.raises(UsageError, match="this version's format"):
+        go_on(dipped(P), kept)
+
+
+def emptied(content):
+    content["frontier"], content["key"] = content["frontier"][:0], content["key"][:0]
+
+
+def called_closed(content):
+    content["closed"] = torch.cat([content["closed"], content["frontier"]])
+    emptied(content)
+
+
+def without_a_leaf(content):
+    content["closed"] = content["closed"][1:]
+
+
+def without_a_cut(content):
+    content["node"], content["axis"] = content["node"][:-1], content["axis"][:-1]
+
+
+def cut_twice(content):
+    content["node"][-1] = content["node"][-2]
+
+
+def raised(content):
+    content["worst"], content["proved"] = None, 6.0
+
+
+def with_another_counterexample(content):
+    content["worst"] = {"t": 1.0, "x": [0.0, 0.0], "condition": 1.0, "height": 5.9}
+
+
+def of_another_key(content):
+    content["key"] = content["key"] + 100
+
+
+def of_another_v(content):
+    content["of"][0]["fingerprint"] = "0" * 64
+
+
+@pytest.mark.parametrize(
+    "change",
+    [emptied, without_a_leaf, without_a_cut, cut_twice, with_another_counterexample, of_another_key, of_another_v],
+)
+def test_resuming_refuses_what_does_not_fit_together(change, P, kept):
+    rewritten(kept, change)
+    with pytest.raises(UsageError, match=r"got another(?: file)?; (?:name a new one|take a new file)\.$"):
+        go_on(dipped(P), kept)
+
+
+def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
+    path, condition = tmp_path / "proof.pt", violated(P)
+    whole = go_on(condition, path, wanted=6.0)
+    assert whole.level < 6.0
+    rewritten(path, raised)
+    again = go_on(condition, path, wanted=6.0)
+    assert (again.verdict, again.level) == ("falsified", pytest.approx(whole.level, rel=0.05))
+
+
+def test_a_file_that_says_finished_is_bounded_again(P, kept):
+    """All that waits is called closed, as if the proof had ended; of a condition that fails, with its fingerprint."""
+    rewritten(kept, called_closed)
+    before = kept_proofs.read_content(kept)["boxes"]
+    proof = go_on(dipped(P), kept)
+    assert proof.verdict == "certified"
+    assert proof.boxes > before + 60, "its leaves, and what was left to cut"
+
+
+# Checking without a search
+
+
+def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
+    """Each of a tree's K cuts was bounded in the search, and one leaf more than these is in the check."""
+    content = kept_proofs.read_content(finished)
+    confirmed = checked(dipped(P), finished)
+    assert (confirmed.verdict, confirmed.level, confirmed.remaining_volume) == ("certified", 2.0, 0.0)
+    assert confirmed.boxes == len(content["node"]) + 1
+    assert content["boxes"] == 2 * len(content["node"]) + 1
+
+
+@pytest.mark.parametrize("change", [without_a_cut, raised, called_closed, emptied], ids=lambda f: f.__name__)
+def test_a_check_believes_neither_lists_nor_levels(change, P, kept):
+    """The proof was stopped early; its digest is right."""
+    rewritten(kept, change)
+    assert checked(dipped(P), kept, 6.0 if change is raised else 2.0).verdict != "certified"
+
+
+def test_a_check_refuses_other_cuts_and_another_v(P, finished):
+    rewritten(finished, lambda content: content["axis"].zero_())
+    assert checked(dipped(P), finished).verdict != "certified"
+    with pytest.raises(UsageError, match=r"got another; name its checkpoint\.$"):
+        checked(dipped(1.001 * P), finished)
+    rewritten(finished, cut_twice)
+    with pytest.raises(UsageError, match="another file"):
+        checked(dipped(P), finished)
+
+
+def test_leaves_cover_their_box_exactly():
+    generator, tree, (lower, upper) = torch.Generator().manual_seed(0), CutTree(), domain()
+    boxes = single(lower, upper)
+    for _ in range(6):
+        boxes = tree.cut(boxes, torch.randint(3, (len(boxes.key),), generator=generator))
+        boxes = boxes[torch.rand(len(boxes.key), generator=generator) < 0.8]
+    leaves = CutTree(*tree.cuts).leaves(lower, upper)
+    assert len(leaves.key) == tree.size + 1 > 20
+    assert float(leaves.volumes(lower, upper).sum()) == 1.0, "powers of two add exactly"
+    points = lower + (upper - lower) * torch.rand(500, 1, 3, generator=generator)
+    assert (((leaves.lower <= points) & (points < leaves.upper)).all(-1).sum(-1) == 1).all()
+    assert torch.isin(boxes.node, leaves.node).all()
 
 
 # Threads

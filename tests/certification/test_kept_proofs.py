@@ -265,7 +265,7 @@ def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
 
 
 def test_a_file_that_says_finished_is_bounded_again(P, kept):
-    """All that waits is called closed, as if the proof had ended; of a condition that fails, with its fingerprint."""
+    """All that waits is called closed, as if the proof had ended."""
     rewritten(kept, called_closed)
     before = kept_proofs.read_content(kept)["boxes"]
     proof = go_on(dipped(P), kept)

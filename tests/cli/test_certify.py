@@ -4,6 +4,7 @@ import inspect
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from typer.main import get_command
@@ -15,6 +16,7 @@ from lyapnet.cli import certify, main
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.systems import DoubleIntegrator
+from tests.certification import planted
 from tests.problems import Formula, problem_of
 
 MAKERS = {"sampled": sampled_certificate, "statistical": statistical_certificate, "sound": sound_certificate}
@@ -134,6 +136,38 @@ def test_options_are_refused_before_any_work(monkeypatch, capsys):
     ):
         assert main(["certify", *wrong]) == 2
         assert capsys.readouterr().err.startswith("error: Expected")
+
+
+def certifiable(*arguments, **own):
+    """In place of a checkpoint: the Riccati V of the double integrator."""
+    return Controller(planted.problem(), planted.stationary(planted.riccati()))
+
+
+def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(certify, "load_controller", certifiable)
+    monkeypatch.setattr(funnel, "LEVELS", 20.0)
+    path = str(tmp_path / "kept.proof")
+    options = ["--alpha", "0.9", "--delta", "0.05", "--keep", path]
+    found = certificate(capsys, "sound", checkpoint, *options)
+    assert found["verdict"] == "certified"
+    assert len(found["fingerprint"]) == 64
+    assert main(["certify", "check", path, checkpoint, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["kind"], result["verdict"]) == ("check", "certified")
+    same = ("alpha", "delta", "set", "rho", "rho_wanted", "volume_share", "terminal_excess", "fingerprint")
+    assert {name: result[name] for name in same} == {name: found[name] for name in same}
+    assert result["boxes"] <= found["boxes"]
+    assert result["share_of_search"] > 0
+    assert main(["certify", "check", path, checkpoint]) == 0
+    assert "check: certified" in capsys.readouterr().out
+    for other in (0.999, 1.0):  # another V, then a changed file
+        V = planted.stationary(other * planted.riccati())
+        monkeypatch.setattr(certify, "load_controller", lambda *a, V=V, **own: Controller(planted.problem(), V))
+        if other == 1.0:
+            content = Path(path).read_bytes()
+            Path(path).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+        assert main(["certify", "check", path, checkpoint]) == 1
+        assert "check: refused" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("kind", "make"), list(MAKERS.items()))

@@ -52,6 +52,10 @@ class Boxes(NamedTuple):
         sides = torch.where(upper > lower, upper - lower, 1.0)
         return torch.where(upper > lower, (self.upper - self.lower) / sides, 1.0).prod(-1)
 
+    def share(self, lower: Corner, upper: Corner) -> float:
+        """That of all of them in the box (lower, upper)."""
+        return float(self.volumes(lower, upper).sum())
+
     def halves(self, axis: Tensor, cuts: Tensor | None = None) -> "Boxes":
         """Each box cut in two in the middle of an axis of its own, by cuts of these numbers in a CutTree."""
         cut = torch.nn.functional.one_hot(axis, self.lower.shape[-1]).bool()

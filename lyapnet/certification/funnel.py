@@ -14,7 +14,7 @@ from lyapnet.certification.branch_and_bound import Budget, just_above, just_belo
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition, require_own_gradient
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.ignorable_states import ignorable_states
-from lyapnet.certification.proof import Progress, Proof, prove
+from lyapnet.certification.proof import Progress, prove
 from lyapnet.certification.verdict import Verdict
 from lyapnet.contracts import check_function
 from lyapnet.errors import UsageError
@@ -65,6 +65,7 @@ class SoundClaim:
     undecided: Points  # centres (t, x) of boxes that remain
     left_out: list[int]  # ignorable states, on which nothing depends: D has no bounds for them, and is drawn at 0
     fingerprint: str = ""  # of (V̇ + αℓ − δ, W) as it was traced: the operations and numbers that the claim is about
+    proof_seconds: float = 0.0  # those of the boxes alone
 
     @property
     def verdict(self) -> Verdict:
@@ -101,7 +102,7 @@ def sound_claim(
     generator: torch.Generator | None = None,
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
-    prover: Callable[..., Proof] = prove,
+    replay: bool = False,
 ) -> SoundClaim:
     """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
@@ -109,8 +110,7 @@ def sound_claim(
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
         problem: whose X₀, T and goal are meant.
         states: D; by default a box around where samples of V are low enough.
-        report, keep: of prove.
-        prover: prove, or replay, which bounds what a file holds.
+        report, keep, replay: of prove.
 
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
@@ -135,7 +135,8 @@ def sound_claim(
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
     set_up = time.monotonic() - started
     budget = replace(budget, started=time.monotonic())
-    proof = prover(condition, domain, min(needed, just_below(rim)), budget, False, generator, report, keep)
+    level = min(needed, just_below(rim))
+    proof = prove(condition, domain, level, budget, False, generator, report, keep, replay)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed:  # the proof was about less than what X₀ needs, and so was its search
@@ -149,7 +150,7 @@ def sound_claim(
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, _largest_seen(condition.V, initial_states), inside, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint,
+        proof.fingerprint, proof.seconds,
     )  # fmt: skip
 
 

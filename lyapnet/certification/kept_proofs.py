@@ -137,6 +137,22 @@ class KeptProof:
             search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
             return Standing(search, reached, worst, content["seconds"])
 
+    def claim(self, domain: tuple[Corner, Corner]) -> Standing:
+        """The leaves of a proof of the same, none of them decided, and the level that it claims.
+
+        Raises:
+            UsageError: the file holds another proof, or none.
+        """
+        content = read_content(self.path)
+        with refusing(self.path):
+            leaves, of = CutTree(content["node"], content["axis"]).leaves(*domain), content["of"][:1]
+            claimed = Standing(Search(leaves), float(content["proved"]), None)
+        if of != [self.about]:
+            raise UsageError(
+                f"Expected the proof of this V, α, δ and set in {str(self.path)!r}, got another; name its checkpoint."
+            )
+        return claimed
+
 
 def read_content(path: Path) -> dict[str, Any]:
     """What a file of a proof holds, as it was written.

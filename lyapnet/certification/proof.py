@@ -1,21 +1,21 @@
 """Where a condition c ≤ 0 holds: on sublevel sets of W = V − δt, proved on boxes."""
 
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import Boxes, CutTree, single
+from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.certification.kept_proofs import KeptProof, Standing, read_content, refusing
+from lyapnet.certification.kept_proofs import KeptProof, Standing
 from lyapnet.certification.verdict import Verdict
-from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner, Points
 
@@ -66,6 +66,7 @@ def prove(
     generator: torch.Generator | None = None,
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
+    replay: bool = False,
 ) -> Proof:
     """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
@@ -79,6 +80,9 @@ def prove(
         stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
         report: is told how far it is, after every few thousand boxes.
         keep: a file in which the proof is kept, and from which it goes on; a finished one is bounded once more.
+        replay: bound the leaves of the kept proof, each once, instead of a search; nothing in the file is believed. Its
+            cuts say where to look, its level how far: were they wrong, a leaf would stay undecided. Of leaves 1 % may
+            be cut again, for what the search inherited from larger boxes, or another machine rounded.
 
     Raises:
         UsageError: the file keeps the proof of something else.
@@ -86,10 +90,19 @@ def prove(
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
     bounded = bounded_condition(condition, (lower, upper))
-    about = about_of(condition, bounded, lower, upper)
+    about = {
+        "fingerprint": bounded.fingerprint, "lower": lower.tolist(), "upper": upper.tolist(),
+        "alpha": condition.alpha, "delta": condition.delta,
+    }  # fmt: skip
     kept = None if keep is None else KeptProof(keep, about, wanted)
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample)
-    begun = None if kept is None else kept.read((lower, upper), question.again)
+    begun = None
+    if kept is not None and replay:
+        begun, kept = kept.claim((lower, upper)), None
+        leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
+        budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
+    elif kept is not None:
+        begun = kept.read((lower, upper), question.again)
     if begun is None:
         question.lower_to(find_counterexample(condition, bounded, lower, upper, wanted, generator))
         begun = Standing(Search(single(lower, upper)), question.level, question.worst)
@@ -98,81 +111,19 @@ def prove(
     def standing() -> Standing:
         return Standing(search, question.level, question.worst, earlier + budget.elapsed)
 
-    for _ in _rounds(search, question, budget, (lower, upper), report, earlier):
-        if kept is not None and budget.elapsed > saved + KEEP_EVERY:
-            kept.write(standing())
-            saved = budget.elapsed
-    if kept is not None:
-        kept.write(standing())
-    return _proof(standing(), question, wanted, (lower, upper))
-
-
-def replay(
-    condition: DecreaseCondition,
-    domain: tuple[Corner, Corner],
-    wanted: float,
-    budget: Budget,
-    stop_at_counterexample: bool,
-    generator: torch.Generator | None,
-    report: Callable[[Progress], None] | None,
-    keep: Path,
-) -> Proof:
-    """The proof that a file holds, with every leaf of its cuts bounded anew: no search, and nothing in it is believed.
-
-    The cuts say where to look, the claimed level how far; were either of them wrong, a leaf would stay undecided. Of
-    leaves 1 % may be cut again: what the search inherited from larger boxes, or another machine rounded.
-
-    Raises:
-        UsageError: the file holds another proof, or none.
-    """
-    lower, upper = (side.double() for side in domain)
-    bounded = bounded_condition(condition, (lower, upper))
-    content = read_content(keep)
-    if content["of"][:1] != [about_of(condition, bounded, lower, upper)]:
-        raise UsageError(
-            f"Expected the proof of this V, α, δ and set in {str(keep)!r}, got another; name its checkpoint."
-        )
-    with refusing(keep):
-        leaves, claimed = CutTree(content["node"], content["axis"]).leaves(lower, upper), float(content["proved"])
-    budget = replace(budget, boxes=len(leaves.key) + len(leaves.key) // 100 + 100)
-    question = WhereItHolds(condition, bounded, min(wanted, claimed), stop_at_counterexample)
-    search = Search(leaves)
-    for _ in _rounds(search, question, budget, (lower, upper), report):
-        pass
-    return _proof(Standing(search, question.level, question.worst, budget.elapsed), question, wanted, (lower, upper))
-
-
-def about_of(condition: DecreaseCondition, bounded: BoundedFunction, lower: Corner, upper: Corner) -> dict[str, Any]:
-    """What a proof is about, as plain data."""
-    return {
-        "fingerprint": bounded.fingerprint, "lower": lower.tolist(), "upper": upper.tolist(),
-        "alpha": condition.alpha, "delta": condition.delta,
-    }  # fmt: skip
-
-
-def _rounds(
-    search: Search,
-    question: "WhereItHolds",
-    budget: Budget,
-    domain: tuple[Corner, Corner],
-    report: Callable[[Progress], None] | None,
-    earlier: float = 0.0,
-) -> Iterator[None]:
-    """The rounds of a search in threads, reported."""
     with ThreadPoolExecutor(budget.workers) as pool:
         for _ in search.rounds(question, budget, pool.map):
-            yield
+            if kept is not None and budget.elapsed > saved + KEEP_EVERY:
+                kept.write(standing())
+                saved = budget.elapsed
             if report is not None:
-                remaining = float(search.frontier.volumes(*domain).sum())
-                report(Progress(search.boxes, remaining, earlier + budget.elapsed))
-
-
-def _proof(standing: Standing, question: "WhereItHolds", wanted: float, domain: tuple[Corner, Corner]) -> Proof:
-    search, proved = standing.search, -torch.inf if question.settled else standing.proved
-    remaining = float(search.frontier.volumes(*domain).sum())
+                report(Progress(search.boxes, search.frontier.share(lower, upper), earlier + budget.elapsed))
+    end = standing()
+    if kept is not None:
+        kept.write(end)
     return Proof(
-        proved, wanted, standing.worst, search.boxes, standing.seconds, remaining, search.frontier.center[:KEPT],
-        question.bounded.fingerprint,
+        -torch.inf if question.settled else end.proved, wanted, end.worst, search.boxes, end.seconds,
+        search.frontier.share(lower, upper), search.frontier.center[:KEPT], bounded.fingerprint,
     )  # fmt: skip
 
 

@@ -150,22 +150,13 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         return result.to(recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
-            _require_covered(node.target, form, value)
+            real = value.dtype == torch.float64 or (value.dtype == torch.bool and node.target in OF_TRUTHS)
+            if not real or form.shape != value.shape:
+                raise UsageError(
+                    f"Expected operators with a rule for bounds, got {node.target} in {value.dtype} of shape "
+                    f"{tuple(value.shape)}; stay in x.dtype, to which truths convert, or write it with others."
+                )
     return result
-
-
-def _require_covered(target: Any, form: TaylorForm, value: Tensor) -> None:
-    """Refuse bounds of other numbers than torch computes there."""
-    if value.dtype != torch.float64 and not (value.dtype == torch.bool and target in OF_TRUTHS):
-        raise UsageError(
-            f"Expected operators with a rule for bounds, got {target} in {value.dtype}; stay in x.dtype, to which "
-            "truths convert."
-        )
-    if form.shape != value.shape:
-        raise UsageError(
-            f"Expected a result of shape {tuple(value.shape)}, got bounds of {tuple(form.shape)} from {target}; write "
-            "it with other operators."
-        )
 
 
 def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:

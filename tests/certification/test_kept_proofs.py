@@ -179,7 +179,7 @@ def rewritten(path, change):
 
 
 def checked(condition, path, wanted=2.0):
-    return proof.replay(condition, domain(), wanted, Budget(60, chunk=64), True, None, None, path)
+    return prove(condition, domain(), wanted, Budget(60, chunk=64), keep=path, replay=True)
 
 
 @pytest.fixture

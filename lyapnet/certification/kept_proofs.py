@@ -24,9 +24,11 @@ import torch
 
 from lyapnet.certification.boxes import CutTree
 from lyapnet.certification.branch_and_bound import Search, just_below
+from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
+from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner
 
 PACKAGE = Path(__file__).parents[1]
@@ -61,6 +63,12 @@ class Standing(NamedTuple):
     def proved(self) -> float:
         """The level up to which c ≤ 0 is known."""
         return min(self.level, just_below(self.search.least))
+
+
+def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
+    """What a proof is about, as plain data."""
+    box = {"lower": lower.tolist(), "upper": upper.tolist()}
+    return {"fingerprint": bounded.fingerprint, **box, "alpha": condition.alpha, "delta": condition.delta}
 
 
 FORMAT = b"lyapnet proof 2\n"

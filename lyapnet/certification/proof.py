@@ -14,7 +14,7 @@ from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.certification.kept_proofs import KeptProof, Standing
+from lyapnet.certification.kept_proofs import KeptProof, Standing, about
 from lyapnet.certification.verdict import Verdict
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner, Points
@@ -70,8 +70,8 @@ def prove(
 ) -> Proof:
     """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
-    Counterexamples are sought first, by samples and by ascent from the worst of them. Then boxes of lowest W are
-    bounded first. A box is dropped where c ≤ 0 on all of it or W > level on all of it, and else cut in two. A
+    Counterexamples are sought first, by samples and by ascent from the worst of them, then boxes of lowest W are
+    bounded. A box is dropped where c ≤ 0 on all of it or W > level on all of it, and else cut in two. A
     counterexample that turns up among their centres lowers the level, and the search goes on under it.
 
     Args:
@@ -80,9 +80,8 @@ def prove(
         stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
         report: is told how far it is, after every few thousand boxes.
         keep: a file in which the proof is kept, and from which it goes on; a finished one is bounded once more.
-        replay: bound the leaves of the kept proof, each once, instead of a search; nothing in the file is believed. Its
-            cuts say where to look, its level how far: were they wrong, a leaf would stay undecided. Of leaves 1 % may
-            be cut again, for what the search inherited from larger boxes, or another machine rounded.
+        replay: bound each leaf of the kept proof once, in place of a search. Nothing in the file is believed: were its
+            cuts or level wrong, a leaf would stay undecided. 1 % may be cut again, as rounding differs by machine.
 
     Raises:
         UsageError: the file keeps the proof of something else.
@@ -90,22 +89,15 @@ def prove(
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
     bounded = bounded_condition(condition, (lower, upper))
-    about = {
-        "fingerprint": bounded.fingerprint, "lower": lower.tolist(), "upper": upper.tolist(),
-        "alpha": condition.alpha, "delta": condition.delta,
-    }  # fmt: skip
-    kept = None if keep is None else KeptProof(keep, about, wanted)
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample)
-    begun = None
+    kept = None if keep is None else KeptProof(keep, about(bounded, condition, lower, upper), wanted)
     if kept is not None and replay:
         begun, kept = kept.claim((lower, upper)), None
         leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
         budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
-    elif kept is not None:
-        begun = kept.read((lower, upper), question.again)
-    if begun is None:
-        question.lower_to(find_counterexample(condition, bounded, lower, upper, wanted, generator))
-        begun = Standing(Search(single(lower, upper)), question.level, question.worst)
+    else:
+        begun = None if kept is None else kept.read((lower, upper), question.again)
+        begun = begun or question.begin(lower, upper, generator)
     search, earlier, saved = begun.search, begun.seconds, budget.elapsed
 
     def standing() -> Standing:
@@ -151,6 +143,11 @@ class WhereItHolds(Question):
         """Go on under a counterexample, if there is one."""
         if found is not None:
             self.worst, self.level = found, found.height - BELOW * abs(found.height)
+
+    def begin(self, lower: Corner, upper: Corner, generator: torch.Generator | None) -> Standing:
+        """The whole box, under the lowest counterexample that is found without bounds."""
+        self.lower_to(find_counterexample(self.condition, self.bounded, lower, upper, self.level, generator))
+        return Standing(Search(single(lower, upper)), self.level, self.worst)
 
     def again(self, worst: Counterexample | None) -> float:
         """The level under a counterexample of an earlier search, which is evaluated again.

@@ -16,6 +16,7 @@ from lyapnet.certification import (
     prove,
     sound_claim,
 )
+from lyapnet.certification import condition as conditions
 from lyapnet.certification import proof as proofs
 from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import minimum, share_below
@@ -137,7 +138,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
 
     for module, name in ((elementary_functions, "linearised"), (taylor, "multiply")):
         monkeypatch.setattr(module, name, without_remainder(getattr(module, name)))
-    monkeypatch.setattr(proofs, "BoundedFunction", partial(BoundedFunction, degree=1))  # all in remainders
+    monkeypatch.setattr(conditions, "BoundedFunction", partial(BoundedFunction, degree=1))  # all in remainders
     assert proof_without_search(monkeypatch, P).verdict == "certified"
 
 

@@ -18,6 +18,7 @@ from lyapnet.certification.sampling_certificates import (
     sampled_certificate,
 )
 from lyapnet.certification.sound_certificate import SoundCertificate, sound_certificate
+from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.controller import Controller, load
 from lyapnet.programs import Tolerances
@@ -103,10 +104,10 @@ def test_its_command_makes_the_same_certificate(reported, capsys):
 
 def test_another_checkpoint_has_another_hash(reported, checkpoint, tmp_path):
     copy = tmp_path / "copy.ckpt"
-    weights = torch.load(checkpoint, weights_only=True)
+    weights = read_checkpoint(checkpoint)
     name = next(key for key in weights["state_dict"] if key.startswith("V."))
     weights["state_dict"][name] += 1e-3
-    torch.save(weights, copy)
+    write_checkpoint(weights, copy)
     assert main(["certify", "sampled", str(copy), "--samples", "2", "--report", str(tmp_path)]) == 0
     assert content(tmp_path)["checkpoint"]["sha256"] != content(reported / "sampled")["checkpoint"]["sha256"]
 

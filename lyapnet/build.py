@@ -16,7 +16,7 @@ from torch import Tensor
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, CostConfig, SystemConfig
 from lyapnet.cost import COSTS, Cost, QuadraticCost
-from lyapnet.errors import UsageError, did_you_mean
+from lyapnet.errors import LyapnetError, UsageError, did_you_mean, raised
 from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
 from lyapnet.policy import POLICIES
 from lyapnet.problem import Horizon, Problem
@@ -92,6 +92,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         # in float64 for the checks below, and copies: the caller's own parts keep their precision
         system, cost, controls = copy.deepcopy((parts.system, parts.cost, parts.controls))
         system = build_system(config.system) if system is None else system.double()
+        system.check_coordinates()
         with _section("initial_states"):
             bounds = (config.initial_states.lower, config.initial_states.upper)
             initial_states = Box(*(_repeated(bound, system.n) for bound in bounds))
@@ -297,10 +298,11 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
         sys.path.insert(0, here)
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (Exception, SystemExit) as error:  # of any kind: the module is the user's
         choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
         raise UsageError(
-            f"Expected {key} as {choices}, got {name!r} ({error}); check the spelling and the working directory."
+            f"Expected {key} as {choices}, got {name!r} ({raised(error)}); check the spelling, the working directory "
+            "and that module."
         ) from error
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
@@ -376,13 +378,15 @@ def _require_length(key: str, length: int, system: ControlAffineSystem, expected
 
 @contextmanager
 def _section(name: str):
-    """Name the config's section in what a constructor refuses."""
+    """Name the config's section in what a constructor refuses, or what goes wrong in one of the user's own."""
     try:
         yield
-    except UsageError:
+    except LyapnetError:
         raise
-    except (ValueError, TypeError) as error:
-        raise UsageError(f"{name}: {error}") from error
+    except (Exception, SystemExit) as error:
+        if str(error).startswith("Expected "):  # lyapnet's own words
+            raise UsageError(f"{name}: {error}") from error
+        raise UsageError(f"Expected {name} that can be built, got {raised(error)}; correct it.") from error
 
 
 @contextmanager

@@ -18,6 +18,7 @@ from lyapnet.programs import PROGRAMS
 from lyapnet.rollout import GRADIENTS, METHODS
 from lyapnet.schema import check_values, checked, differences, option, read_yaml
 from lyapnet.sets import CONTROL_SETS
+from lyapnet.sizes import THREADS, check_sizes
 from lyapnet.systems import SYSTEMS
 
 SWITCH = ("auto", "on", "off")
@@ -148,7 +149,10 @@ class TrainingConfig:
     weight_decay: float = option(0.0, "AdamW weight decay.", at_least=0)
     precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
     threads: int = option(
-        1, "CPU threads; in networks this small, more of them mostly wait for each other.", at_least=1
+        1,
+        "CPU threads; in networks this small, more of them mostly wait for each other.",
+        at_least=1,
+        below=THREADS + 1,
     )
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
 
@@ -172,7 +176,7 @@ class Config:
 
     experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
     logs: str = option("logs", "The folder of all runs.")
-    seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0)
+    seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0, below=2**63)
     seeds: int = option(1, "Runs trained together as one batch, with the seeds seed, seed + 1, …", at_least=1)
     program: ProgramConfig = field(default_factory=ProgramConfig)
     pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
@@ -219,6 +223,7 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
+    check_sizes(config)
     return config
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, raised
 
 STEP = 1e-6  # of central differences, relative to the spread of an argument
 DIRECTIONS = 4  # along which derivatives are compared at each state
@@ -67,9 +67,8 @@ def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor])
         return function(*arguments)
     except (Exception, SystemExit) as error:
         shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
-        line = " ".join(str(error).split())
         raise UsageError(
-            f"Expected {name} for arguments of shape {shapes}, got {type(error).__name__}: {line}"
+            f"Expected {name} for arguments of shape {shapes}, got {raised(error)}; correct it there."
         ) from error
 
 

@@ -1,13 +1,38 @@
 """What lyapnet raises for its users: one line that says what was expected, what came, what to do."""
 
 import difflib
+import re
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
+
+_INSTALLED = (str(Path(__file__).parent), "site-packages", "<frozen", "/lib/python")
+_REQUEST = re.compile(
+    r"[^.;:]*(please|feel free to)[^.;]*(file|open|report|submit)[^.;]*(issue|bug|ticket).*", re.I | re.S
+)
+LONGEST = 400  # characters of a foreign message that a line repeats
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
     """How a message about an unknown name ends: with the nearest known one after its prefix, or with another advice."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {prefix}{near[0]}?" if near else otherwise
+
+
+def one_line(error: BaseException | str) -> str:
+    """The message of an error that another library raised: its words alone, and not its requests to report it."""
+    text = " ".join(_REQUEST.sub("", str(error)).split())
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
+
+
+def raised(error: BaseException) -> str:
+    """What code of the user's own raised, and in which line of it: "ValueError: no such mass (drone.py:12)"."""
+    known = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
+    own = [place for place in known if not any(part in place[0] for part in _INSTALLED)]
+    if isinstance(error, SyntaxError) and error.filename:
+        own = [(error.filename, error.lineno)]
+    what = f"{type(error).__name__}: {one_line(error)}"
+    return f"{what} ({Path(own[-1][0]).name}:{own[-1][1]})" if own else what
 
 
 class LyapnetError(Exception):
@@ -42,8 +67,11 @@ class OracleError(LyapnetError):
     """There is no ground truth for a task; what is measured without it can still be reported."""
 
 
-class Interrupted(LyapnetError):
-    """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once."""
+class Interrupted(BaseException):
+    """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once.
+
+    No Exception, as KeyboardInterrupt is none: what stops in the midst of a compiler or a user's function gets through.
+    """
 
     def __init__(self, message: str, exit_status: int = 0):
         super().__init__(message)

@@ -89,11 +89,8 @@ class Problem(nn.Module):
         """
         own = copy.deepcopy(self).double().cpu()
         system, cost, n, m = own.system, own.cost, own.system.n, own.system.m
+        system.check_coordinates()
         name = type(system).__name__
-        if len(system.state_units) != n or len(system.control_units) != m:
-            raise UsageError(
-                f"Expected one unit for each state and control name of {name}, got another number of units."
-            )
         generator = torch.Generator().manual_seed(0)
         x = own.initial_states.sample(256, generator)
         for symbol, function, shape in (

@@ -14,6 +14,7 @@ from lyapnet.problem import Problem
 from lyapnet.programs import EVENTS, Tolerances
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Trajectory
+from lyapnet.sizes import NUMBER, require_memory
 from lyapnet.types import State
 
 
@@ -131,6 +132,7 @@ def sampled_claim(
     """
     if samples < 1 or batch < 1:
         raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
+    require_memory("samples", samples, NUMBER * samples * problem.system.n, "draw fewer")
     x0 = problem.initial_states.sample(samples, generator)
     held = torch.cat([_events(rollout, part, tolerances, problem.goal) for part in x0.split(batch)])
     return SampledClaim(x0.cpu(), held, tolerances)

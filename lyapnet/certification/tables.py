@@ -13,7 +13,12 @@ from rich.table import Table
 @contextmanager
 def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
     """A bar in a terminal: how much of [0, T] × D a proof has decided. It is told of Progress."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TextColumn("{task.fields[state]}", markup=False),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"certifying, {kind}", total=None, state="")
 

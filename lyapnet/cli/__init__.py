@@ -3,8 +3,10 @@
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
 
+import signal
 import sys
-from typing import Annotated
+import threading
+from typing import Annotated, Any
 
 import typer
 
@@ -14,7 +16,7 @@ from lyapnet.cli.evaluate import evaluate
 from lyapnet.cli.sweep import sweep
 from lyapnet.cli.systems import systems
 from lyapnet.cli.train import train
-from lyapnet.errors import LyapnetError
+from lyapnet.errors import Interrupted, LyapnetError, one_line, raised
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -39,30 +41,40 @@ for group in (certify, bench):
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly."""
     arguments = sys.argv[1:] if arguments is None else arguments
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, so that work in progress can be kept
     try:
         return app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
-    except Exception as error:  # the outermost frame: one line for the user, whatever happened
+    except (Exception, SystemExit) as error:  # the outermost frame: one line for the user, whatever happened
         if "--debug" in arguments:
             raise
         line, status = _explain(error)
         print(line, file=sys.stderr)
         return status
+    except Interrupted as stop:
+        print(stop, file=sys.stderr)
+        return stop.exit_status
     except KeyboardInterrupt:
         print("Interrupted; whatever was saved is kept.", file=sys.stderr)
         return 130
 
 
-def _explain(error: Exception) -> tuple[str, int]:
+def _explain(error: Any) -> tuple[str, int]:
     """One line and the exit status for an exception that reached the user."""
     if isinstance(error, LyapnetError):
-        status = error.exit_status
-        return (f"error: {error}" if status else str(error)), status
+        return f"error: {' '.join(str(error).split())}", error.exit_status
     if isinstance(error, typer.TyperException):
-        return f"error: {error.format_message().rstrip('.')}. See lyapnet --help.", error.exit_code
+        context = getattr(error, "ctx", None)
+        command, got = getattr(context, "command_path", "lyapnet"), " ".join(error.format_message().split())
+        return (
+            f"error: Expected options as {command} --help has them, got: {got.rstrip('.')}; see there.",
+            error.exit_code,
+        )
+    if isinstance(error, SystemExit):
+        return f"error: Expected code of your own that returns, got {raised(error)}; take that out.", 1
     if isinstance(error, OSError):
         return (
             f"error: {error.strerror or error}: {error.filename or 'a file of the run'}; check space and permissions.",
             1,
         )
-    message = " ".join(str(error).split())
-    return f"error: {type(error).__name__}: {message}; run again with --debug for the traceback.", 1
+    return f"error: {type(error).__name__}: {one_line(error)}; run again with --debug for the traceback.", 1

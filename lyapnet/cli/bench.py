@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from typer.core import TyperGroup
 
 from lyapnet.cli.options import Debug
@@ -87,14 +88,14 @@ def gradient(
     batches = [_count("--batch", text) for text in _items(batch) or ["12", "64", "512"]]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
+    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
     say = partial(notes.print, soft_wrap=True)
     if not has_compiler():
         say("No C++ compiler ($CXX, g++ or clang++): compiled rows are left out.")
     rows = []
     for case, names in chosen:
         for size in batches:
-            with notes.status(f"{case.name}, batch {size}: {', '.join(names)}"):
+            with notes.status(escape(f"{case.name}, batch {size}: {', '.join(names)}")):
                 rows += benchmark.time_routes(case, size, names, repeats, say)
         if not as_json:
             console.print(bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
@@ -144,10 +145,10 @@ def certify(
     lengths = [_count("--dimensions", text) for text in _items([dimensions])]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
+    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
     case = condition_of_network() if checkpoint is None else condition_of_controller(load(checkpoint))
     enclosures = enclosures_of(case.condition, (case.lower, case.upper), partial(notes.print, soft_wrap=True))
-    with notes.status(f"{case.name}: {', '.join(enclosures)}"):
+    with notes.status(escape(f"{case.name}: {', '.join(enclosures)}")):
         bounds = tightness(case, enclosures, boxes, repeats)
     proofs = []
     with notes.status("chains of integrators") as status:

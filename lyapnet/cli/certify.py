@@ -212,7 +212,7 @@ def sound(
         parse_set(states)
     require_writable(figure, report, keep)
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
-    notes = Console(stderr=True, highlight=False)
+    notes = Console(stderr=True, highlight=False, markup=False)
 
     def certified(path: Path) -> Any:
         controller = load_controller(path, **own)
@@ -268,7 +268,7 @@ def _show(certificate: Any, checkpoint: Path, as_json: bool) -> None:
 
     if not as_json:
         table = certificate_table(str(checkpoint), certificate.result, certificate.labels)
-        Console(highlight=False).print(table)
+        Console(highlight=False, markup=False).print(table)
 
 
 def _write(
@@ -282,4 +282,4 @@ def _write(
         print(json.dumps(certificate.result, allow_nan=False))
     command = certificate.command(str(checkpoint), **own)
     for path in write_outputs(certificate, checkpoint, command, figure, report):
-        Console(stderr=True, highlight=False).print(f"wrote {path}", soft_wrap=True)
+        Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

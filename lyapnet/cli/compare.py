@@ -46,7 +46,7 @@ def compare(
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/compare.yaml.")
     comparison = load_comparison(config, overrides or [])
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if job is not None:
         run_job(job_named(comparison, job), console)
         return
@@ -78,7 +78,7 @@ def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
 
     for job in {job.task: job for job in jobs}.values():
         if (reason := why_no_optimum(job.bounded)) is not None:
-            console.print(f"{job.task}: cost without its optimum. {reason}", soft_wrap=True, markup=False)
+            console.print(f"{job.task}: cost without its optimum. {reason}", soft_wrap=True)
 
 
 def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console) -> int:

@@ -40,7 +40,7 @@ def evaluate(
     controller = load_controller(
         checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
     )
-    notes = Console(stderr=True, highlight=False)
+    notes = Console(stderr=True, highlight=False, markup=False)
     with notes.status("measuring …") as status:
         measured = evaluation(
             controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
@@ -53,9 +53,9 @@ def evaluate(
     if as_json:
         print(json.dumps(result))
     else:
-        Console(highlight=False).print(evaluation_table(str(checkpoint), result))
+        Console(highlight=False, markup=False).print(evaluation_table(str(checkpoint), result))
         if disturbed:
-            Console(highlight=False).print(robustness_table(result["robustness"], min(samples, 64)))
+            Console(highlight=False, markup=False).print(robustness_table(result["robustness"], min(samples, 64)))
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)

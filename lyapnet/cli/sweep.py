@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from lyapnet.cli.options import Debug
 from lyapnet.errors import LyapnetError
@@ -37,12 +38,12 @@ def sweep(
     from lyapnet.comparison.sweep.runs import sweep_csv
     from lyapnet.comparison.sweep.tables import sweep_table
 
-    console, notes = Console(highlight=False), Console(stderr=True, highlight=False)
+    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
     points = points_of(config or [], vary, overrides or [])
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     where = f"{workers} at a time" if ray is None else f"on the Ray cluster {ray}"
-    with notes.status(f"training {len(points)} runs, {where}"):
+    with notes.status(escape(f"training {len(points)} runs, {where}")):
         rows = run(points, workers, partial(notes.print, soft_wrap=True), ray)
     failed = len(points) - len({(row.config, row.value) for row in rows})
     for name in dict.fromkeys(row.config for row in rows):

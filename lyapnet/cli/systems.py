@@ -26,7 +26,7 @@ def systems(debug: Debug = False) -> None:
             "any number" if instance is None else ", ".join(instance.control_labels),
             ", ".join(shown),
         )
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     console.print(table)
     for part, (registry, _) in REGISTRIES.items():
         if part != "system":

@@ -27,7 +27,7 @@ def train(
 
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     command = shlex.join(["python", "train.py", "--config", str(config), *(overrides or [])])
     plan = plan_run(load_config(config, overrides or []), resume, finetune)
     if plan.finished:
@@ -54,4 +54,4 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         ("fine-tune", f"{command} --finetune {best}"),
         ("use", f'lyapnet.load("{best}")'),
     ):
-        console.print(f"{what:<10}{shown}", soft_wrap=True, markup=False)
+        console.print(f"{what:<10}{shown}", soft_wrap=True)

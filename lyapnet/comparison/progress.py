@@ -29,7 +29,7 @@ def progress(
         seconds = seconds_left(jobs, running, dict(took), workers)
         return "time left unknown" if seconds is None else f"{duration(seconds)} left"
 
-    columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"), TimeLeft(left))
+    columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}", markup=False), TimeLeft(left))
     bar = Progress(*columns, console=console, disable=not console.is_terminal)
     task = bar.add_task("starting", total=total, completed=finished)
 

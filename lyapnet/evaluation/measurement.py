@@ -12,6 +12,7 @@ from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.random_streams import TEST, stream
+from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.tables import csv_text
 from lyapnet.types import ControlPath, State
@@ -95,6 +96,8 @@ def evaluation(
     """
     if samples < 1:
         raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
+    size = size_of_loops(samples, controller.horizon.steps, controller.system.n)
+    require_memory("samples", samples, size, "draw fewer")
     trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.errors import UsageError
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.types import Control, ControlMatrix, Coordinates, InputMatrix, MassMatrix, PerState, State
 
@@ -20,10 +21,10 @@ class ControlAffineSystem(nn.Module, ABC):
     say so in a method `energy(x)` of shape (*batch,), in J: constant along u = 0 without friction.
     """
 
-    state_names: Sequence[str]
-    state_units: Sequence[str]
-    control_names: Sequence[str]
-    control_units: Sequence[str]
+    state_names: Sequence[str] = ()
+    state_units: Sequence[str] = ()
+    control_names: Sequence[str] = ()
+    control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
 
     @abstractmethod
@@ -47,6 +48,26 @@ class ControlAffineSystem(nn.Module, ABC):
     def m(self) -> int:
         """Number of controls."""
         return len(self.control_names)
+
+    def check_coordinates(self) -> None:
+        """Refuse names and units that are no lists of as many strings, and angles that are no states.
+
+        Raises:
+            UsageError: naming the attribute.
+        """
+        name = type(self).__name__
+        for names, units in (("state_names", "state_units"), ("control_names", "control_units")):
+            for attribute in (names, units):
+                listed = getattr(self, attribute)
+                if not isinstance(listed, list | tuple) or not all(isinstance(entry, str) for entry in listed):
+                    raise UsageError(f"Expected {name}.{attribute} as a list of strings, got {listed!r}; write it so.")
+            listed, of_each = getattr(self, names), getattr(self, units)
+            if not listed or len(set(listed)) < len(listed):
+                raise UsageError(f"Expected {name}.{names} with a name for each, got {listed!r}; declare them.")
+            if len(of_each) != len(listed):
+                raise UsageError(f"Expected one unit for each of {name}.{names}, got {len(of_each)}; declare {units}.")
+        if not all(isinstance(i, int) and 0 <= i < self.n for i in self.angles):
+            raise UsageError(f"Expected {name}.angles as indices of states, got {self.angles!r}; count from 0.")
 
     @property
     def state_labels(self) -> list[str]:

@@ -34,6 +34,7 @@ class Checkpoints(Checkpoint):
         self._saved: Callable[[], None] | None = saved
         self.best_loss = dict.fromkeys(best, math.inf)
         self._signal: int | None = None
+        self._begun = False  # whether a step has been
         self._previous: dict[int, Any] = {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -49,6 +50,7 @@ class Checkpoints(Checkpoint):
         self._install_handlers()  # again: Lightning sets one for SIGTERM in between
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._begun = True
         if trainer.global_step + 1 == trainer.max_epochs:
             trainer.check_val_every_n_epoch = 1
 
@@ -87,6 +89,8 @@ class Checkpoints(Checkpoint):
             self._saved = None
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
+        if not self._begun:  # while it compiles, or seeks an optimum: there is nothing yet to be saved
+            raise Interrupted(f"{signal.Signals(number).name} before the first step: the run is as it was.", 130)
         if self._signal is not None:  # the second time, the user means now
             raise Interrupted("Stopped at once; the last checkpoint is from before this step.", exit_status=130)
         self._signal = number

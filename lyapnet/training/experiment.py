@@ -12,6 +12,7 @@ from typing import Any
 import lightning as L
 import torch
 from rich.console import Console
+from rich.text import Text
 
 from lyapnet.build import Parts
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
@@ -58,7 +59,7 @@ def train(
         resolved, again = config_from_plain(content, overrides), 'lyapnet.train(…, resume="last")'
     plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
     if not plan.finished:
-        fit(plan, console or Console(highlight=False), again)
+        fit(plan, console or Console(highlight=False, markup=False), again)
     return plan.run
 
 
@@ -90,7 +91,7 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     trainer = build_trainer(plan, console)
     if trainer.is_global_zero:
         _prepare_folder(plan)
-        console.print(f"[bold]{config.experiment}[/]  {run.folder}", soft_wrap=True)
+        console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
     started = time.perf_counter()
     try:
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one

@@ -13,6 +13,7 @@ from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.controller import config_of, load_value_function, require_parts
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.sizes import check_training_sizes
 from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
@@ -62,6 +63,7 @@ def plan_run(
     """
     if resume and finetune:
         raise UsageError("Expected --resume or --finetune, got both; resume goes on, finetune starts a new run.")
+    check_training_sizes(config)
     check_trainer_options(config)
     require_libraries(config.loggers)
     callbacks = build_callbacks(config)

@@ -37,7 +37,7 @@ class TrainingProgress(ProgressBar):
         self._progress = Progress(
             MofNCompleteColumn(),
             BarColumn(bar_width=None),
-            TextColumn("{task.description}", table_column=Column(no_wrap=True)),
+            TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True)),
             TimeRemainingColumn(elapsed_when_finished=True),
             console=self._console,
             disable=not self._console.is_terminal,

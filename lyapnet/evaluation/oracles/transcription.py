@@ -121,6 +121,8 @@ class Transcription(Oracle):
         """The local minimum that IPOPT finds from a start, or its reason for none."""
         result = self._solver(x0=np.concatenate([start.u.ravel(), start.x.ravel()]), p=x0, lbg=0, ubg=0)
         status = self._solver.stats()["return_status"]
+        if status == "User_Requested_Stop":  # Ctrl-C or SIGTERM, which CasADi keeps to itself
+            raise KeyboardInterrupt
         if status != "Solve_Succeeded":
             return f"IPOPT: {status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])

@@ -346,7 +346,10 @@ def _rows(name: str, matrix: Any) -> Any:
     """A flat list of numbers as the diagonal matrix it stands for."""
     if not isinstance(matrix, list | tuple):
         raise ValueError(f"Expected {name} as a list of rows, or of the diagonal's numbers, got {matrix!r}.")
-    if isinstance(matrix, list | tuple) and all(isinstance(v, int | float) for v in matrix):
+    entries = [entry for row in matrix for entry in (row if isinstance(row, list | tuple) else [row])]
+    if any(type(entry) not in (int, float) for entry in entries):
+        raise ValueError(f"Expected {name} of real numbers, got {matrix!r}; write each as 1 or 0.5.")
+    if all(type(row) in (int, float) for row in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix
 

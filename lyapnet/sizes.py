@@ -67,6 +67,7 @@ def check_training_sizes(config: Any) -> None:
         config.evaluation,
     )
     learner = 10_000 + COPIES * NUMBER * _weights(n, hidden)
+    require_memory("network.hidden", hidden, learner, "choose smaller widths")
     require_memory("seeds", config.seeds, config.seeds * learner, "train fewer at once")
     for name, states in (
         ("training.batch_size", config.training.batch_size),

@@ -139,7 +139,7 @@ class RolloutConfig:
 class TrainingConfig:
     """The optimisation."""
 
-    iterations: int = option(200, "Gradient steps.", at_least=1)
+    iterations: int = option(200, "Gradient steps.", at_least=1, below=10**12)
     batch_size: int = option(64, "Initial states in each step, per process.", at_least=1)
     optimizer: str = option("adam", "adam, or adamw with decoupled weight decay.", choices=("adam", "adamw"))
     learning_rate: float = option(1e-2, "Step size at the start.", above=0)

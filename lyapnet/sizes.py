@@ -76,9 +76,8 @@ def check_training_sizes(config: Any) -> None:
         require_memory(name, states, size_of_loops(states * config.seeds, steps, n), "choose fewer")
     test = size_of_loops(options.test_states, steps, n)
     require_memory("evaluation.test_states", options.test_states, test, "choose fewer")
-    if options.certify_every:
-        certified = NUMBER * n * options.certified_states
-        require_memory("evaluation.certified_states", options.certified_states, certified, "choose fewer")
+    certified = NUMBER * n * options.certified_states
+    require_memory("evaluation.certified_states", options.certified_states, certified, "choose fewer")
     if config.pointwise.weight:
         points = NUMBER * config.pointwise.points * max([n, *hidden])
         require_memory("pointwise.points", config.pointwise.points, points, "choose fewer")

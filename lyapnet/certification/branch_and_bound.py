@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.certification.boxes import Boxes, CutTree, roots, single
+from lyapnet.certification.stopping import Stop
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import TaylorForm, wide_axes
 from lyapnet.types import Corner, Corners, PerBox, Value
@@ -36,6 +37,7 @@ class Budget:
     frontier: int = 1_000_000
     workers: int = 1
     started: float = field(default_factory=time.monotonic)
+    stop: Stop = field(default_factory=Stop)  # asked by the user
 
     @property
     def elapsed(self) -> float:
@@ -44,7 +46,13 @@ class Budget:
 
     def spent(self, boxes: int) -> bool:
         """Whether no more work is to be begun."""
-        return self.elapsed >= self.seconds or boxes >= self.boxes
+        self.stop.searching = True
+        return self.stop.asked or self.elapsed >= self.seconds or boxes >= self.boxes
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return max(0.0, self.seconds - self.elapsed)
 
 
 MARGIN = 1e-9

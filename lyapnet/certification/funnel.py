@@ -17,7 +17,7 @@ from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, prove
 from lyapnet.certification.verdict import Verdict
 from lyapnet.contracts import check_function
-from lyapnet.errors import UsageError
+from lyapnet.errors import Interrupted, UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.problem import TRIED, Problem
@@ -25,8 +25,8 @@ from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
-LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most
-FINISH = 5.0  # seconds, or a fifth of those for the proof, for the share of X₀ and κ
+LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most …
+SHARE_OF_LEVELS, SHARE_OF_FINISH = 0.3, 0.15  # … of the budget, which also leaves some to the share of X₀ and κ
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ def sound_claim(
     keep: Path | None = None,
     replay: bool = False,
 ) -> SoundClaim:
-    """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
+    """The largest funnel that can be proved within a budget, all that belongs to it included.
+
+    It is not sought beyond what X₀ needs.
 
     Args:
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
@@ -114,6 +116,7 @@ def sound_claim(
 
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
+        Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget = time.monotonic(), budget or Budget()
     condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
@@ -122,7 +125,7 @@ def sound_claim(
     initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     _require_continuous(condition.V, x_low, x_high)
-    levels = Budget(LEVELS, chunk=budget.chunk)  # of its own: what is proved must not depend on how long it may take
+    levels = Budget(min(LEVELS, SHARE_OF_LEVELS * budget.left), chunk=budget.chunk)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
     if states is None:
         states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
@@ -134,16 +137,20 @@ def sound_claim(
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
     set_up = time.monotonic() - started
-    budget = replace(budget, started=time.monotonic())
+    search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
     level = min(needed, just_below(rim))
-    proof = prove(condition, domain, level, budget, False, generator, report, keep, replay)
+    with search.stop:
+        proof = prove(condition, domain, level, search, False, generator, report, keep, replay)
+    if search.stop.asked:
+        kept = f"the proof so far is kept in {keep}; the same command goes on" if keep else "nothing without --keep"
+        raise Interrupted(f"Stopped while certifying: {kept}.", 130)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
-    if found is None and rim <= needed:  # the proof was about less than what X₀ needs, and so was its search
+    if found is None and rim <= needed and budget.left:  # proved, and so searched, was less than what X₀ needs
         found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
-        finish = Budget(max(FINISH, 0.2 * budget.seconds), chunk=budget.chunk)
+        finish = Budget(budget.left, chunk=budget.chunk)
         start_low, start_high = _at(0.0, x_low, x_high)
         inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)

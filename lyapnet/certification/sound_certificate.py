@@ -1,5 +1,7 @@
 """Certificates by proof: a funnel, and the cost that it guarantees."""
 
+import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -48,7 +50,8 @@ class SoundCertificate(Certificate):
     claim: SoundClaim
 
     def numbers(self) -> dict[str, Any]:
-        return {**self.proved(), "guaranteed_cost_ratio": guaranteed_cost_ratio(self.controller, self.claim)}
+        seconds = max(1.0, 0.1 * self.options["seconds"])  # for the optima, which are beside the claim
+        return {**self.proved(), "guaranteed_cost_ratio": guaranteed_cost_ratio(self.controller, self.claim, seconds)}
 
     def proved(self) -> dict[str, Any]:
         """The numbers of the claim, without the optimum, which takes an oracle."""
@@ -114,6 +117,8 @@ def sound_certificate(
     keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
+    *,
+    started: float | None = None,
 ) -> SoundCertificate:
     """The sound claim about a controller.
 
@@ -121,14 +126,16 @@ def sound_certificate(
         alpha: the share of ℓ that V pays for.
         delta: slack in cost per second; default_delta if None.
         set: D, as parse_set reads it; found if None.
-        seconds: when to stop undecided.
+        seconds: when to stop undecided, set-up and what follows the proof included.
         keep: a file in which an unfinished proof is kept.
         report: is told how far the proof is.
+        started: time.monotonic() from which the seconds count; now if None.
     """
+    budget = Budget(seconds, workers=workers, started=time.monotonic() if started is None else started)
     claim = sound_claim(
         controller.closed_loop, controller.problem, alpha,
         default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
-        Budget(seconds, workers=workers), stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
+        budget, stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
     )  # fmt: skip
     options = {
         "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "keep": keep, "seed": seed,
@@ -161,11 +168,18 @@ def _pairs(text: str) -> Sequence[Sequence[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
-def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim) -> float | None:
+def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim, seconds: float = math.inf) -> float | None:
     """Mean guaranteed cost over the mean optimum of the discretised task, on states of X₀ inside the funnel.
 
-    None where there is no funnel or no oracle. A search by IPOPT takes fewer states, and the controller's help.
+    None where there is no funnel or no oracle, or it takes longer. A search by IPOPT takes fewer states, and the
+    controller's help.
     """
+    end = time.monotonic() + seconds
+
+    def in_time(done: int, total: int) -> None:
+        if done < total and time.monotonic() > end:
+            raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
+
     x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
     guaranteed = claim.guaranteed_cost(controller.value(0.0, x0).double())
     x0, guaranteed = x0[guaranteed.isfinite()], guaranteed[guaranteed.isfinite()]
@@ -175,7 +189,7 @@ def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim) -> float | 
         oracle = oracle_of(controller.problem, controller.method)
         if not isinstance(oracle, RiccatiOracle):
             x0, guaranteed = x0[:SEARCHED], guaranteed[:SEARCHED]
-        optima = oracle.solve(x0, controller.rollout(x0).u)
+        optima = oracle.solve(x0, controller.rollout(x0).u, in_time)
     except OracleError:
         return None
     return ratio_of_means(guaranteed, optima.cost)

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 from lyapnet.cli.options import Debug
 from lyapnet.errors import UsageError
 from lyapnet.files import plain
+from lyapnet.sizes import THREADS
 
 DEFAULT = "gradient"
 
@@ -51,7 +52,7 @@ def gradient(
     batch: Annotated[list[str] | None, typer.Option(help="Numbers of initial states; 12,64,512 if none.")] = None,
     routes: Annotated[list[str] | None, typer.Option(help="Some of the above; all that can run here if none.")] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Timings of each, of which the median counts.")] = 7,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=THREADS, help="CPU threads.")] = 1,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
     figures: Annotated[Path | None, typer.Option(help="Write figures into this folder.", metavar="FOLDER")] = None,
     debug: Debug = False,

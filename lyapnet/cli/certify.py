@@ -4,6 +4,7 @@ import json
 import math
 import shlex
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,6 +15,7 @@ from typer.core import TyperGroup, TyperOption
 
 from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
 from lyapnet.errors import UsageError
+from lyapnet.sizes import THREADS
 
 DEFAULT = "statistical"
 
@@ -181,7 +183,7 @@ def sound(
     seconds: Annotated[
         float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
     ] = 60.0,
-    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=THREADS, help="Threads.")] = 1,
     keep: Annotated[
         str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
     ] = None,
@@ -200,6 +202,7 @@ def sound(
     debug: Debug = False,
 ) -> None:  # fmt: skip
     """A funnel that no closed loop leaves, and its cost: proved."""
+    begun = time.monotonic()
     if refine and keep is not None:
         raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
     if overrides and not refine:
@@ -214,10 +217,13 @@ def sound(
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
     notes = Console(stderr=True, highlight=False, markup=False)
 
-    def certified(path: Path) -> Any:
+    def certified(path: Path, started: float | None = None) -> Any:
+        started = started or time.monotonic()
         controller = load_controller(path, **own)
         with proof_progress(notes, "sound") as progress:
-            certificate = sound_certificate(controller, alpha, delta, states, seconds, workers, keep, seed, progress)
+            certificate = sound_certificate(
+                controller, alpha, delta, states, seconds, workers, keep, seed, progress, started=started
+            )
         _show(certificate, path, as_json)
         return certificate
 
@@ -228,7 +234,7 @@ def sound(
         parts = parts_given(checkpoint, **own)
         checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes, parts)
     else:
-        certificate = certified(checkpoint)
+        certificate = certified(checkpoint, begun)
     _write(certificate, checkpoint, own, as_json, figure, report)
 
 

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from lyapnet.cli.options import Debug
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.sizes import THREADS
 
 
 def compare(
@@ -21,7 +22,9 @@ def compare(
     tasks: Annotated[str | None, typer.Option(help="Only these.", metavar="NAME,NAME,…")] = None,
     methods: Annotated[str | None, typer.Option(help="Only these.", metavar="NAME,NAME,…")] = None,
     seeds: Annotated[int | None, typer.Option(min=1, help="Seeds of every method; the config's if none.")] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Jobs at a time; one for each core if none.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=THREADS, help="Jobs at a time; one for each core if none.")
+    ] = None,
     ray: Annotated[
         str | None, typer.Option(help="Run the jobs on the Ray cluster there: auto, local, ray://…", metavar="ADDRESS")
     ] = None,

@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+from lyapnet.errors import UsageError
 
 
 def evaluate(
@@ -37,6 +38,10 @@ def evaluate(
     from lyapnet.evaluation.robustness import robustness
     from lyapnet.evaluation.tables import evaluation_table, robustness_table
 
+    if table is not None and not table.parent.is_dir():
+        raise UsageError(
+            f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
+        )
     controller = load_controller(
         checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
     )

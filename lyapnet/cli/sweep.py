@@ -10,13 +10,14 @@ from rich.markup import escape
 
 from lyapnet.cli.options import Debug
 from lyapnet.errors import LyapnetError
+from lyapnet.sizes import THREADS
 
 
 def sweep(
     overrides: Annotated[list[str] | None, typer.Argument(help="Changes to every config, as key.sub=value.")] = None,
     config: Annotated[list[Path] | None, typer.Option(help="An experiment, a YAML file; once or more.")] = None,
     vary: Annotated[str | None, typer.Option(help="A key and its values.", metavar="KEY=VALUE,VALUE,…")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="Trainings at a time.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=THREADS, help="Trainings at a time.")] = 1,
     ray: Annotated[
         str | None, typer.Option(help="Train on the Ray cluster there: auto, local, ray://…", metavar="ADDRESS")
     ] = None,

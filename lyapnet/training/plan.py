@@ -9,7 +9,7 @@ import lightning as L
 import torch
 
 from lyapnet.build import Parts, parts_of
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.controller import config_of, load_value_function, require_parts
 from lyapnet.errors import LyapnetError, UsageError
@@ -116,6 +116,8 @@ def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:
     """Put the weights of a checkpoint into every member, if there is one to fine-tune from."""
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)
+        if content[KEY].get("config") is not None:
+            config_of(content, checkpoint)  # refuses what this version does not understand
         for member in module.members:
             load_value_function(member.V, content, checkpoint)
 

@@ -35,7 +35,6 @@ def _few_seconds_for_levels():
     """What is sought beside the proof takes no longer than this; it decides no verdict here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(funnels, "LEVELS", 0.5)
-        patch.setattr(funnels, "FINISH", 0.5)
         yield
 
 

@@ -112,7 +112,7 @@ IMPOSSIBLE = [
 
 
 def fields(cls=Config, prefix=""):
-    """Full name, type and kind of bound of every field with a bound or choices, or of a type that refuses some values."""
+    """Full name and type of every field, and whether it has choices."""
     for f in dataclasses.fields(cls):
         if dataclasses.is_dataclass(f.type):
             yield from fields(f.type, f"{prefix}{f.name}.")
@@ -195,12 +195,15 @@ class Own(Cost):
 """
 BODIES = [
     "return None", "return (x, x)", "return 3.0", "return x.numpy()", "return x.detach().float()", "return 'text'",
-    "raise KeyError('mass')", "raise RuntimeError('a\\nb')", "sys.exit(0)", "sys.exit('bye')", "return x[..., :1, None, None]",
-    "return undefined", "return torch.full_like(x, torch.nan)", "return x @ torch.ones(7, 7)", "return torch.rand_like(x)",
+    "raise KeyError('mass')", "raise RuntimeError('a\\nb')", "sys.exit(0)", "sys.exit('bye')",
+    "return x[..., :1, None, None]",
+    "return undefined", "return torch.full_like(x, torch.nan)", "return x @ torch.ones(7, 7)",
+    "return torch.rand_like(x)",
     "return x.mean(0)", "x += 1", "return x.detach().sum()", "return x.to(torch.complex128)", "return [x]",
 ]  # fmt: skip
 ABOVE = [
-    "import no_such_module", "from lyapnet import NoSuch", "1 / 0", "sys.exit(0)", "def (", "undefined", "raise SystemExit",
+    "import no_such_module", "from lyapnet import NoSuch", "1 / 0", "sys.exit(0)", "def (", "undefined",
+    "raise SystemExit",
     "'unclosed", "  indented = 1", "raise Exception('[/bold] please file an issue at pytorch')",
 ]  # fmt: skip
 START = [
@@ -212,7 +215,8 @@ START = [
     "torch.ones(2) @ torch.ones(3)",
 ]
 FACTS = [
-    "state_names = ()", "state_names = 'position'", "state_units = ('m',)", "control_names = ()", "state_names = (1, 2)",
+    "state_names = ()", "state_names = 'position'", "state_units = ('m',)", "control_names = ()",
+    "state_names = (1, 2)",
     "state_names = ('a', 'a')", "angles = (5,)", "angles = ('position',)", "state_names = None", "control_units = ()",
 ]  # fmt: skip
 PLACES = [
@@ -355,7 +359,8 @@ def files(draw):
     content, verb = (HERE / "best.ckpt").read_bytes(), draw.choice(VERBS)
     at = draw.randrange(1, len(content) - 1)
     broken, what = draw.choice([
-        (content[:at], f"cut at {at}"), (b"", "empty"), (b"\x80\x04}.", "another pickle"), (b"PK\x03\x04", "no archive"),
+        (content[:at], f"cut at {at}"), (b"", "empty"), (b"\x80\x04}.", "another pickle"),
+        (b"PK\x03\x04", "no archive"),
         (draw.randbytes(500), "noise"), (content[: len(content) // 2] + draw.randbytes(2000), "half noise"),
         (rewritten(lambda c: c["lyapnet"].update(config="none")), "config a string"),
         (rewritten(lambda c: c["state_dict"].clear()), "no weights"),
@@ -371,7 +376,8 @@ def files(draw):
     return Malformed(verb.split(), {"broken.ckpt": broken, "experiment.yaml": yaml.safe_dump(BASE)}, f"{what}: {verb}")
 
 
-VERBS = ["evaluate broken.ckpt", "certify broken.ckpt", "certify sampled broken.ckpt", "certify sound broken.ckpt --seconds 1",
+VERBS = ["evaluate broken.ckpt", "certify broken.ckpt", "certify sampled broken.ckpt",
+         "certify sound broken.ckpt --seconds 1",
          "train --config experiment.yaml --resume broken.ckpt", "train --config experiment.yaml --finetune broken.ckpt",
          "bench certify broken.ckpt"]  # fmt: skip
 

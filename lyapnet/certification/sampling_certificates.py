@@ -25,14 +25,18 @@ class SampledCertificate(Certificate):
         "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
         "all_share": "all that is asked for",
         "confidence": "confidence",
+        "draws": "draws of this checkpoint, other seeds included",
+        "confidence_over_draws": "confidence over all of them",
         "decrease_lower_bound": "condition holds on at least",
         "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
         "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
         "probability_lower_bound": "all that is asked for on at least",
         "required_share": "share of X₀ that the verdict is about",
         "failure": "a state that fails",
+        "caveat": "this draw",
     }
     claim: SampledClaim
+    caveat: str | None = None  # why the draw is not on record
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
@@ -42,6 +46,7 @@ class SampledCertificate(Certificate):
             **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
             "tolerances": asdict(claim.tolerances),
             "failure": claim.failures[0].tolist() if len(claim.failures) else None,
+            **({} if self.caveat is None else {"caveat": self.caveat}),
         }
 
     def in_words(self) -> str:
@@ -88,7 +93,10 @@ class StatisticalCertificate(SampledCertificate):
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
-        bounds = {"confidence": claim.confidence, "required_share": claim.share, **claim.named_bounds}
+        bounds = {
+            "confidence": claim.confidence, "draws": claim.draws,
+            "confidence_over_draws": claim.confidence_over_draws, "required_share": claim.share, **claim.named_bounds,
+        }  # fmt: skip
         return {**super().numbers(), **bounds}
 
     def in_words(self) -> str:
@@ -96,13 +104,19 @@ class StatisticalCertificate(SampledCertificate):
         return (
             f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop keeps the "
             "conditions below on the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound of "
-            f"{successes} successes in {self._drawn}. The confidence is over the draw. Like the rollouts the claim "
-            "speaks of this model, this Δt and this integrator."
+            f"{successes} successes in {self._drawn}. The confidence is over the draw{self._others}. Like the rollouts "
+            "the claim speaks of this model, this Δt and this integrator."
         )
 
     @property
+    def _others(self) -> str:
+        """What there is to say of further draws."""
+        chosen = f", one of {self.claim.draws} of this checkpoint, from which it may have been chosen"
+        return (chosen if self.claim.draws > 1 else "") + (f"; {self.caveat}" if self.caveat else "")
+
+    @property
     def _confidence(self) -> str:
-        return f"1 − {1 - self.claim.confidence:.2g}"
+        return f"1 − {1 - self.claim.confidence_over_draws:.2g}"
 
     def in_formulas(self) -> list[str]:
         bound = floored(self.claim.probability_lower_bound)
@@ -143,14 +157,19 @@ def statistical_certificate(
     share: float = 0.99,
     radius: float | None = None,
     seed: int = 0,
+    *,
+    draws: int = 1,
 ) -> StatisticalCertificate:
     """The statistical claim about a controller.
 
     Args:
         share: of X₀, about which the verdict is.
         radius: of success at T, in the norm of x; not asked for if None.
+        draws: of this controller that were made, this one included, with other seeds or numbers of states.
     """
     tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
-    claim = statistical_claim(controller.rollout, controller.problem, tolerances, samples, confidence, share, generator)
+    claim = statistical_claim(
+        controller.rollout, controller.problem, tolerances, samples, confidence, share, generator, draws=draws
+    )
     options = {"samples": samples, "confidence": confidence, "share": share, "radius": radius, "seed": seed}
     return StatisticalCertificate(controller, claim, options)

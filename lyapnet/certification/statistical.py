@@ -60,11 +60,19 @@ class StatisticalClaim(SampledClaim):
     """With this confidence, at least `probability_lower_bound` of X₀ by volume succeeds.
 
     The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
-    holds for each event by itself. Like the rollouts it speaks of this model, this Δt and this integrator.
+    holds for each event by itself. Like the rollouts it speaks of this model, this Δt and this integrator. Where one of
+    K draws was chosen, the bounds hold with confidence 1 − K(1 − confidence) alone (Bonferroni), and the verdict takes
+    bounds that keep the confidence, each at 1 − (1 − confidence)/K.
     """
 
     confidence: float
     share: float  # of X₀, about which there is a verdict
+    draws: int = 1  # K, this one included
+
+    @property
+    def confidence_over_draws(self) -> float:
+        """With which the bounds hold, whichever of the draws this is."""
+        return max(0.0, 1 - self.draws * (1 - self.confidence))
 
     @property
     def lower_bounds(self) -> dict[str, float]:
@@ -86,10 +94,10 @@ class StatisticalClaim(SampledClaim):
     @property
     def verdict(self) -> Verdict:
         """On the claim that at least `share` of X₀ succeeds, at this confidence either way."""
-        if self.probability_lower_bound >= self.share:
+        each, failures = 1 - (1 - self.confidence) / self.draws, len(self.failures)
+        if lower_bound(self.successes["all"], self.samples, each) >= self.share:
             return "certified"
-        failures = len(self.failures)
-        return "falsified" if 1 - lower_bound(failures, self.samples, self.confidence) < self.share else "unknown"
+        return "falsified" if 1 - lower_bound(failures, self.samples, each) < self.share else "unknown"
 
 
 def lower_bound(successes: int, samples: int, confidence: float) -> float:
@@ -147,18 +155,22 @@ def statistical_claim(
     share: float = 0.99,
     generator: torch.Generator | None = None,
     batch: int = 1000,
+    draws: int = 1,
 ) -> StatisticalClaim:
     """Bound the share of X₀ on which the closed loop succeeds, from fresh states.
 
     The states must be fresh, drawn by a generator on which nothing was trained or chosen, and their number fixed in
-    advance: drawing until the bound pleases voids it.
+    advance: drawing until the bound pleases voids it, unless all the draws are counted.
+
+    Args:
+        draws: from which this one may be chosen, itself included.
 
     Raises:
         ValueError: as sampled_claim and lower_bound.
     """
     lower_bound(0, samples, confidence)  # refuse before the work
     sampled = sampled_claim(rollout, problem, tolerances, samples, generator, batch)
-    return StatisticalClaim(**vars(sampled), confidence=confidence, share=share)
+    return StatisticalClaim(**vars(sampled), confidence=confidence, share=share, draws=draws)
 
 
 FEWEST = 16  # states that are counted as failures together where one of them diverges

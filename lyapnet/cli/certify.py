@@ -111,12 +111,14 @@ def sampled(
     debug: Debug = False,
 ) -> None:
     """The share of some states whose closed loop succeeds. It proves no more."""
+    from lyapnet.certification.draws import draws_of
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sampling_certificates import sampled_certificate
 
     require_writable(figure, report)
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
     certificate = sampled_certificate(load_controller(checkpoint, **own), samples, radius, seed)
+    _record(certificate, draws_of(checkpoint, **own, radius=radius))
     _show(certificate, checkpoint, as_json)
     _write(certificate, checkpoint, own, as_json, figure, report)
 
@@ -146,13 +148,17 @@ def statistical(
     debug: Debug = False,
 ) -> None:
     """A share of X₀ that succeeds, with a confidence."""
+    from lyapnet.certification.draws import draws_of
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sampling_certificates import statistical_certificate
 
     require_writable(figure, report)
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
     controller = load_controller(checkpoint, **own)
-    certificate = statistical_certificate(controller, samples, confidence, share, radius, seed)
+    draws = draws_of(checkpoint, **own, radius=radius)
+    made = 1 + draws.others(seed, samples)
+    certificate = statistical_certificate(controller, samples, confidence, share, radius, seed, draws=made)
+    _record(certificate, draws)
     _show(certificate, checkpoint, as_json)
     _write(certificate, checkpoint, own, as_json, figure, report)
 
@@ -266,6 +272,12 @@ def check(
     else:
         Console(highlight=False).print(certificate_table(f"{proof}, {checkpoint}", result, LABELS))
     raise typer.Exit(result["verdict"] != "certified")
+
+
+def _record(certificate: Any, draws: Any) -> None:
+    """Take down the draw of a certificate, or have it say why that is not possible."""
+    options = certificate.options
+    certificate.caveat = draws.record(certificate.kind, options["seed"], options["samples"], certificate.verdict)
 
 
 def _show(certificate: Any, checkpoint: Path, as_json: bool) -> None:

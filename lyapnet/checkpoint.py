@@ -123,7 +123,9 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
             warnings.simplefilter("ignore")
             return torch.load(path, map_location=device, weights_only=True)
     except OSError as error:
-        raise CheckpointError(f"Expected a readable checkpoint, got {str(path)!r} ({error.strerror}).") from error
+        raise CheckpointError(
+            f"Expected a readable checkpoint, got {str(path)!r} ({error.strerror}); use another."
+        ) from error
     except UNREADABLE as error:
         raise CheckpointError(
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which is truncated or foreign "

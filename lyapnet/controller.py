@@ -241,9 +241,9 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
         )
     try:
         if not isinstance(plain, dict):
-            raise UsageError(f"Expected a config, got {type(plain).__name__}")
+            raise UsageError(f"Expected a config, got {type(plain).__name__}; use another checkpoint.")
         if "${" in json.dumps(plain, ensure_ascii=False):  # resolving one may read the environment, or call a function
-            raise UsageError("Expected plain values, got an interpolation ${…}")
+            raise UsageError("Expected plain values, got an interpolation ${…}; use another checkpoint.")
         return config_from_plain(plain)
     except UsageError as error:
         raise CheckpointError(

@@ -126,6 +126,9 @@ def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
                     f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
                 )
             _refuse_unknown_keys(value, section, f"{prefix}{key}.")
+        collection = str(section).partition("[")[0]
+        if isinstance(value, {"list": Mapping, "dict": list}.get(collection, ())):
+            raise UsageError(f"Expected {prefix}{key} as {section}, got {value!r}; correct its value.")
         for entry in get_args(section)[1:]:  # of dict[str, section]
             for name, one in value.items() if dataclasses.is_dataclass(entry) else ():
                 _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")

@@ -27,7 +27,7 @@ BASE = {
     "training": {"iterations": 1, "batch_size": 2},
     "evaluation": {"validation_states": 2, "test_states": 2, "optimum": False},
 }  # fmt: skip
-FORM = re.compile(r"error: .*Expected .+, got.+[;:,] .+\.")
+FORM = re.compile(r"error: .*Expected .+, got.+[;:,] .+[.?]")
 
 
 class Malformed(NamedTuple):

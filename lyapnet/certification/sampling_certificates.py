@@ -36,7 +36,6 @@ class SampledCertificate(Certificate):
         "caveat": "this draw",
     }
     claim: SampledClaim
-    caveat: str | None = None  # why the draw is not on record
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
@@ -46,7 +45,6 @@ class SampledCertificate(Certificate):
             **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
             "tolerances": asdict(claim.tolerances),
             "failure": claim.failures[0].tolist() if len(claim.failures) else None,
-            **({} if self.caveat is None else {"caveat": self.caveat}),
         }
 
     def in_words(self) -> str:
@@ -90,6 +88,7 @@ class StatisticalCertificate(SampledCertificate):
 
     kind: ClassVar[str] = "statistical"
     claim: StatisticalClaim
+    caveat: str | None = None  # why the draw is not on record
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
@@ -97,7 +96,7 @@ class StatisticalCertificate(SampledCertificate):
             "confidence": claim.confidence, "draws": claim.draws,
             "confidence_over_draws": claim.confidence_over_draws, "required_share": claim.share, **claim.named_bounds,
         }  # fmt: skip
-        return {**super().numbers(), **bounds}
+        return {**super().numbers(), **bounds, **({"caveat": self.caveat} if self.caveat else {})}
 
     def in_words(self) -> str:
         bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]

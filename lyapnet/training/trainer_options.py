@@ -44,7 +44,9 @@ def check_trainer_options(config: Config) -> None:
             owned = key in inspect.signature(L.Trainer).parameters
             nearest = did_you_mean(key, TRAINER_OPTIONS, "remove it", "trainer.")
             hint = "lyapnet sets that one itself" if owned else nearest
-            raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint}")
+            raise UsageError(
+                f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint.rstrip('.?')}."
+            )
         expected, holds = VALUES.get(key, ("", lambda _: True))
         if value is not None and not holds(value):
             raise UsageError(f"Expected trainer.{key} as {expected}, got {value!r}; correct it, or leave it out.")

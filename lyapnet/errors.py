@@ -2,8 +2,11 @@
 
 import difflib
 import re
+import signal
+import threading
 import traceback
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _INSTALLED = (str(Path(__file__).parent), "site-packages", "<frozen", "/lib/python")
@@ -76,3 +79,15 @@ class Interrupted(BaseException):
     def __init__(self, message: str, exit_status: int = 0):
         super().__init__(message)
         self.exit_status = exit_status
+
+
+@contextmanager
+def signals_taken(handler: Callable[..., None]) -> Iterator[None]:
+    """Have a handler take Ctrl-C and SIGTERM, where this is the main thread; who took them before does afterwards."""
+    main = threading.current_thread() is threading.main_thread()
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM) if main}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -139,7 +139,7 @@ def sound_claim(
     set_up = time.monotonic() - started
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
     level = min(needed, just_below(rim))
-    with search.stop:
+    with search.stop.listening():
         proof = prove(condition, domain, level, search, False, generator, report, keep, replay)
     if search.stop.asked:
         kept = f"the proof so far is kept in {keep}; the same command goes on" if keep else "nothing without --keep"

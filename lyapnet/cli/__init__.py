@@ -5,7 +5,6 @@ A command imports what it needs when it runs: help and misspelt options are answ
 
 import signal
 import sys
-import threading
 from typing import Annotated, Any
 
 import typer
@@ -16,7 +15,7 @@ from lyapnet.cli.evaluate import evaluate
 from lyapnet.cli.sweep import sweep
 from lyapnet.cli.systems import systems
 from lyapnet.cli.train import train
-from lyapnet.errors import Interrupted, LyapnetError, one_line, raised
+from lyapnet.errors import Interrupted, LyapnetError, one_line, raised, signals_taken
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -41,10 +40,9 @@ for group in (certify, bench):
 def main(arguments: list[str] | None = None) -> int:
     """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C, so that work in progress can be kept
     try:
-        return app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
+        with signals_taken(_stop):
+            return app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
     except (Exception, SystemExit) as error:  # the outermost frame: one line for the user, whatever happened
         if "--debug" in arguments:
             raise
@@ -54,9 +52,10 @@ def main(arguments: list[str] | None = None) -> int:
     except Interrupted as stop:
         print(stop, file=sys.stderr)
         return stop.exit_status
-    except KeyboardInterrupt:
-        print("Interrupted; whatever was saved is kept.", file=sys.stderr)
-        return 130
+
+
+def _stop(number: int, frame: Any) -> None:
+    raise Interrupted(f"{signal.Signals(number).name}: stopped at once; what was saved before is kept.", 130)
 
 
 def _explain(error: Any) -> tuple[str, int]:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
@@ -51,6 +52,7 @@ class Transcription(Oracle):
         require_equal(step, self.step, (x, u))
         require_equal(end, self.end, (x,))
         self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
+        self._stopped = False
         self._solver = _solver(step, end, horizon.steps, iterations)
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
@@ -79,7 +81,8 @@ class Transcription(Oracle):
         search = MultiStart(states.numpy(), stored, self.minimise)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
-            search.run(dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
+            with signals_taken(self._stop):
+                search.run(dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
@@ -117,12 +120,17 @@ class Transcription(Oracle):
             known = given[i]
             yield cold if known is None else [known, *cold]
 
+    def _stop(self, *_: object) -> None:
+        """Take Ctrl-C or SIGTERM; CasADi ends at what this raises, and keeps it to itself."""
+        self._stopped = True
+        raise Interrupted("Stopped while seeking optima; those of earlier evaluations are kept.", 130)
+
     def minimise(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
         """The local minimum that IPOPT finds from a start, or its reason for none."""
         result = self._solver(x0=np.concatenate([start.u.ravel(), start.x.ravel()]), p=x0, lbg=0, ubg=0)
         status = self._solver.stats()["return_status"]
-        if status == "User_Requested_Stop":  # Ctrl-C or SIGTERM, which CasADi keeps to itself
-            raise KeyboardInterrupt
+        if self._stopped:
+            self._stop()
         if status != "Solve_Succeeded":
             return f"IPOPT: {status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])

@@ -60,11 +60,7 @@ def parts_of(config: Config) -> Parts:
 
 
 def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
-    """Parts by their section and the name of their class, with the other options of a config.
-
-    Raises:
-        UsageError: as parts_of.
-    """
+    """Parts by their section and the name of their class, with the other options of a config; as parts_of."""
     config = copy.deepcopy(config)
     for part, name in names.items():
         getattr(config, part).name = name

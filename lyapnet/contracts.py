@@ -114,7 +114,8 @@ def _check_derivative(name: str, function: Callable[..., Any], arguments: Sequen
         directions = [
             torch.randn(a.shape, generator=generator, dtype=a.dtype) * a.std(0).clamp_min(1e-3) for a in arguments
         ]
-        slope = sum((s * d).reshape(len(value), -1).sum(1) for s, d in zip(slopes, directions, strict=True))
+        parts = [(s * d).reshape(len(value), -1).sum(1) for s, d in zip(slopes, directions, strict=True)]
+        slope = torch.stack(parts).sum(0)
         wide, narrow = along(directions, STEP), along(directions, STEP / 2)
         tolerance = 1e-4 * torch.maximum(wide.abs(), slope.abs()) + rounding
         wrong = torch.nonzero(((wide - narrow).abs() <= tolerance) & ~((slope - wide).abs() <= 3 * tolerance)).flatten()

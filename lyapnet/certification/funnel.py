@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from lyapnet.certification.branch_and_bound import Budget, just_above, just_belo
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition, require_own_gradient
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.ignorable_states import ignorable_states
-from lyapnet.certification.proof import Progress, prove
+from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict
 from lyapnet.contracts import check_function
 from lyapnet.errors import Interrupted, UsageError
@@ -137,13 +138,8 @@ def sound_claim(
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
     set_up = time.monotonic() - started
-    search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
     level = min(needed, just_below(rim))
-    with search.stop.listening():
-        proof = prove(condition, domain, level, search, False, generator, report, keep, replay)
-    if search.stop.asked:
-        kept = f"the proof so far is kept in {keep}; the same command goes on" if keep else "nothing without --keep"
-        raise Interrupted(f"Stopped while certifying: {kept}.", 130)
+    proof = _proof(condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed and budget.left:  # proved, and so searched, was less than what X₀ needs
@@ -159,6 +155,20 @@ def sound_claim(
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
         proof.fingerprint, proof.seconds,
     )  # fmt: skip
+
+
+def _proof(
+    condition: DecreaseCondition, domain: tuple[Corner, Corner], level: float, budget: Budget, **options: Any
+) -> Proof:
+    """What is proved of the condition, in what a budget leaves but for a share of it, unless someone stops it."""
+    search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
+    with search.stop.listening():
+        proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
+    if search.stop.asked:
+        keep = options["keep"]
+        kept = f"the proof so far is kept in {keep}; the same command goes on" if keep else "nothing without --keep"
+        raise Interrupted(f"Stopped while certifying: {kept}.", 130)
+    return proof
 
 
 def enclosing_box(W: Value, initial_states: Box, goal: State, duration: float, level: float) -> Box:

@@ -286,7 +286,7 @@ def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
 
 
 @rule(aten.index_put.default)
-def _index_put(x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> TaylorForm:
+def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False) -> TaylorForm:
     """x with the values added to its entries at some indices, as the derivative of an indexing is written."""
     if not accumulate:
         raise UsageError("Expected values that are added to entries, got entries that are replaced; use torch.where.")

@@ -297,8 +297,7 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     except (Exception, SystemExit) as error:  # of any kind: the module is the user's
         choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
         raise UsageError(
-            f"Expected {key} as {choices}, got {name!r} ({raised(error)}); check the spelling, the working directory "
-            "and that module."
+            f"Expected {key} as {choices}, got {name!r} ({raised(error)}); correct the name, or the module."
         ) from error
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
@@ -342,10 +341,7 @@ def _rows(name: str, matrix: Any) -> Any:
     """A flat list of numbers as the diagonal matrix it stands for."""
     if not isinstance(matrix, list | tuple):
         raise ValueError(f"Expected {name} as a list of rows, or of the diagonal's numbers, got {matrix!r}.")
-    entries = [entry for row in matrix for entry in (row if isinstance(row, list | tuple) else [row])]
-    if any(type(entry) not in (int, float) for entry in entries):
-        raise ValueError(f"Expected {name} of real numbers, got {matrix!r}; write each as 1 or 0.5.")
-    if all(type(row) in (int, float) for row in matrix):
+    if all(type(entry) in (int, float) for entry in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix
 

@@ -212,6 +212,8 @@ def _quadratic(weight: Tensor, v: Tensor) -> Tensor:
 def _symmetric(name: str, rows: Sequence[Sequence[float]] | Tensor, *, definite: bool) -> Tensor:
     """The matrix as a tensor, or a ValueError that says what is wrong with it."""
     try:
+        if not isinstance(rows, Tensor) and any(type(entry) not in (int, float) for row in rows for entry in row):
+            raise TypeError("booleans, or no numbers")
         matrix = torch.as_tensor(rows, dtype=torch.get_default_dtype()).clone()
     except (TypeError, ValueError):
         matrix = torch.empty(0)

@@ -112,6 +112,9 @@ def _leaves(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
     known = {f.name: f for f in dataclasses.fields(schema)}
+    if not isinstance(content, Mapping):
+        name, names = prefix.rstrip("."), ", ".join(known)
+        raise UsageError(f"Expected {name} as a section with {names}, got {content!r}; indent its keys below it.")
     for key, value in content.items():
         if key not in known:
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
@@ -120,17 +123,12 @@ def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
             raise UsageError(f"Expected a key of the schema, got unknown key {prefix}{key}; {hint}")
         section = known[key].type
         if isinstance(section, type) and dataclasses.is_dataclass(section):
-            if not isinstance(value, Mapping):
-                names = ", ".join(f.name for f in dataclasses.fields(section))
-                raise UsageError(
-                    f"Expected {prefix}{key} as a section with {names}, got {value!r}; indent its keys below it."
-                )
             _refuse_unknown_keys(value, section, f"{prefix}{key}.")
         collection = str(section).partition("[")[0]
         if isinstance(value, {"list": Mapping, "dict": list}.get(collection, ())):
             raise UsageError(f"Expected {prefix}{key} as {section}, got {value!r}; correct its value.")
         for entry in get_args(section)[1:]:  # of dict[str, section]
-            for name, one in value.items() if dataclasses.is_dataclass(entry) else ():
+            for name, one in value.items() if dataclasses.is_dataclass(entry) and isinstance(value, Mapping) else ():
                 _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
 
 

@@ -11,7 +11,7 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 # Each line imports only lines above it.
 LEVELS = (
     {"drawing", "errors", "interpolation", "linear_algebra", "provenance", "random_streams", "tables", "types"},
-    {"contracts", "cost", "files", "schema", "sets", "systems"},
+    {"contracts", "cost", "files", "schema", "sets", "sizes", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"networks", "policy"},
     {"rollout"},

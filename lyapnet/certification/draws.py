@@ -42,9 +42,10 @@ class Draws(NamedTuple):
         return None
 
     def _lines(self) -> list[str]:
-        if self.file is None or not self.file.exists():
+        try:
+            return [] if self.file is None else self.file.read_text(encoding="utf-8", errors="replace").splitlines()
+        except OSError:  # none yet, or none that can be read: then none can be added
             return []
-        return self.file.read_text(encoding="utf-8", errors="replace").splitlines()
 
     def _draw(self, line: str, number: int) -> tuple[Any, Any] | None:
         """What tells a recorded draw apart; None if it is of something else."""

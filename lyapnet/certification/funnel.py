@@ -28,6 +28,8 @@ from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
 LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most …
 SHARE_OF_LEVELS, SHARE_OF_FINISH = 0.3, 0.15  # … of the budget, which also leaves some to the share of X₀ and κ
+KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command goes on."
+NOT_KEPT = "Stopped while certifying: nothing is kept without --keep FILE."
 
 
 @dataclass(frozen=True)
@@ -105,9 +107,7 @@ def sound_claim(
     keep: Path | None = None,
     replay: bool = False,
 ) -> SoundClaim:
-    """The largest funnel that can be proved within a budget, all that belongs to it included.
-
-    It is not sought beyond what X₀ needs.
+    """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
     Args:
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
@@ -147,8 +147,7 @@ def sound_claim(
     inside, excess = 0.0, float("inf")
     if rho > -float("inf"):
         finish = Budget(budget.left, chunk=budget.chunk)
-        start_low, start_high = _at(0.0, x_low, x_high)
-        inside = 1.0 if rho >= wanted else share_below(condition.V, start_low[0], start_high[0], rho, finish)
+        inside = 1.0 if rho >= wanted else _share(condition.V, x_low, x_high, rho, finish)
         excess = _terminal_excess(condition, states, duration, rho, finish)
     return SoundClaim(
         alpha, delta, duration, states, rho, wanted, _largest_seen(condition.V, initial_states), inside, excess,
@@ -166,8 +165,7 @@ def _proof(
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options["keep"]
-        kept = f"the proof so far is kept in {keep}; the same command goes on" if keep else "nothing without --keep"
-        raise Interrupted(f"Stopped while certifying: {kept}.", 130)
+        raise Interrupted(KEPT.format(keep) if keep else NOT_KEPT, 130)
     return proof
 
 
@@ -205,6 +203,12 @@ def _largest_seen(V: Value, initial_states: Box) -> float:
     states = torch.cat([corners, initial_states.sample(10_000, torch.Generator().manual_seed(0))])
     with torch.no_grad():
         return float(V(states.new_zeros(len(states)), states).max())
+
+
+def _share(V: Value, x_low: State, x_high: State, rho: float, budget: Budget) -> float:
+    """A lower bound of the share by volume of X₀ with V(0, ·) ≤ ρ."""
+    lower, upper = _at(0.0, x_low, x_high)
+    return share_below(V, lower[0], upper[0], rho, budget)
 
 
 def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:

@@ -40,6 +40,13 @@ class Plan:
     step: int = 0  # at which that was written
     lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
 
+    def __post_init__(self) -> None:
+        if self.resume_from is not None and self.config.training.iterations < self.step:
+            raise UsageError(
+                f"Expected training.iterations ≥ {self.step}, which {str(self.resume_from)!r} has behind it, got "
+                f"{self.config.training.iterations}; raise it, or start a new run."
+            )
+
     @property
     def finished(self) -> bool:
         """Whether the run has its end behind it: there is nothing to train."""

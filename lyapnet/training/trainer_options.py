@@ -42,11 +42,9 @@ def check_trainer_options(config: Config) -> None:
     for key, value in config.trainer.items():
         if key not in TRAINER_OPTIONS:
             owned = key in inspect.signature(L.Trainer).parameters
-            nearest = did_you_mean(key, TRAINER_OPTIONS, "remove it", "trainer.")
-            hint = "lyapnet sets that one itself" if owned else nearest
-            raise UsageError(
-                f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint.rstrip('.?')}."
-            )
+            nearest = did_you_mean(key, TRAINER_OPTIONS, "remove it.", "trainer.")
+            hint = "lyapnet sets that one itself." if owned else nearest
+            raise UsageError(f"Expected trainer options among {', '.join(TRAINER_OPTIONS)}, got trainer.{key}; {hint}")
         expected, holds = VALUES.get(key, ("", lambda _: True))
         if value is not None and not holds(value):
             raise UsageError(f"Expected trainer.{key} as {expected}, got {value!r}; correct it, or leave it out.")

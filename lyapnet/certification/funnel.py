@@ -18,7 +18,7 @@ from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict
 from lyapnet.contracts import check_function
-from lyapnet.errors import Interrupted, UsageError
+from lyapnet.errors import Interrupted, UsageError, signals_taken
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.problem import TRIED, Problem
@@ -161,7 +161,7 @@ def _proof(
 ) -> Proof:
     """What is proved of the condition, in what a budget leaves but for a share of it, unless someone stops it."""
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
-    with search.stop.listening():
+    with signals_taken(search.stop.ask):
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options["keep"]

@@ -1,0 +1,80 @@
+"""Ctrl-C and SIGTERM: what is in progress ends within seconds, and says what is kept."""
+
+import os
+import signal
+import threading
+import time
+
+import pytest
+import torch
+
+from lyapnet.certification import funnel
+from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.cli import main
+from lyapnet.errors import Interrupted, signals_taken
+from tests.problems import untrained
+
+CERTIFIED = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"
+
+
+def told_after(seconds, number):
+    threading.Timer(seconds, os.kill, (os.getpid(), number)).start()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, monkeypatch, capsys):
+    kept, reports = tmp_path / "proof", []
+
+    def progress(state):  # the search has begun
+        reports.append(time.monotonic())
+        if len(reports) == 1:
+            os.kill(os.getpid(), number)
+
+    controller = untrained("double_integrator")
+    with pytest.raises(Interrupted, match=f"the proof so far is kept in {kept}") as stop:
+        funnel.sound_claim(controller.closed_loop, controller.problem, budget=Budget(60), report=progress, keep=kept)
+    assert stop.value.exit_status == 130
+    assert time.monotonic() - reports[0] < 2
+    assert kept.stat().st_size > 0
+
+
+def test_what_waits_in_a_command_stops_at_once(monkeypatch, capsys):
+    monkeypatch.setattr("lyapnet.cli.options.read_checkpoint", lambda *_: time.sleep(60), raising=False)
+    monkeypatch.setattr("lyapnet.controller.read_checkpoint", lambda *_: time.sleep(60))
+    before = signal.getsignal(signal.SIGTERM)
+    told_after(0.5, signal.SIGTERM)
+    started = time.monotonic()
+    assert main(["evaluate", CERTIFIED]) == 130
+    assert time.monotonic() - started < 5
+    assert capsys.readouterr().err == "SIGTERM: stopped at once; what was saved before is kept.\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_an_oracle_stops_although_casadi_keeps_signals_to_itself():
+    pytest.importorskip("casadi")
+    from lyapnet.evaluation.oracles.transcription import Transcription
+
+    controller = untrained("cartpole_balancing", "horizon.steps=10")
+    oracle = Transcription(controller.problem)
+    x0 = controller.initial_states.sample(3000)
+    told_after(0.5, signal.SIGINT)
+    started = time.monotonic()
+    with pytest.raises(Interrupted, match="Stopped while seeking optima"):
+        oracle.solve(x0)
+    assert time.monotonic() - started < 3
+
+
+def test_without_a_signal_nothing_stops():
+    """A twin."""
+    with signals_taken(lambda *_: pytest.fail("Expected no signal.")):
+        assert float(torch.ones(())) == 1
+
+
+@pytest.mark.parametrize("seconds", [12.0])
+def test_seconds_hold_for_all_of_a_certificate(seconds):
+    """For a condition that no budget decides."""
+    controller = untrained("cartpole_balancing")
+    started = time.monotonic()
+    claim = funnel.sound_claim(controller.closed_loop, controller.problem, budget=Budget(seconds))
+    assert time.monotonic() - started < 1.1 * seconds + 1
+    assert claim.verdict != "certified"

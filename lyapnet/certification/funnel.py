@@ -27,7 +27,8 @@ from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
 LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most …
-SHARE_OF_LEVELS, SHARE_OF_FINISH = 0.3, 0.15  # … of the budget, which also leaves some to the share of X₀ and κ
+LEAST, SHARE_OF_LEVELS = 1.0, 0.3  # … in seconds at the least, and of the budget
+SHARE_OF_FINISH = 0.15  # of what is left, for the share of X₀ and κ
 KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command goes on."
 NOT_KEPT = "Stopped while certifying: nothing is kept without --keep FILE."
 
@@ -126,7 +127,7 @@ def sound_claim(
     initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     _require_continuous(condition.V, x_low, x_high)
-    levels = Budget(min(LEVELS, SHARE_OF_LEVELS * budget.left), chunk=budget.chunk)
+    levels = Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
     if states is None:
         states = enclosing_box(condition.height, initial_states, goal, duration, wanted)

@@ -61,7 +61,7 @@ def test_an_oracle_stops_although_casadi_keeps_signals_to_itself():
     started = time.monotonic()
     with pytest.raises(Interrupted, match="Stopped while seeking optima"):
         oracle.solve(x0)
-    assert time.monotonic() - started < 3
+    assert time.monotonic() - started < 15, "all of them take minutes"
 
 
 def test_without_a_signal_nothing_stops():
@@ -70,6 +70,7 @@ def test_without_a_signal_nothing_stops():
         assert float(torch.ones(())) == 1
 
 
+@pytest.mark.slow  # by the clock: on a machine that has nothing else to do
 @pytest.mark.parametrize("seconds", [12.0])
 def test_seconds_hold_for_all_of_a_certificate(seconds):
     """For a condition that no budget decides."""

@@ -101,7 +101,7 @@ def test_a_checkpoint_never_imports_the_control_set_that_it_names(checkpoint):
 def test_the_command_measures_within_the_limits_and_refuses_without(checkpoint, capsys):
     arguments = ["evaluate", str(checkpoint), "--samples", "3", "--json"]
     assert main(arguments) == 2
-    assert "--controls to lyapnet evaluate" in capsys.readouterr().err
+    assert "--controls to the command" in capsys.readouterr().err
     assert main([*arguments, "--controls", "limits:Limits"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["cost_mean"] > 0

@@ -110,7 +110,7 @@ def test_a_checkpoint_never_imports_the_cost_that_it_names(checkpoint):
 def test_the_command_measures_with_the_cost_and_refuses_without(checkpoint, capsys):
     arguments = ["evaluate", str(checkpoint), "--samples", "3", "--json"]
     assert main(arguments) == 2
-    assert "--cost to lyapnet evaluate" in capsys.readouterr().err
+    assert "--cost to the command" in capsys.readouterr().err
     assert main([*arguments, "--cost", "swing_cost:Swing"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["cost_ratio"] >= 1 - 1e-6

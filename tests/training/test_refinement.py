@@ -197,7 +197,7 @@ def test_the_command(run, capsys, monkeypatch):
         def numbers(self):
             return {"alpha": self.options["alpha"], "trained with": self.controller.config.seed}
 
-    def certify(controller, alpha, *_):
+    def certify(controller, alpha, *_, **options):
         return Made(controller, claimed(best(run)).claim, {"alpha": alpha, "seed": 0})
 
     monkeypatch.setattr(sound_certificate, "sound_certificate", certify)
@@ -254,7 +254,9 @@ TRAPS = {
 def undecided(monkeypatch):
     """A sound claim that takes no time and proves nothing."""
     monkeypatch.setattr(
-        sound_certificate, "sound_certificate", lambda controller, *_: claimed(best(Path()), controller=controller)
+        sound_certificate,
+        "sound_certificate",
+        lambda controller, *_, **__: claimed(best(Path()), controller=controller),
     )
     monkeypatch.setattr("lyapnet.certification.tables.certificate_table", lambda *_: "")
     monkeypatch.setattr(SoundCertificate, "numbers", lambda self: {"system": type(self.controller.system).__name__})

@@ -49,7 +49,8 @@ def check_sizes(config: Any) -> None:
         UsageError: naming the key.
     """
     n, hidden = len(config.initial_states.lower), config.network.hidden or []
-    require_memory("network.hidden", hidden, NUMBER * _weights(n, hidden), "choose smaller widths")
+    # twice: V, and the copy of it that is held against its contract
+    require_memory("network.hidden", hidden, 2 * NUMBER * _weights(n, hidden), "choose smaller widths")
     steps = config.horizon.steps
     require_memory("horizon.steps", steps, size_of_loops(1, steps, n), "choose fewer")
 

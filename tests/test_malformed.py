@@ -15,6 +15,7 @@ import pytest
 import torch
 import yaml
 
+from lyapnet import sizes
 from lyapnet.cli import main
 from lyapnet.config import Config
 
@@ -435,6 +436,7 @@ def _checkpoint(tmp_path_factory):
     shutil.copy(folder / "small/version_0/checkpoints/best.ckpt", folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys.modules[__name__], "HERE", folder)
+        patch.setattr(sizes, "free_memory", lambda: 16 * 2**30)  # as if this were such a machine
         yield
 
 

@@ -50,11 +50,11 @@ def test_samples_are_refused_before_they_are_drawn():
 def test_the_line_is_where_memory_ends(monkeypatch):
     """A twin: what fits is let through, and the same is refused where there is less."""
     plain = to_plain(untrained("double_integrator").config)
-    plain["network"]["hidden"] = [1000, 1000]  # 8 MB of weights
-    monkeypatch.setattr(sizes, "free_memory", lambda: 9_000_000)
+    plain["network"]["hidden"] = [1000, 1000]  # 8 MB of weights, twice
+    monkeypatch.setattr(sizes, "free_memory", lambda: 17_000_000)
     assert config_from_plain(plain).network.hidden == [1000, 1000]
-    monkeypatch.setattr(sizes, "free_memory", lambda: 7_000_000)
-    with pytest.raises(UsageError, match=r"network\.hidden.*\(about 0\.00802 GB, 0\.007 GB are free\)"):
+    monkeypatch.setattr(sizes, "free_memory", lambda: 15_000_000)
+    with pytest.raises(UsageError, match=r"network\.hidden.*\(about 0\.016 GB, 0\.015 GB are free\)"):
         config_from_plain(plain)
 
 

@@ -30,12 +30,19 @@ def one_line(error: BaseException | str) -> str:
 
 def raised(error: BaseException) -> str:
     """What code of the user's own raised, and in which line of it: "ValueError: no such mass (drone.py:12)"."""
-    known = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(error.__traceback__)]
-    own = [place for place in known if not any(part in place[0] for part in _INSTALLED)]
+    line = own_line(error)
+    place = None if line is None else (line.filename, line.lineno)
     if isinstance(error, SyntaxError) and error.filename:
-        own = [(error.filename, error.lineno)]
+        place = (error.filename, error.lineno)
     what = f"{type(error).__name__}: {one_line(error)}"
-    return f"{what} ({Path(own[-1][0]).name}:{own[-1][1]})" if own else what
+    return what if place is None else f"{what} ({Path(place[0]).name}:{place[1]})"
+
+
+def own_line(error: BaseException) -> traceback.FrameSummary | None:
+    """The innermost line of the user's own code that an error came through; None if it came through none."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if not any(part in frame.filename for part in _INSTALLED)]
+    return own[-1] if own else None
 
 
 class LyapnetError(Exception):

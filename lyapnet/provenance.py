@@ -7,6 +7,8 @@ from pathlib import Path
 
 from lyapnet import __version__
 
+RUN_RECORD = "run.json"  # what made a run; its presence marks a run's folder
+
 
 def versions(*packages: str) -> dict[str, str]:
     """The versions of lyapnet, of those packages that are installed, and of Python; and the platform."""

@@ -41,6 +41,7 @@ jaxtyping.jaxtyped = _checked_at_first
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
 jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
+from lyapnet.certification import funnel  # noqa: E402
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
 from lyapnet.rollout import discrete_adjoint  # noqa: E402
@@ -144,3 +145,11 @@ LONG = ("test_runs.py", "test_readme.py", "test_funnel.py", "test_negative_contr
 def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that no process is left alone with one of them."""
     items.sort(key=lambda item: item.path.name not in LONG)
+
+
+@pytest.fixture(scope="module")
+def few_seconds_for_levels():
+    """What is sought beside a proof takes no longer than this; for tests where it decides no verdict."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(funnel, "LEVELS", 0.5)
+        yield

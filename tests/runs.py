@@ -35,6 +35,8 @@ SMALL = {
     "evaluation": {"validation_states": 6, "test_states": 6, "figures_every": 2},
     "trainer": {"gradient_clip_val": 3},
 }
+TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4",
+        "loggers=[csv]"]  # no figures  # fmt: skip
 PATIENCE = 120  # seconds
 MEASURED_TIME = {"rollout_steps_per_second", "training_seconds"}
 
@@ -43,6 +45,13 @@ _server.set_forkserver_preload(
     ["lyapnet.training.experiment", "lyapnet.cli", "lyapnet.evaluation.tables", "tensorboard.util.tensor_util",
      "torch.utils.tensorboard", "matplotlib.backends.backend_agg"]
 )  # fmt: skip
+
+
+def tiny_checkpoint(folder):
+    """The best checkpoint of a double integrator that was trained for two iterations."""
+    changes = [f"logs={folder}", "network.hidden=[8]", *TINY]
+    assert main(["train", "--config", "conf/double_integrator.yaml", *changes]) == 0
+    return folder / "double_integrator/version_0/checkpoints/best.ckpt"
 
 
 class Desk:

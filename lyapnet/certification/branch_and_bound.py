@@ -46,7 +46,6 @@ class Budget:
 
     def spent(self, boxes: int) -> bool:
         """Whether no more work is to be begun."""
-        self.stop.searching = True
         return self.stop.asked or self.elapsed >= self.seconds or boxes >= self.boxes
 
     @property
@@ -117,6 +116,7 @@ class Search:
         Args:
             run: maps a function over chunks, as `map` does or a pool of threads.
         """
+        budget.stop.searching = True
         while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):
             lowest, rest = self.frontier.first(budget.chunk * budget.workers)
             self.boxes += len(lowest.key)

@@ -1,13 +1,14 @@
 """The draws that were made of one checkpoint, in its run's folder: who draws until a claim pleases has to say so."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lyapnet.files import digest_of_file
+from lyapnet.provenance import RUN_RECORD
+
 DRAWS = "draws.jsonl"  # a line for each claim from sampled states
-RECORD = "run.json"  # whose presence marks a run's folder
 
 
 class Draws(NamedTuple):
@@ -60,11 +61,11 @@ class Draws(NamedTuple):
 
 def draws_of(checkpoint: Path, **about: Any) -> Draws:
     """The draws of a checkpoint's content for claims with these further facts."""
-    digest = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    digest = digest_of_file(checkpoint)
     folders = _folders(checkpoint.resolve())
     return Draws(next((folder / DRAWS for folder in folders), None), {"checkpoint": digest, **about})
 
 
 def _folders(checkpoint: Path) -> Iterator[Path]:
     """The run's folder: above checkpoints/, or above that of a seed."""
-    return (folder for folder in checkpoint.parents[1:3] if (folder / RECORD).is_file())
+    return (folder for folder in checkpoint.parents[1:3] if (folder / RUN_RECORD).is_file())

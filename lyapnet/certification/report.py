@@ -1,6 +1,5 @@
 """Reports of certificates: the claim in words and formulas, its figures, and what it is about; JSON and Markdown."""
 
-import hashlib
 import io
 import json
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from lyapnet.config import Config
 from lyapnet.controller import Controller
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
-from lyapnet.files import write_atomically
+from lyapnet.files import digest_of_file, write_atomically
 from lyapnet.provenance import versions
 from lyapnet.systems import SYSTEMS, ControlAffineSystem
 
@@ -90,7 +89,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
         "certificate": result,
         "numbers": certificate_rows(result, certificate.labels),
         "options": dict(certificate.options),
-        "checkpoint": {"path": str(checkpoint), "sha256": hashlib.sha256(checkpoint.read_bytes()).hexdigest()},
+        "checkpoint": {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
         "experiment": config.experiment,
         "system": {"name": _name(controller.system), "parameters": controller.parameters},
         "states": controller.system.state_labels,

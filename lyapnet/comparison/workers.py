@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 from urllib.parse import urlsplit
 
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, one_line
 
 LOG = "job.log"
 
@@ -122,7 +122,7 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     except Exception as error:  # ConnectionError, or one of its many own
-        line = " ".join(str(error).split())
+        line = one_line(error)
         raise UsageError(f"Expected a Ray cluster at {address!r}, got {type(error).__name__}: {line}") from error
     remote: Any = ray.remote(num_cpus=1, max_retries=0)(_run_in)
     waiting: dict[Any, J] = {}
@@ -136,7 +136,7 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
             try:
                 yield Outcome(job, *ray.get(ended))
             except RayError as error:  # a machine was lost: the others go on
-                yield Outcome(job, 0.0, " ".join(str(error).split()))
+                yield Outcome(job, 0.0, one_line(error))
     finally:
         ray.shutdown()
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.fx import Node
 from torch.utils._pytree import tree_map
 
-from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.errors import LyapnetError, UsageError, one_line
 from lyapnet.graphs import taylor
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
 from lyapnet.graphs.simplification import with_known_truths, without_copies
@@ -61,7 +61,7 @@ class BoundedFunction:
         except LyapnetError as error:
             raise UsageError(str(error)) from error
         except Exception as error:
-            line = " ".join(str(error).split())
+            line = one_line(error)
             raise UsageError(
                 f"Expected f, g, the cost and V in torch operations, each state's result its own, got {line}"
             ) from error
@@ -142,7 +142,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         raise
     except Exception as error:
         raise UsageError(
-            f"Expected arguments that the rule for bounds of {node.target} covers, got {' '.join(str(error).split())}; "
+            f"Expected arguments that the rule for bounds of {node.target} covers, got {one_line(error)}; "
             "write it with other operators."
         ) from error
     recorded = node.meta.get("val")

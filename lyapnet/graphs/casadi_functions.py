@@ -15,7 +15,7 @@ from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import LyapnetError, OracleError
+from lyapnet.errors import LyapnetError, OracleError, one_line
 from lyapnet.graphs.tracing import Tensors, is_view, name_of, trace
 
 # torch counts them among its core, but has them in simpler operators too
@@ -38,7 +38,7 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
     except LyapnetError as error:
         raise OracleError(str(error)) from error
     except Exception as error:  # any kind: the function is the user's
-        line = " ".join(str(error).split())[:200]
+        line = one_line(error)[:200]
         raise OracleError(
             f"Expected dynamics and cost that torch can trace, got {type(error).__name__}: {line}; write them in torch "
             "operations, with torch.where for a course that depends on values."

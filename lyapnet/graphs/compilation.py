@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule
 
-from lyapnet.errors import CompilationError, LyapnetError
+from lyapnet.errors import CompilationError, LyapnetError, one_line
 from lyapnet.files import digest_of_file, write_atomically
 
 
@@ -83,7 +83,7 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
                 return aoti_load_package(str(path))
             reason = "another digest than what was compiled"
         except Exception as error:  # of any kind: a file that was cut short or exchanged
-            reason = " ".join(str(error).split())[:200]
+            reason = one_line(error)[:200]
         logging.getLogger(__name__).warning("note: compiling again what is in %s: got %s.", path, reason)
         path.unlink(missing_ok=True)
     if not has_compiler():
@@ -117,7 +117,7 @@ def compilation_errors() -> Iterator[None]:
     except LyapnetError:
         raise
     except Exception as error:
-        line = " ".join(str(error).split())[:200]
+        line = one_line(error)[:200]
         raise CompilationError(f"Expected a closed loop to compile, got {type(error).__name__}: {line}") from error
 
 

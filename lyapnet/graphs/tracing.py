@@ -15,7 +15,7 @@ from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.testing import assert_close
 
-from lyapnet.errors import UntraceableError, UsageError
+from lyapnet.errors import UntraceableError, UsageError, own_line
 
 Tensors = tuple[Tensor, ...]
 
@@ -77,7 +77,7 @@ def _reading_values():
             raise
         raise UntraceableError(
             f"Expected torch operations, with control flow that does not depend on values, got code that reads the "
-            f"values of a tensor{_where(error)}; use torch.where, or lyapnet.Table for a table."
+            f"values of a tensor{_where(own_line(error))}; use torch.where, or lyapnet.Table for a table."
         ) from error
 
 
@@ -85,14 +85,9 @@ NO_VALUES = re.compile(r"tensor subclasses|data pointer|'meta' device|Cannot cop
 """What torch says of code that asks a tensor without values for them."""
 
 
-def _where(error: BaseException) -> str:
-    """The innermost line outside torch in an error's traceback, as " at file:line (its text)"."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith(TORCH)]
-    own = [f for f in frames if not f.filename.startswith(LYAPNET)] or frames
-    return f" at {Path(own[-1].filename).name}:{own[-1].lineno} ({own[-1].line})" if own else ""
-
-
-TORCH, LYAPNET = str(Path(torch.__file__).parent), str(Path(__file__).parents[1])
+def _where(line: traceback.FrameSummary | None) -> str:
+    """ " at file:line (its text)"; nothing where there is no line."""
+    return "" if line is None else f" at {Path(line.filename).name}:{line.lineno} ({line.line})"
 
 
 def batched(

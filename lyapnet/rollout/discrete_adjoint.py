@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.func import functional_call
 
-from lyapnet.errors import LyapnetError, UntraceableError
+from lyapnet.errors import LyapnetError, UntraceableError, one_line
 from lyapnet.graphs.compilation import Scan, compilation_errors, compiled, is_on_disk
 from lyapnet.graphs.tracing import batched, cut, trace
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -206,7 +206,7 @@ class DiscreteAdjoint:
             except LyapnetError:
                 raise
             except Exception as error:  # of any kind, from inside the user's own functions
-                reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")
+                reason = one_line(error).split(". ")[0].rstrip(".")
                 raise UntraceableError(
                     f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."
                 ) from error

@@ -11,12 +11,11 @@ from typing import Any
 from lyapnet.config import Config, configs_of_seeds, label_of
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.files import read_json, write_json
-from lyapnet.provenance import commit, versions
+from lyapnet.provenance import RUN_RECORD, commit, versions
 from lyapnet.training.run_lock import RunLock
 
 LAST, BEST = "last", "best"
 CONFIG = "config.yaml"
-PROVENANCE = "run.json"
 EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
 RECORDED = {  # what is read of run.json: its types, and what version 0.1 leaves out
     "finetuned_from": (str | None, ...), "compiled": (bool, False), "saved": (bool | None, None),
@@ -34,7 +33,7 @@ class Run:
     @property
     def exists(self) -> bool:
         """Whether there is such a run."""
-        return (self.folder / PROVENANCE).is_file()
+        return (self.folder / RUN_RECORD).is_file()
 
     @property
     def checkpoints(self) -> Path:
@@ -75,7 +74,7 @@ class Run:
 
     def record(self) -> dict[str, Any]:
         """What made the run, and what it took."""
-        path = self.folder / PROVENANCE
+        path = self.folder / RUN_RECORD
         record = {key: default for key, (_, default) in RECORDED.items()} | read_json(path, REPAIR)
         for key, (kinds, _) in RECORDED.items():
             if not isinstance(record[key], kinds):
@@ -85,7 +84,7 @@ class Run:
 
     def note(self, **facts: Any) -> None:
         """Add to the record, or replace in it."""
-        write_json(self.folder / PROVENANCE, {**self.record(), **facts})
+        write_json(self.folder / RUN_RECORD, {**self.record(), **facts})
 
     @property
     def finished(self) -> bool:
@@ -120,7 +119,7 @@ def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock |
         draft = Path(tempfile.mkdtemp(prefix=".new_", dir=root))
         try:
             draft.chmod(0o755)
-            write_json(draft / PROVENANCE, _provenance(config, finetuned_from))
+            write_json(draft / RUN_RECORD, _provenance(config, finetuned_from))
             lock = RunLock(draft)
             return Run(_numbered(draft)), lock
         except BaseException:

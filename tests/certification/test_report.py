@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from lyapnet.certification import Counterexample, SampledClaim, SoundClaim, StatisticalClaim
-from lyapnet.certification import funnel as funnels
 from lyapnet.certification.report import markdown, write_outputs
 from lyapnet.certification.sampling_certificates import (
     SampledCertificate,
@@ -25,25 +24,14 @@ from lyapnet.programs import Tolerances
 from lyapnet.sets import Box
 from lyapnet.systems import DoubleIntegrator
 from tests.problems import Formula, problem_of
+from tests.runs import tiny_checkpoint
 
-TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4",
-        "loggers=[csv]"]  # no figures  # fmt: skip
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_seconds_for_levels():
-    """What is sought beside the proof takes no longer than this; it decides no verdict here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(funnels, "LEVELS", 0.5)
-        yield
+pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("logs")
-    changes = [f"logs={folder}", "network.hidden=[8]", *TINY]
-    assert main(["train", "--config", "conf/double_integrator.yaml", *changes]) == 0
-    return folder / "double_integrator/version_0/checkpoints/best.ckpt"
+    return tiny_checkpoint(tmp_path_factory.mktemp("logs"))
 
 
 @pytest.fixture(scope="module")

@@ -18,27 +18,16 @@ from lyapnet.errors import UsageError
 from lyapnet.systems import DoubleIntegrator
 from tests.certification import planted
 from tests.problems import Formula, problem_of
+from tests.runs import tiny_checkpoint
 
 MAKERS = {"sampled": sampled_certificate, "statistical": statistical_certificate, "sound": sound_certificate}
 
-TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4",
-        "loggers=[csv]"]  # no figures  # fmt: skip
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _few_seconds_for_levels():
-    """What is sought beside the proof takes no longer than this; it decides no verdict here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(funnel, "LEVELS", 0.5)
-        yield
+pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("logs")
-    changes = [f"logs={folder}", "network.hidden=[8]", *TINY]
-    assert main(["train", "--config", "conf/double_integrator.yaml", *changes]) == 0
-    return str(folder / "double_integrator/version_0/checkpoints/best.ckpt")
+    return str(tiny_checkpoint(tmp_path_factory.mktemp("logs")))
 
 
 def certificate(capsys, *arguments):

@@ -35,25 +35,10 @@ in_both_forms = pytest.mark.parametrize("traced", [False, True], ids=["as writte
 in_either_form = pytest.mark.parametrize("traced", [None], ids=["in either form"])
 
 
-@pytest.fixture
-def traced():
-    return False
-
-
 def routes(system, cost, policy, method="euler", horizon=HORIZON):
     """The same rollout twice: with the discrete costate, and by backpropagation."""
     problem = problem_of(system, cost, horizon.steps, horizon.dt)
     return [Rollout(problem, policy, method, gradient) for gradient in ("discrete", "backprop")]
-
-
-@pytest.fixture
-def policy(system, cost, V):
-    return HJBPolicy(problem_of(system, cost), V)
-
-
-@pytest.fixture
-def x0(system):
-    return 0.5 * torch.randn(3, system.n)
 
 
 def weighted(trajectory, without=None):

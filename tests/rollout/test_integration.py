@@ -13,7 +13,7 @@ from torch.testing import assert_close
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.errors import DivergenceError
-from lyapnet.policy import POLICIES, HJBPolicy
+from lyapnet.policy import POLICIES
 from lyapnet.problem import Horizon
 from lyapnet.rollout import ADAPTIVE_METHODS, FIXED_STEP_METHODS, GRADIENTS, METHODS, Rollout
 from lyapnet.systems import DoubleIntegrator
@@ -27,21 +27,6 @@ double_integrator = pytest.mark.parametrize("system", ["double_integrator"], ind
 
 def rollout_of(system, cost, policy, steps=16, **options):
     return Rollout(problem_of(system, cost, steps, DURATION / steps), policy, **options)
-
-
-@pytest.fixture
-def traced():
-    return False
-
-
-@pytest.fixture
-def policy(system, cost, V):
-    return HJBPolicy(problem_of(system, cost), V)
-
-
-@pytest.fixture
-def x0(system):
-    return 0.5 * torch.randn(3, system.n)
 
 
 def by_hand(system, cost, policy, horizon, x0):

@@ -5,7 +5,7 @@ Ground truth for tests and tables, never used in training. The model is the torc
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import casadi
 import numpy as np
@@ -81,8 +81,7 @@ class Transcription(Oracle):
         search = MultiStart(states.numpy(), stored, self.minimise)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
-            with signals_taken(self._stop):
-                search.run(dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
+            self._search(search, dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
@@ -120,8 +119,18 @@ class Transcription(Oracle):
             known = given[i]
             yield cold if known is None else [known, *cold]
 
+    def _search(self, search: MultiStart, starts: Mapping[int, list[Candidate]], progress: Report) -> None:
+        """Run a search; Ctrl-C and SIGTERM end it."""
+        self._stopped = False
+        with signals_taken(self._stop):
+            try:
+                search.run(starts, progress)
+            finally:  # where CasADi made an error of its own of what ended it
+                if self._stopped:
+                    self._stop()
+
     def _stop(self, *_: object) -> None:
-        """Take Ctrl-C or SIGTERM; CasADi ends at what this raises, and keeps it to itself."""
+        """Take a signal: CasADi ends at what this raises, and keeps it to itself or raises something else."""
         self._stopped = True
         raise Interrupted("Stopped while seeking optima; those of earlier evaluations are kept.", 130)
 

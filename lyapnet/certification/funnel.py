@@ -186,12 +186,24 @@ def enclosing_box(W: Value, initial_states: Box, goal: State, duration: float, l
         rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
         points = (radii[:, None, None] * rays).clamp(-30 * largest, 30 * largest)
-        with torch.no_grad():
-            above = torch.stack([W(t.expand(points.shape[:-1]), goal + points) > level for t in times])
-        below = above.cumsum(1) == 0  # from the goal to the first crossing
-        reach = torch.where(below.any(0)[..., None], points.abs(), 0.0).amax((0, 1)).clamp_min(1e-6 * float(largest))
+        reach = torch.stack([_reach_below(W, t, goal, points, level) for t in times]).amax(0)
+        reach = reach.clamp_min(1e-6 * float(largest))
     reach = 1.15 * torch.maximum(reach, inner)
     return Box(goal - reach, goal + reach)
+
+
+def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float) -> State:
+    """How far rays of points (radii, rays, n) go from the goal, component by component, before W(t, ·) > level."""
+    reach, below = torch.zeros_like(goal), torch.arange(points.shape[1])
+    for some in points.split(8):
+        if not len(below):
+            break
+        with torch.no_grad():
+            above = W(t.expand(len(some), len(below)), goal + some[:, below]) > level
+        still = above.cumsum(0) == 0
+        reach = torch.maximum(reach, torch.where(still[..., None], some[:, below].abs(), 0.0).amax((0, 1)))
+        below = below[still[-1]]
+    return reach
 
 
 def _largest_seen(V: Value, initial_states: Box) -> float:

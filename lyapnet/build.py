@@ -49,14 +49,18 @@ REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
 }
 
 
+def own_parts(config: Config) -> dict[str, str]:
+    """The sections whose class is the user's own, with the name of the class."""
+    return {part: name for part, (known, _) in REGISTRIES.items() if (name := getattr(config, part).name) not in known}
+
+
 def parts_of(config: Config) -> Parts:
     """The user's own parts that a config names as module:Class, imported; nothing for what is registered.
 
     Raises:
         UsageError: no such module or class, or arguments that it does not take.
     """
-    own = [part for part, (registry, _) in REGISTRIES.items() if getattr(config, part).name not in registry]
-    return parts_named(config, {part: getattr(config, part).name for part in own})
+    return parts_named(config, own_parts(config))
 
 
 def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
@@ -259,8 +263,9 @@ def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout
             "compiles: take it, or leave compile at auto."
         )
     with _section("rollout"):
-        policy = POLICIES[options.policy](problem, V)
-        return Rollout(problem, policy, options.method, options.gradient, options.rtol, options.atol)
+        return Rollout(
+            problem, POLICIES[options.policy](problem, V), options.method, options.gradient, options.rtol, options.atol
+        )
 
 
 def build_program(config: Config) -> Program:

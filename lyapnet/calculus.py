@@ -30,6 +30,10 @@ class ValueFunction(nn.Module, ABC):
         """(V, V_x) of shapes (*batch,) and (*batch, n); they share most of their work."""
         return self(t, x), gradients(self, t, x)[1]
 
+    def curvature(self, t: Time) -> Tensor | None:
+        """A positive semidefinite model of V_xx at t, (*batch, n, n), for control laws; None where V has none."""
+        return None
+
 
 def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
     """(V_t, V_x) by automatic differentiation, of shapes (*batch,) and (*batch, n)."""

@@ -25,6 +25,16 @@ SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
 
 
+# What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top.
+STANDARD: dict[str, Any] = {
+    "program": {"name": "value", "constraint": 0, "cost_to_go": 10, "trajectory_cost": 1},
+    "network": {"name": "expansion"},
+    "rollout": {"policy": "sampled", "gradient": "discrete"},
+    "training": {"iterations": 400, "batch_size": 32, "learning_rate": 0.003, "validate_every": 20},
+    "trainer": {"gradient_clip_val": 3},
+}
+
+
 @dataclass
 class ProgramConfig:
     """What is minimised; see Program for the loss and its units."""
@@ -107,7 +117,7 @@ class NetworkConfig:
     """V(t, x). Fields left at null take the network's own default."""
 
     name: str = option(
-        MISSING, "A registered network, or module:Class of your own.", choices=tuple(NETWORKS), user_class=True
+        "expansion", "A registered network, or module:Class of your own.", choices=tuple(NETWORKS), user_class=True
     )
     hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
     activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
@@ -210,7 +220,8 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
     """
-    return config_from_plain(read_yaml(path, Config), overrides)
+    content = read_yaml(path, Config)
+    return config_from_plain({"experiment": Path(path).stem, **content}, overrides)
 
 
 def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
@@ -219,12 +230,23 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     Raises:
         UsageError: as load_config.
     """
-    config = checked(Config, content, overrides)
+    config = checked(Config, _completed(content), overrides)
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
     check_sizes(config)
     return config
+
+
+def _completed(content: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The content on top of the standard recipe, where it names no network; a program that it names is taken whole."""
+    sections = {key: content[key] for key in STANDARD if isinstance(content.get(key), Mapping)}
+    if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
+        return content
+    standard = {key: {**section, **sections.get(key, {})} for key, section in STANDARD.items()}
+    if "name" in sections.get("program", {}):
+        standard["program"] = sections["program"]
+    return {**content, **standard}
 
 
 def to_plain(config: Config) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Lookup tables in torch: what an engineer measured, as a function with a derivative, bounds and a translation."""
+"""Interpolation in torch, with a derivative, bounds and a translation: tables of measurements, and curves in time."""
 
 from collections.abc import Sequence
 
@@ -67,10 +67,64 @@ class Table(nn.Module):
     def _at(self, axis: int, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
         """The weight of each node along an axis."""
         nodes, weights = getattr(self, f"nodes_{axis}"), getattr(self, f"weights_{axis}")
-        r = (x[..., None] - nodes[:-1]) / nodes.diff()
-        s = torch.relu(r) - torch.relu(r - 1)  # at a node one interval alone has a slope; with clamp two would
+        s = _share_behind(x, nodes)
         basis = torch.cat([torch.ones_like(s[..., :1]), *(s**k for k in range(1, self.degree + 1))], -1)
         return (weights * basis[..., None, :]).sum(-1)
+
+
+class Curve(nn.Module):
+    """t (*batch) ↦ (*batch, *shape): piecewise linear between nodes, and constant beyond them.
+
+    Its nodes and values are part of a checkpoint, unlike a Table's, which belong to a system.
+
+    Args:
+        nodes: (K,), rising.
+        values: (K, *shape).
+    """
+
+    nodes: Float[Tensor, " K"]
+    values: Float[Tensor, "K *shape"]
+
+    def __init__(self, nodes: Float[Tensor, " K"], values: Float[Tensor, "K *shape"]):
+        super().__init__()
+        self.register_buffer("nodes", nodes.clone())
+        self.register_buffer("values", values.clone())
+
+    def forward(self, t: Float[Tensor, "*batch"]) -> Tensor:
+        y = self.values.flatten(1)
+        return (y[0] + _share_behind(t, self.nodes) @ y.diff(dim=0)).unflatten(-1, self.values.shape[1:])
+
+    @torch.no_grad()
+    def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
+        """Become the curve through as many of these points as there are nodes, those that leave the least error.
+
+        With fewer points than nodes, further ones are put between them.
+        """
+        kept = [0, len(nodes) - 1]
+        unit = values.flatten(1) / values.flatten(1).abs().amax(0).clamp_min(torch.finfo(values.dtype).tiny)
+        while len(kept) < min(len(self.nodes), len(nodes)):
+            kept = sorted([*kept, _furthest_from(nodes, unit, kept)])
+        nodes, values = nodes[kept], values[kept]
+        while len(nodes) < len(self.nodes):
+            i = int(nodes.diff().argmax())
+            nodes, values = (
+                torch.cat([y[: i + 1], (y[i : i + 1] + y[i + 1 : i + 2]) / 2, y[i + 1 :]]) for y in (nodes, values)
+            )
+        self.nodes.copy_(nodes)
+        self.values.copy_(values)
+
+
+def _furthest_from(nodes: Tensor, values: Tensor, kept: list[int]) -> int:
+    """The index of the point furthest from the curve through some of them, relative to what values are around it."""
+    share = _share_behind(nodes, nodes[kept])
+    error = (values - values[kept][0] - share @ values[kept].diff(dim=0)).abs() / (values.abs() + 1e-3)
+    return int(error.amax(1).argmax())
+
+
+def _share_behind(x: Tensor, nodes: Tensor) -> Tensor:
+    """The share of each interval between nodes that lies behind x, (*batch, K − 1)."""
+    r = (x[..., None] - nodes[:-1]) / nodes.diff()
+    return torch.relu(r) - torch.relu(r - 1)  # at a node one interval alone has a slope; with clamp two would
 
 
 def _cardinal(nodes: Tensor, degree: int) -> Tensor:

@@ -6,6 +6,8 @@ import torch
 from torch import nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
+from lyapnet.expansions import held_control, riccati
+from lyapnet.interpolation import Curve
 from lyapnet.problem import Problem
 from lyapnet.types import Control, PerState, State, Time
 
@@ -93,4 +95,37 @@ class SontagPolicy(ValuePolicy):
         return -gain[..., None] * direction
 
 
-POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy}
+class SampledPolicy(ValuePolicy):
+    """The law of a controller that holds u for Δt: the minimiser of Δt ℓ(x, u) + V(t + Δt, x + Δt(f + gu)) over u ∈ ℝᵐ,
+
+        u = −(2R + Δt gᵀHg)⁻¹ gᵀV_x(t + Δt, x + Δt f),
+
+    for V of curvature H along g. With Euler steps of Δt and V = xᵀP_n x it is the optimal law of a linear problem,
+    and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. As
+    Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the goal.
+
+    Raises:
+        ValueError: the problem limits its controls.
+    """
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        if problem.controls.limited:
+            raise ValueError(
+                f"Expected controls without limits for the sampled law, got {type(problem.controls).__name__}; take "
+                "rollout.policy=hjb."
+            )
+        super().__init__(problem, V)
+        self.problem = problem
+        self.riccati: Curve | None = None
+        if V.curvature(torch.zeros(()).to(problem.goal)) is None:
+            self.riccati = Curve(problem.horizon.times(problem.goal), riccati(problem).hessian.to(problem.goal))
+
+    def forward(self, t: Time, x: State) -> Control:
+        after = (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
+        H = self.V.curvature(after) if self.riccati is None else self.riccati(after)
+        assert H is not None
+        V_x = self.V.value_and_state_gradient(after, x + self.problem.horizon.dt * self.system.f(x))[1]
+        return held_control(self.problem, x, V_x, H)
+
+
+POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy}

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS = range(6)
+TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START = range(7)
 
 
 def stream(seed: int, *path: int) -> torch.Generator:

@@ -11,6 +11,7 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.config import load_config
 from lyapnet.controller import Controller
 from lyapnet.cost import Cost, QuadraticCost
+from lyapnet.networks import ExpansionNetwork
 from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Horizon, Problem
 from lyapnet.rollout import ClosedLoop
@@ -111,3 +112,15 @@ def planted(condition: nn.Module, point: Tensor, side: float, height: float) -> 
 
     condition.forward = lifted
     return condition
+
+
+def with_expansion(V: ValueFunction) -> ValueFunction:
+    """An ExpansionNetwork around a random path, with random weights for its zeros; any other V as it is."""
+    if isinstance(V, ExpansionNetwork):
+        nn.init.normal_(V.network.output.weight)
+        t = torch.linspace(0, V.network.inputs.duration, 9)
+        wave = 1 + 0.3 * torch.sin(3 * t)[:, None]
+        root = torch.randn(V.n, V.n)
+        H = wave[..., None] * (root @ root.mT)
+        V.take(t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(20, V.n))
+    return V

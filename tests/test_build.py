@@ -43,8 +43,16 @@ TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width o
 PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
 
 
+OWN = ("pendulum_swingup", "planar_quadrotor")  # of four sections, as a user writes them
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_configs_of_four_sections_name_nothing_else(name):
+    assert set(yaml.safe_load((CONF / f"{name}.yaml").read_text())) == {"system", "cost", "initial_states", "horizon"}
+
+
 def test_every_shipped_config_is_a_task_of_the_sheet():
-    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain"}
+    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain", *OWN}
     assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(PAPER)
 
 

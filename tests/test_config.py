@@ -10,8 +10,9 @@ import pytest
 import yaml
 from omegaconf import MISSING
 
-from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.config import STANDARD, Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
+from lyapnet.training.build import build_module
 from lyapnet.training.plan import plan_run
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
 
@@ -300,7 +301,7 @@ def mandatory(schema=Config, prefix=""):
 
 def test_mandatory_keys_are_these():
     task = ["initial_states.lower", "initial_states.upper", "horizon.steps"]
-    assert list(mandatory()) == ["experiment", "program.name", "system.name", *task, "network.name"]
+    assert list(mandatory()) == ["experiment", "program.name", "system.name", *task]
 
 
 @pytest.mark.parametrize("key", [*mandatory(), "cost.Q", "cost.R", "cost.Q_T"])
@@ -312,6 +313,34 @@ def test_missing_mandatory_key_is_refused(key, plain):
     del section[name]
     with pytest.raises(UsageError, match=f"^Expected .*{key}, got none"):
         objects(config_from_plain(plain))
+
+
+FOUR = ("system", "cost", "initial_states", "horizon")
+
+
+def test_four_sections_in_a_file_are_enough(tmp_path, plain):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump({section: plain[section] for section in FOUR}))
+    config = load_config(path, ["training.iterations=9"])
+    assert config.experiment == "mine"
+    assert (config.network.name, config.rollout.policy, config.program.name) == ("expansion", "sampled", "value")
+    assert (config.training.iterations, config.training.batch_size) == (9, STANDARD["training"]["batch_size"])
+    assert config.trainer == STANDARD["trainer"]
+    assert build_module(config).members[0].rollout.gradient == "discrete"
+
+
+def test_what_a_file_says_comes_on_top_of_the_standard_recipe(plain):
+    task = {"experiment": "mine", **{section: plain[section] for section in FOUR}}
+    config = config_from_plain({**task, "program": {"name": "lyapunov"}, "training": {"batch_size": 7}})
+    assert (config.program.name, config.program.cost_to_go) == ("lyapunov", None)
+    assert (config.training.batch_size, config.training.learning_rate) == (7, STANDARD["training"]["learning_rate"])
+    assert config_from_plain({**task, "program": {"cost_to_go": 3}}).program.trajectory_cost == 1
+
+
+def test_a_file_that_names_a_network_gets_the_schemas_defaults_alone(plain):
+    """As in version 0.1, whose files all name one."""
+    config = config_from_plain({**plain, "network": {"name": "fcn"}})
+    assert (config.rollout.policy, config.training.learning_rate, config.trainer) == ("hjb", 1e-2, {})
 
 
 # Precedence and round trips

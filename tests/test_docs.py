@@ -12,6 +12,7 @@ from omegaconf import MISSING
 
 from lyapnet.comparison.plan import ComparisonConfig
 from lyapnet.config import Config
+from lyapnet.networks import NETWORKS
 from tests.pages import PAGES, README, REPORT, ROOT
 
 WIDTH = 120
@@ -167,4 +168,4 @@ def test_the_table_of_keys_is_that_of_the_schema(schema, heading, end):
     assert {k: table[k] for k in known} == {k: shown_default(field) for k, field in known.items()}
 
 
-NETWORK_NAMES = ("fcn", "icnn", "anchored", "quadratic")  # of the further table on that page
+NETWORK_NAMES = tuple(NETWORKS)  # of the further table on that page

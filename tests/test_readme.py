@@ -184,7 +184,7 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
 def test_a_system_of_your_own(workplace):
     (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
     assert len(source.strip().splitlines()) <= 24
-    (config,) = [block for block in blocks("yaml") if "experiment:" in block]
+    (config,) = [block for block in blocks("yaml") if "pendulum:Pendulum" in block and "system:" in block]
     (comparison,) = [block for block in blocks("yaml") if "comparison:" in block]
     (workplace / "pendulum.py").write_text(source, encoding="utf-8")
     (workplace / "pendulum.yaml").write_text(config, encoding="utf-8")

@@ -28,7 +28,8 @@ def train(
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
     console = Console(highlight=False, markup=False)
-    command = shlex.join(["python", "train.py", "--config", str(config), *(overrides or [])])
+    program = ["python", "train.py"] if Path("train.py").is_file() else ["lyapnet", "train"]
+    command = shlex.join([*program, "--config", str(config), *(overrides or [])])
     plan = plan_run(load_config(config, overrides or []), resume, finetune)
     if plan.finished:
         console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
@@ -39,19 +40,22 @@ def train(
 
 
 def _print_result(console: Console, plan: Any, result: dict[str, Any], command: str) -> None:
+    from lyapnet.build import own_parts
     from lyapnet.evaluation.tables import evaluation_table, table_over_seeds
 
     title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
     console.print(
         evaluation_table(title, result) if len(members) == 1 else table_over_seeds(f"{title} of each seed", result)
     )
-    best = members[0].best
+    best, own = members[0].best, own_parts(plan.config)
+    options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
+    arguments = "".join(f", {part}=…" for part in own)
     for what, shown in (
         ("run", plan.run.folder),
         ("watch", f"tensorboard --logdir {plan.config.logs}"),
-        ("measure", f"lyapnet evaluate {best}"),
-        ("certify", f"lyapnet certify {best}"),
+        ("measure", f"lyapnet evaluate {best}{options}"),
+        ("certify", f"lyapnet certify {best}{options}"),
         ("fine-tune", f"{command} --finetune {best}"),
-        ("use", f'lyapnet.load("{best}")'),
+        ("use", f'lyapnet.load("{best}"{arguments})'),
     ):
         console.print(f"{what:<10}{shown}", soft_wrap=True)

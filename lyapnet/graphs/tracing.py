@@ -100,7 +100,16 @@ def batched(
     """The trace of a function over an axis of some of its arguments: each of its operations on all members at once."""
     one, other = (_first_member(arguments, axes), [_first_member(o, axes[len(axes) - len(o) :]) for o in elsewhere])
     # traced before it is batched: by then no autograd is left that vmap could not enter
-    return trace(vmap(trace(function, one, other), tuple(axes), tuple(out_axes)), arguments)
+    return trace(vmap(_of_any_layout(trace(function, one, other)), tuple(axes), tuple(out_axes)), arguments)
+
+
+def _of_any_layout(graph_module: GraphModule) -> GraphModule:
+    """A graph with reshape for view: over an axis that is not the first, members are not contiguous."""
+    for node in graph_module.graph.nodes:
+        if node.target is torch.ops.aten.view.default:
+            node.target = torch.ops.aten.reshape.default
+    graph_module.recompile()
+    return graph_module
 
 
 def cut(

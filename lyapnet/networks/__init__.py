@@ -6,6 +6,7 @@ The options are the fields of the config's network section that the constructor 
 from lyapnet.calculus import ValueFunction
 from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAnchor
 from lyapnet.networks.base import ACTIVATIONS, Scaling
+from lyapnet.networks.expansion import ExpansionNetwork
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.networks.ignoring import IgnoringStates
@@ -16,6 +17,7 @@ NETWORKS: dict[str, type[ValueFunction]] = {
     "icnn": ICNN,
     "anchored": AnchoredNetwork,
     "quadratic": QuadraticForm,
+    "expansion": ExpansionNetwork,
 }
 
 __all__ = [
@@ -24,6 +26,7 @@ __all__ = [
     "ICNN",
     "NETWORKS",
     "AnchoredNetwork",
+    "ExpansionNetwork",
     "GoalAnchor",
     "IgnoringStates",
     "PartiallyConvexNetwork",

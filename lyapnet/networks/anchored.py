@@ -8,6 +8,7 @@ from torch import Tensor
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import Cost
 from lyapnet.networks.base import Scaling
+from lyapnet.networks.expansion import ExpansionNetwork
 from lyapnet.networks.icnn import PartiallyConvexNetwork
 from lyapnet.types import PerState, State, Time
 
@@ -17,10 +18,15 @@ class TerminalAnchor(ValueFunction):
 
     Where N is convex in x, so is V; where N(t, 0) = 0, so is V(t, 0). With N ≥ 0, as an AnchoredNetwork is, V ≥ φ at
     every t: an upper bound of the cost-to-go still fits, the cost-to-go itself need not.
+
+    Raises:
+        ValueError: N has an expansion of its own, which ends in φ.
     """
 
     def __init__(self, network: ValueFunction, cost: Cost, duration: float):
         super().__init__()
+        if isinstance(network, ExpansionNetwork):
+            raise ValueError("Expected terminal=free with the expansion network, got exact; it starts at φ: remove it.")
         self.network, self.cost, self.duration = network, cost, duration
 
     def forward(self, t: Time, x: State) -> PerState:

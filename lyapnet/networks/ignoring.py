@@ -35,3 +35,10 @@ class IgnoringStates(ValueFunction):
         """V, and V_x with zeros for the states that are ignored."""
         value, gradient = self.network.value_and_state_gradient(t, x[..., self.kept])
         return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)
+
+    def curvature(self, t: Time) -> Tensor | None:
+        H = self.network.curvature(t)
+        if H is None:
+            return None
+        places = torch.eye(self.n).to(H)[self.kept]
+        return places.mT @ H @ places

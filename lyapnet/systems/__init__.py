@@ -3,6 +3,8 @@
 from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
 from lyapnet.systems.cartpole import Cartpole
 from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
+from lyapnet.systems.pendulum import Pendulum
+from lyapnet.systems.planar_quadrotor import PlanarQuadrotor
 from lyapnet.systems.reacher import Reacher
 
 SYSTEMS: dict[str, type[ControlAffineSystem]] = {
@@ -11,6 +13,8 @@ SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "linear": Linear,
     "cartpole": Cartpole,
     "reacher": Reacher,
+    "pendulum": Pendulum,
+    "planar_quadrotor": PlanarQuadrotor,
 }
 
 __all__ = [
@@ -21,6 +25,8 @@ __all__ = [
     "IntegratorChain",
     "Linear",
     "MechanicalSystem",
+    "Pendulum",
+    "PlanarQuadrotor",
     "Reacher",
     "is_linear",
 ]

@@ -92,6 +92,9 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
+        if plan.start is not None:
+            run.note(start=plan.start.as_json())
+            console.print(str(plan.start), soft_wrap=True)
     started = time.perf_counter()
     try:
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one

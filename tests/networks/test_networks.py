@@ -23,6 +23,7 @@ from lyapnet.networks import (
     Scaling,
 )
 from lyapnet.networks.anchored import GoalAnchor, TerminalAnchor
+from tests.problems import with_expansion
 
 T = 2.0
 SCALING = Scaling(state=(1.0, 2.0, 0.5), duration=T, value=30.0)
@@ -63,7 +64,7 @@ def ignoring():
 
 
 VALUES = {
-    **{name: partial(cls, **SMALL) for name, cls in NETWORKS.items()},
+    **{name: lambda cls=cls: with_expansion(cls(**SMALL)) for name, cls in NETWORKS.items()},
     **{f"fcn, {name}": partial(FCN, SCALING, (8,), activation=name) for name in ACTIVATIONS},
     **{f"icnn, {name}": partial(ICNN, SCALING, (8, 6, 4), activation=name) for name in CONVEX},
     "fcn, angles": partial(FCN, **SMALL, embedded_angles=(2, 0)),

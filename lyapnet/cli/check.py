@@ -1,0 +1,43 @@
+"""lyapnet check."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from lyapnet.cli.options import Debug
+
+
+def check(
+    config: Annotated[Path, typer.Argument(help="The experiment, a YAML file.")],
+    overrides: Annotated[list[str] | None, typer.Argument(help="Changes to the config, as key.sub=value.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Say what can be said of a task before training it: its goal, its modes, how stiff it is, and where to start."""
+    import torch
+
+    from lyapnet.build import parts_of
+    from lyapnet.config import load_config
+    from lyapnet.training.build import build_learner, build_problem
+    from lyapnet.training.facts import facts_of
+
+    resolved = dataclasses.replace(load_config(config, overrides or []), seeds=1)
+    torch.set_num_threads(resolved.training.threads)
+    parts = parts_of(resolved)
+    facts = facts_of(build_learner(resolved, build_problem(resolved, parts), parts))
+    console = Console(highlight=False, markup=False)
+    if as_json:
+        rows = [{"fact": fact.name, "found": fact.found, "advice": fact.advice or None} for fact in facts]
+        print(json.dumps({"experiment": resolved.experiment, "facts": rows}, ensure_ascii=False))
+        return
+    advice = Column("what to do", overflow="fold")
+    table = Table("fact", Column("found", overflow="fold"), advice, title=f"{resolved.experiment}, before training")
+    for fact in facts:
+        table.add_row(*fact)
+    console.print(table)
+    console.print(f"train     lyapnet train --config {config}", soft_wrap=True)

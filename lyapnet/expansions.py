@@ -1,0 +1,231 @@
+"""Optimal trajectories of the discretised problem, and the value function to second order around them.
+
+The problem is J_N = Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) along x_{n+1} = F(x_n, u_n) = x_n + Δt(f + g u). With
+Q(x, u) = Δt ℓ + V_{n+1}(F(x, u)), backwards from V_N = φ and to second order in (x, u),
+
+    k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
+
+Along an optimal trajectory k = 0, and V_n is the value function to second order. Around a state that stays where it is,
+with F linearised and q, φ quadratic, it is the Riccati solution; of an affine system, if f does not vanish there.
+
+Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search as in Tassa, Mansard, Todorov,
+"Control-limited differential dynamic programming", ICRA 2014.
+"""
+
+import copy
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.linear_algebra import apply, multiply, solve
+from lyapnet.problem import Problem
+from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
+
+STEP_SIZES = tuple(0.5**k for k in range(10))
+FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
+SETTLED = 1e-9  # relative improvement of J_N that is none
+TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
+
+
+class Expansion(NamedTuple):
+    """V(t_n, x̄_n + δ) ≈ c_n + p_nᵀδ + ½ δᵀH_nδ at the nodes of the horizon, in float64; *batch for several."""
+
+    x: StatePath  # x̄
+    value: ValuePath  # c
+    gradient: StatePath  # p
+    hessian: Tensor  # H (N + 1, *batch, n, n), symmetric
+
+    def member(self, i: int) -> "Expansion":
+        """One of several."""
+        return Expansion(*(part[:, i] for part in self))
+
+    def restricted_to(self, kept: list[int]) -> "Expansion":
+        """As a function of some of the states alone."""
+        return Expansion(
+            self.x[..., kept], self.value, self.gradient[..., kept], self.hessian[..., kept, :][..., :, kept]
+        )
+
+
+class Path(NamedTuple):
+    """Trajectories by Euler steps; J_N is infinite where one is not finite, and x is then finite all the same."""
+
+    x: StatePath
+    u: ControlPath
+    cost: PerState
+
+
+class Optimum(NamedTuple):
+    """Locally optimal trajectories from a batch of states, with the value function around each."""
+
+    path: Path
+    expansion: Expansion
+
+
+def held_control(problem: Problem, x: State, V_x: State, H: Tensor) -> Control:
+    """u held for Δt: the minimiser of Δt ℓ(x, u) + V(x + Δt(f + gu)) for V of gradient V_x at x + Δt f and curvature H.
+
+    u = −(2R + Δt gᵀHg)⁻¹ gᵀV_x.
+    """
+    g = problem.system.g(x)
+    weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(g.mT, multiply(H, g))
+    return -solve(weight, apply(g.mT, V_x)[..., None])[..., 0]
+
+
+def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
+    """(n, x_n) ↦ u_n: the held control for V as one expansion has it."""
+
+    def law(n: int, x: State) -> Control:
+        H, after = expansion.hessian[n + 1], x + problem.horizon.dt * problem.system.f(x)
+        return held_control(problem, x, expansion.gradient[n + 1] + apply(H, after - expansion.x[n + 1]), H)
+
+    return law
+
+
+class _Backward(NamedTuple):
+    k: ControlPath
+    K: Tensor  # (N, *batch, m, n)
+    expansion: Expansion
+
+
+def riccati(problem: Problem) -> Expansion:
+    """The value function of the problem linearised at its goal, x̄ = x*: F to first order, q, R and φ to second."""
+    problem, N = _exact(problem), problem.horizon.steps
+    x, u = problem.goal.expand(N + 1, -1), torch.zeros(N, problem.system.m, dtype=torch.float64)
+    return _backward(problem, x, u, curved=False).expansion
+
+
+def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations: int = 300) -> Optimum:
+    """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
+
+    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Where the
+    controls lead nowhere finite the cost is infinite.
+    """
+    problem, given = _exact(problem), u.double()
+    now = path_under(problem, lambda n, _: given[n], x0.double())
+    for curved in (False, True):
+        now = _descended(problem, now, curved, iterations)
+    return Optimum(now, _backward(problem, now.x, now.u).expansion)
+
+
+def _descended(problem: Problem, now: Path, curved: bool, iterations: int) -> Path:
+    """Where line searches lead until none of the trajectories improves; each has a damping of its own."""
+    damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
+    for _ in range(iterations):
+        if settled.all():
+            break
+        tried = _line_search(problem, now, _backward(problem, now.x, now.u, damping, curved))
+        better = (tried.cost < now.cost) & ~settled
+        settled |= better & (now.cost - tried.cost <= SETTLED * now.cost.abs())
+        x, u = torch.where(better[:, None], tried.x, now.x), torch.where(better[:, None], tried.u, now.u)
+        now = Path(x, u, torch.where(better, tried.cost, now.cost))
+        failures = torch.where(better, 0, failures + 1)
+        damping = torch.where(better, damping / 10, (10 * damping).clamp_min(1e-3))
+        settled |= failures > TRIES
+    return now
+
+
+def _exact(problem: Problem) -> Problem:
+    return copy.deepcopy(problem).double().cpu().requires_grad_(False)
+
+
+def _step(problem: Problem, x: State, u: Tensor) -> tuple[State, PerState]:
+    """F(x, u), and Δt ℓ."""
+    dt = problem.horizon.dt
+    return x + dt * problem.system.dynamics(x, u), dt * problem.cost.running(x, u)
+
+
+@torch.no_grad()
+def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
+    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
+    x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
+    for n in range(problem.horizon.steps):
+        u.append(law(n, x[-1]))
+        following, paid = _step(problem, x[-1], u[-1])
+        x.append(following)
+        J = J + paid
+    J = (J + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf)
+    return Path(torch.stack(x).nan_to_num(), torch.stack(u).nan_to_num(), J)
+
+
+def _line_search(problem: Problem, now: Path, backward: _Backward) -> Path:
+    """The best of u + αk + K(x' − x) over step sizes α, of each trajectory."""
+    alpha = torch.tensor(STEP_SIZES, dtype=torch.float64)[:, None, None]
+
+    def law(n: int, x: State) -> Control:
+        return now.u[n] + alpha * backward.k[n] + (backward.K[n] @ (x - now.x[n])[..., None])[..., 0]
+
+    tried = path_under(problem, law, now.x[0].expand(len(STEP_SIZES), *now.x.shape[1:]))
+    best, each = tried.cost.argmin(0), torch.arange(now.x.shape[1])
+    return Path(tried.x[:, best, each], tried.u[:, best, each], tried.cost[best, each])
+
+
+def _backward(
+    problem: Problem, x: StatePath, u: ControlPath, damping: Tensor | None = None, curved: bool = True
+) -> _Backward:
+    """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
+
+    Args:
+        damping: added to Q_uu, in units of the control cost.
+        curved: with the second derivatives of F.
+    """
+    n, dt = x.shape[-1], problem.horizon.dt
+    F, F_z, F_zz, paid, l_z, l_zz = _derivatives(problem, x[:-1], u, curved)
+    least = 2 * dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
+    end = x[-1].detach().requires_grad_()
+    with torch.enable_grad():
+        phi = problem.cost.terminal(end)
+        phi_x = _rows(phi[..., None], end)
+        p, H, c = phi_x[..., 0, :].detach(), _rows(phi_x[..., 0, :], end).detach(), phi.detach()
+    nodes, gains = [(c, p, H)], []
+    for k in reversed(range(len(u))):
+        moved = F[k] - x[k + 1]
+        c = c + (p * moved).sum(-1) + (moved * (H @ moved[..., None])[..., 0]).sum(-1) / 2 + paid[k]
+        p = p + (H @ moved[..., None])[..., 0]
+        Q_z = l_z[k] + (F_z[k].mT @ p[..., None])[..., 0]
+        Q_zz = l_zz[k] + F_z[k].mT @ H @ F_z[k]
+        if curved:
+            Q_zz = Q_zz + (p[..., None, None] * F_zz[k]).sum(-3)
+        Q_u, Q_uu, Q_ux = Q_z[..., n:], Q_zz[..., n:, n:], Q_zz[..., n:, :n]
+        raised = _raised(Q_uu, FLOOR * least[k], 0 if damping is None else damping * least[k])
+        gain = -torch.linalg.solve(raised, torch.cat([Q_u[..., None], Q_ux], -1))
+        ff, K = gain[..., 0], gain[..., 1:]
+        uff = (Q_uu @ ff[..., None])[..., 0]
+        c = c + (Q_u * ff).sum(-1) + (ff * uff).sum(-1) / 2
+        p = Q_z[..., :n] + (K.mT @ (Q_u + uff)[..., None])[..., 0] + (Q_ux.mT @ ff[..., None])[..., 0]
+        H = Q_zz[..., :n, :n] + K.mT @ Q_uu @ K + K.mT @ Q_ux + Q_ux.mT @ K
+        H = (H + H.mT) / 2
+        nodes.append((c, p, H))
+        gains.append((ff, K))
+    (value, gradient, hessian), (ff, K) = (
+        [torch.stack(column[::-1]) for column in zip(*rows, strict=True)] for rows in (nodes, gains)
+    )
+    return _Backward(ff, K, Expansion(x, value, gradient, hessian))
+
+
+def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:
+    """Q_uu with eigenvalues of no less than a floor, and with damping added to each."""
+    values, vectors = torch.linalg.eigh(Q_uu)
+    values = values.clamp_min(0).maximum(floor[..., None])
+    values = values + (damping[..., None] if isinstance(damping, Tensor) else damping)
+    return (vectors * values[..., None, :]) @ vectors.mT
+
+
+def _derivatives(problem: Problem, x: StatePath, u: ControlPath, curved: bool) -> tuple[Tensor, ...]:
+    """F, F_z, F_zz (none unless curved), Δt ℓ, and its gradient and Hessian, by z = (x, u), of all steps at once."""
+    with torch.enable_grad():
+        z = torch.cat([x, u], -1).detach().requires_grad_()
+        F, paid = _step(problem, z[..., : x.shape[-1]], z[..., x.shape[-1] :])
+        F_z, l_z = _rows(F, z), _rows(paid[..., None], z)[..., 0, :]
+        l_zz = _rows(l_z, z)
+        F_zz = _rows(F_z.flatten(-2), z).unflatten(-2, F_z.shape[-2:]) if curved else F_z.new_empty(len(x))
+    return tuple(y.detach() for y in (F, F_z, F_zz, paid, l_z, l_zz))
+
+
+def _rows(y: Tensor, z: Tensor) -> Tensor:
+    """∂y/∂z, (*batch, outputs, inputs), each state's by itself; zero where y does not depend on z."""
+    if not y.requires_grad:
+        return y.new_zeros(*y.shape, z.shape[-1])
+    rows = [torch.autograd.grad(y_i.sum(), z, create_graph=True, materialize_grads=True)[0] for y_i in y.unbind(-1)]
+    return torch.stack(rows, -2)

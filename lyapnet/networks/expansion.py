@@ -1,0 +1,83 @@
+"""A network on top of what is known of V before training: its expansion to second order around a trajectory."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.interpolation import Curve
+from lyapnet.linear_algebra import apply
+from lyapnet.networks.base import Scaling
+from lyapnet.networks.fcn import FCN
+from lyapnet.types import PerState, State, Time
+
+NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
+
+
+class ExpansionNetwork(ValueFunction):
+    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s N(t, Cᵀδ), δ = x − x̄(t), where N is zero until it is trained.
+
+    C are the coordinates in which the expansion curves equally in every direction: H ≈ 2s CCᵀ. A correction that is
+    small in V is then small in u = −½R⁻¹gᵀV_x too; in units of X₀ it can be huge along a direction in which V is flat
+    and g is large. Without an expansion, all but N is zero and C = diag(1/scale).
+
+    Args:
+        scaling: of the task, for what starts without an expansion.
+        hidden, activation: of N, an FCN.
+    """
+
+    scale: Float[Tensor, ""]  # s, in units of cost
+    coordinates: Float[Tensor, "n n"]  # C
+
+    def __init__(self, scaling: Scaling, hidden: Sequence[int] = (64, 64), activation: str = "tanh"):
+        super().__init__()
+        n = self.n = len(scaling.state)
+        self.network = FCN(Scaling([1.0] * n, scaling.duration, 1.0), hidden, activation)
+        nn.init.zeros_(self.network.output.weight)
+        nn.init.zeros_(self.network.output.bias)
+        self.register_buffer("scale", torch.tensor(scaling.value))
+        self.register_buffer("coordinates", torch.diag(1 / torch.tensor(scaling.state)))
+        self.expansion = Curve(torch.linspace(0, scaling.duration, NODES), torch.zeros(NODES, 1 + 2 * n + 2 * n * n))
+
+    def forward(self, t: Time, x: State) -> PerState:
+        c, p, H, delta = self._around(t, x)
+        return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * self.network(t, delta @ self.coordinates)
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V and V_x = p + Hδ + s C N_ξ."""
+        c, p, H, delta = self._around(t, x)
+        N, N_xi = self.network.value_and_state_gradient(t, delta @ self.coordinates)
+        curved = apply(H, delta)
+        value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * N
+        return value, p + curved + self.scale * (N_xi @ self.coordinates.mT)
+
+    def curvature(self, t: Time) -> Tensor:
+        return self.expansion(t)[..., -self.n * self.n :].unflatten(-1, (self.n, self.n))
+
+    def _around(self, t: Time, x: State) -> tuple[Tensor, Tensor, Tensor, State]:
+        """(c, p, H) at t, and δ."""
+        n = self.n
+        parts = self.expansion(t)
+        H = parts[..., 1 + 2 * n : 1 + 2 * n + n * n].unflatten(-1, (n, n))
+        return parts[..., 0], parts[..., 1 : 1 + n], H, x - parts[..., 1 + n : 1 + 2 * n]
+
+    @torch.no_grad()
+    def take(
+        self, t: Tensor, x: Tensor, value: Tensor, gradient: Tensor, hessian: Tensor, curvature: Tensor, spread: Tensor
+    ) -> None:
+        """Start from an expansion at the nodes t (K,), whose parts are (K, …), for deviations δ of some spread.
+
+        Args:
+            curvature: what stands for H in control laws, (K, n, n), symmetric positive semidefinite.
+            spread: deviations δ from x̄(0), (k, n): their mean ½ δᵀHδ is s, times the number of states.
+        """
+        parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
+        self.expansion.take(t, torch.cat(parts, 1))
+        early = curvature[: max(1, 3 * len(curvature) // 4)].mean(0) / 2
+        values, vectors = torch.linalg.eigh(early)
+        values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
+        s = (apply(vectors.mT, spread) ** 2 * values).sum(-1).mean() / self.n
+        self.scale.copy_(s)
+        self.coordinates.copy_(vectors * (values / s).sqrt())

@@ -1,0 +1,38 @@
+"""The pendulum."""
+
+import torch
+
+from lyapnet.systems.base import MechanicalSystem, require_positive
+from lyapnet.types import Coordinates, MassMatrix, PerState, State
+
+
+class Pendulum(MechanicalSystem):
+    """A point mass on a massless rod, driven at its hinge; θ = 0 is upright, and hanging down is θ = π.
+
+    m l² θ̈ = u + m g l sin θ − b θ̇.
+
+    Args:
+        mass: m in kg.
+        length: l in m.
+        damping: b in N·m·s/rad.
+        gravity: g in m/s².
+    """
+
+    state_names, state_units = ("angle", "velocity"), ("rad", "rad/s")
+    control_names, control_units = ("torque",), ("N·m",)
+    angles = (0,)
+
+    def __init__(self, mass: float = 1.0, length: float = 1.0, damping: float = 0.0, gravity: float = 9.81):
+        require_positive(mass=mass, length=length, gravity=gravity)
+        super().__init__(actuation=[[1.0]], damping=[damping])
+        self.mass, self.length, self.gravity = mass, length, gravity
+
+    def mass_matrix(self, q: Coordinates) -> MassMatrix:
+        return torch.full_like(q, self.mass * self.length**2)[..., None]
+
+    def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
+        return self.mass * self.gravity * self.length * torch.sin(q)
+
+    def energy(self, x: State) -> PerState:
+        q, qdot = self._split(x)
+        return self.kinetic_energy(q, qdot) + self.mass * self.gravity * self.length * torch.cos(q[..., 0])

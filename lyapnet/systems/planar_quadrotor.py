@@ -1,0 +1,49 @@
+"""The planar quadrotor."""
+
+import torch
+
+from lyapnet.systems.base import ControlAffineSystem, require_positive
+from lyapnet.types import ControlMatrix, InputMatrix, State
+
+
+class PlanarQuadrotor(ControlAffineSystem):
+    """A rigid body in a vertical plane with two rotors; controls are their thrusts beyond those of hovering.
+
+    With F = m g + u₁ + u₂:   m ẍ = −F sin θ,   m z̈ = F cos θ − m g,   I θ̈ = r (u₁ − u₂).
+
+    Args:
+        mass: m in kg.
+        inertia: I in kg·m².
+        arm: r in m, from the centre to each rotor.
+        gravity: g in m/s².
+
+    Source: Tedrake, Underactuated Robotics, ch. 3, with thrusts measured from those of hovering.
+    """
+
+    state_names = ("x", "z", "pitch", "x velocity", "z velocity", "pitch velocity")
+    state_units = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+    control_names, control_units = ("right thrust", "left thrust"), ("N", "N")
+    angles = (2,)
+
+    def __init__(self, mass: float = 0.486, inertia: float = 0.00383, arm: float = 0.25, gravity: float = 9.81):
+        super().__init__()
+        require_positive(mass=mass, inertia=inertia, arm=arm, gravity=gravity)
+        self.mass, self.inertia, self.arm, self.gravity = mass, inertia, arm, gravity
+
+    def f(self, x: State) -> State:
+        pitch = x[..., 2]
+        falling = self.gravity * torch.stack([-torch.sin(pitch), torch.cos(pitch) - 1, torch.zeros_like(pitch)], -1)
+        return torch.cat([x[..., 3:], falling], -1)
+
+    def g(self, x: State) -> InputMatrix:
+        pitch, turn = x[..., 2], self.arm / self.inertia
+        push = torch.stack([-torch.sin(pitch), torch.cos(pitch)], -1) / self.mass
+        right, left = (torch.cat([push, torch.full_like(push[..., :1], a)], -1) for a in (turn, -turn))
+        accelerations = torch.stack([right, left], -1)
+        return torch.cat([torch.zeros_like(accelerations), accelerations], -2)
+
+    def inverse_mass(self, x: State) -> ControlMatrix:
+        """BᵀM⁻¹B, the control weight R of the reference tasks; the same at every state."""
+        push, turn = 1 / self.mass, self.arm**2 / self.inertia
+        R = torch.tensor([[push + turn, push - turn], [push - turn, push + turn]]).to(x)
+        return R.expand(*x.shape[:-1], 2, 2)

@@ -1,0 +1,118 @@
+"""What can be said of a problem before training: its goal, its linearisation there, how stiff it is, where to start."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.expansions import riccati
+from lyapnet.problem import Problem
+from lyapnet.training.learner import Learner
+from lyapnet.training.start import CALM, choose_start
+
+STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
+
+
+class Fact(NamedTuple):
+    """A line: what it is about, what was found, and what to do where that is a reason to."""
+
+    name: str
+    found: str
+    advice: str = ""
+
+
+def facts_of(learner: Learner) -> list[Fact]:
+    """The facts of a learner's problem; its V is left at the best start."""
+    problem = learner.problem
+    exact = type(problem).replaced(problem).double().cpu()
+    facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact)]
+    start = choose_start([learner])
+    if start is None:
+        return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
+    for candidate in start.candidates:
+        cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
+        chosen = " ← training starts here" if candidate == start.chosen else ""
+        facts.append(Fact(f"start from {candidate.name}", f"{cost}{chosen}"))
+    if start.chosen.finite < 1:
+        facts.append(Fact("start", "no candidate is finite on all of X₀", "choose a smaller X₀, or a shorter horizon"))
+    elif start.chosen.name == CALM:
+        facts.append(Fact("start", "nothing known is better than no control", "expect a longer training"))
+    return facts
+
+
+def _task(problem: Problem) -> Fact:
+    horizon, system = problem.horizon, problem.system
+    return Fact(
+        "task",
+        f"{type(system).__name__}: {system.n} states, {system.m} controls; T = {horizon.duration:g} s in "
+        f"{horizon.steps} steps",
+    )
+
+
+def _goal(problem: Problem) -> Fact:
+    """Whether the goal is an equilibrium, or which control makes it one."""
+    f, g = problem.system.f(problem.goal), problem.system.g(problem.goal)
+    if float(f.abs().max()) <= 1e-9:
+        return Fact("goal", "an equilibrium without control")
+    u = -torch.linalg.lstsq(g, f[:, None]).solution[:, 0]
+    residual = float((f + g @ u).abs().max())
+    if residual <= 1e-9 * float(f.abs().max()):
+        return Fact(
+            "goal",
+            f"held by u = {_listed(u)}, which the cost charges",
+            "measure u from there, so that staying costs nothing",
+        )
+    return Fact("goal", f"no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there")
+
+
+def _linearisation(problem: Problem) -> list[Fact]:
+    """The eigenvalues of ẋ = Ax + Bu around the goal, and whether u reaches them."""
+    system, goal, dt = problem.system, problem.goal, problem.horizon.dt
+    A = torch.autograd.functional.jacobian(system.f, goal)
+    assert isinstance(A, Tensor)
+    B, values = system.g(goal).detach(), torch.linalg.eigvals(A)
+    listed = ", ".join(_complex(value) for value in sorted(values.tolist(), key=lambda v: (-v.real, abs(v.imag))))
+    unreached = [value for value in values if _rank(A, B, value) < system.n]
+    facts = [Fact("modes at the goal", f"{listed} 1/s")]
+    if not unreached:
+        facts.append(Fact("controllable", "yes, linearised at the goal"))
+    else:
+        modes = ", ".join(_complex(complex(value)) for value in unreached)
+        grows = any(value.real > 1e-9 for value in unreached)
+        facts.append(Fact(
+            "controllable", f"not linearised at the goal: u does not reach {modes}",
+            "what grows there cannot be held near the goal" if grows else "",
+        ))  # fmt: skip
+    growth = (1 + dt * values).abs()
+    if bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
+        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under Euler steps", "a smaller horizon.dt"))
+    return facts
+
+
+def _stiffness(problem: Problem) -> Fact:
+    """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
+    g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
+    weighted = torch.linalg.solve(R, g.mT @ riccati(problem).hessian @ g)
+    gain = problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max())
+    found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
+    if gain <= STABLE:
+        return Fact("stiffness", f"{found}: both control laws are stable at this Δt")
+    return Fact(
+        "stiffness",
+        f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt",
+        f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}",
+    )
+
+
+def _rank(A: Tensor, B: Tensor, value: Tensor) -> int:
+    """The rank of (A − λI, B): n where u reaches the mode (Popov, Belevitch, Hautus)."""
+    shifted = A.to(value.dtype) - value * torch.eye(len(A), dtype=value.dtype)
+    return int(torch.linalg.matrix_rank(torch.cat([shifted, B.to(value.dtype)], 1), rtol=1e-9))
+
+
+def _listed(values: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} {value.imag:+.3g}i"

@@ -1,0 +1,136 @@
+"""Where training starts from: what is known of V before the first step, chosen by trying."""
+
+import copy
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.expansions import Expansion, greedy_law, optimal_trajectories, path_under, riccati
+from lyapnet.networks import ExpansionNetwork, IgnoringStates
+from lyapnet.problem import Problem
+from lyapnet.random_streams import START, stream
+from lyapnet.training.learner import Learner
+from lyapnet.types import State
+
+STATES = 64  # of X₀, on which a start is tried
+GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
+CALM = "V = 0"
+
+
+class Candidate(NamedTuple):
+    """A start that was tried."""
+
+    name: str
+    cost: float  # mean J_N from states of X₀; infinite where a closed loop is not finite
+    finite: float  # share of the closed loops
+
+
+class Start(NamedTuple):
+    """The start of a training: the candidate of least cost, and the others."""
+
+    chosen: Candidate
+    candidates: Sequence[Candidate]
+
+    def __str__(self) -> str:
+        others = ", ".join(f"{_shown(other)} from {other.name}" for other in self.candidates if other != self.chosen)
+        return f"start: {self.chosen.name}, mean cost {_shown(self.chosen)} of {STATES} states ({others})"
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "chosen": self.chosen.name,
+            "tried": {c.name: c.cost if c.finite == 1 else None for c in self.candidates},
+        }
+
+
+def choose_start(learners: Sequence[Learner]) -> Start | None:
+    """Put the best of some expansions into the networks of learners of one problem; None where there is no place.
+
+    Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws.
+    """
+    networks = [_network_of(learner.V) for learner in learners]
+    if any(network is None for network in networks):
+        return None
+    first, network, kept = learners[0], networks[0], _kept(learners[0].V)
+    x0 = first.problem.initial_states.sample(STATES, stream(0, START)).to(first.problem.goal)
+    calm, tried = {key: value.clone() for key, value in network.state_dict().items()}, []
+    for name, expansion in [(CALM, None), *expansions_of(first.problem)]:
+        if expansion is not None:
+            take(network, first.problem, expansion, kept, x0)
+        tried.append((_tried(name, first, x0), expansion))
+        network.load_state_dict(calm)
+    chosen, expansion = min(tried, key=lambda each: (-each[0].finite, each[0].cost))
+    for each in networks:
+        if expansion is not None:
+            take(each, first.problem, expansion, kept, x0)
+        elif math.isfinite(chosen.cost) and chosen.cost > 0:
+            each.scale.fill_(chosen.cost)
+    return Start(chosen, [candidate for candidate, _ in tried])
+
+
+def _tried(name: str, learner: Learner, x0: State) -> Candidate:
+    """What the closed loop of a learner costs as it is now."""
+    policy, times = learner.rollout.closed_loop.policy, learner.problem.horizon.times(x0)
+    cost = path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
+    return Candidate(name, float(cost.mean()), float(cost.isfinite().double().mean()))
+
+
+def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
+    """What can be known of the value function before training, by name; finite, and for unlimited controls."""
+    if problem.controls.limited:
+        return
+    at_goal = riccati(problem)
+    if all(part.isfinite().all() for part in at_goal):
+        yield "the Riccati solution at the goal", at_goal
+    centre = problem.initial_states.center.double().cpu()
+    if torch.equal(centre, problem.goal.double().cpu()):
+        return
+    guesses = _guesses(problem, centre, at_goal)
+    optimum = optimal_trajectories(problem, centre.expand(guesses.shape[1], -1), guesses)
+    best = optimum.expansion.member(int(optimum.path.cost.argmin()))
+    if optimum.path.cost.isfinite().any() and all(part.isfinite().all() for part in best):
+        yield "the optimum from the centre of X₀", best
+
+
+def take(network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept: list[int], x0: State) -> None:
+    """Start a network from an expansion."""
+    expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
+    values, vectors = torch.linalg.eigh(expansion.hessian)
+    curvature = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
+    parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
+    network.take(*(part.to(network.scale) for part in parts))
+
+
+def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:
+    """Controls (N, guesses, m) from which an optimum from x₀ may be found: Riccati's, none, and random waves.
+
+    The waves cost about what the better of the first two does.
+    """
+    N, m, waves = problem.horizon.steps, problem.system.m, torch.arange(1, 5)
+    exact = copy.deepcopy(problem).double().cpu()
+    laws = greedy_law(exact, at_goal), lambda _, x: torch.zeros(*x.shape[:-1], m).double()
+    paths = [path_under(exact, law, x0) for law in laws]
+    cost = min(float(path.cost) for path in paths)
+    dearest = float(torch.linalg.eigvalsh(exact.cost.R(x0))[..., -1])
+    amplitude = math.sqrt(cost / (dearest * problem.horizon.duration)) if math.isfinite(cost) else 1.0
+    phase = torch.arange(N).double()[:, None] / N * torch.pi * waves
+    weights = torch.randn(GUESSES, m, 2, len(waves), generator=stream(0, START, 1), dtype=torch.float64) / waves
+    random = torch.einsum("gmaw,awn->ngm", weights, torch.stack([phase.sin(), phase.cos()]).mT)
+    return torch.cat([*(path.u[:, None] for path in paths), amplitude * random], 1)
+
+
+def _network_of(V: ValueFunction) -> Any:
+    """The network that an expansion can be put into, if there is one."""
+    inner = V.network if isinstance(V, IgnoringStates) else V
+    return inner if isinstance(inner, ExpansionNetwork) else None
+
+
+def _kept(V: ValueFunction) -> list[int]:
+    return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(_network_of(V).n))
+
+
+def _shown(candidate: Candidate) -> str:
+    return f"{candidate.cost:.4g}" if candidate.finite == 1 else f"not finite on {1 - candidate.finite:.0%}"

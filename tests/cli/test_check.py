@@ -1,0 +1,107 @@
+"""lyapnet check: facts of a task before training, against systems whose facts are known."""
+
+import json
+
+import pytest
+import torch
+import yaml
+
+from lyapnet.cli import main
+from lyapnet.config import config_from_plain
+from lyapnet.systems import Linear
+from lyapnet.training.build import build_learner, build_problem
+from lyapnet.training.facts import facts_of
+
+TASK = {
+    "system": {"name": "pendulum"},
+    "cost": {"Q": [1, 0.1], "R": [0.1], "Q_T": [10, 1]},
+    "initial_states": {"lower": [-0.5, -0.5], "upper": [0.5, 0.5]},
+    "horizon": {"steps": 20, "dt": 0.05},
+}
+
+
+def linear(A, B, **changes):
+    n = len(A)
+    ones = {"Q": [1] * n, "R": [1] * len(B[0]), "Q_T": [1] * n}
+    box = {"lower": [-1] * n, "upper": [1] * n}
+    return {"experiment": "x", "system": {"name": "linear", "parameters": {"A": A, "B": B}}, "cost": ones,
+            "initial_states": box, "horizon": {"steps": 10, "dt": 0.1}, **changes}  # fmt: skip
+
+
+def facts(content, problem=None):
+    config = config_from_plain(content)
+    found = facts_of(build_learner(config, problem or build_problem(config)))
+    return {fact.name: fact for fact in found}
+
+
+def test_modes_and_controllability():
+    reached = facts(linear([[0, 1], [4, 0]], [[0], [1]]))
+    assert reached["modes at the goal"].found == "2, -2 1/s"
+    assert reached["controllable"].found.startswith("yes")
+    lost = facts(linear([[0.5, 0], [0, -1]], [[0], [1]]))["controllable"]
+    assert "does not reach 0.5" in lost.found
+    assert lost.advice
+    assert not facts(linear([[-0.5, 0], [0, -1]], [[0], [1]]))["controllable"].advice, "what decays needs no control"
+
+
+class Falling(Linear):
+    """ẋ = Ax + Bu − 1 in its last state, as gravity pulls."""
+
+    def f(self, x):
+        return super().f(x) - torch.eye(self.n).to(x)[-1]
+
+    def dynamics(self, x, u):
+        return self.f(x) + (self.g(x) @ u[..., None])[..., 0]
+
+
+@pytest.mark.parametrize(("B", "words"), [([[0], [2]], "held by u = (0.5)"), ([[1], [0]], "no control holds it")])
+def test_a_goal_that_is_no_equilibrium(B, words):
+    content = linear([[0, 1], [0, 0]], B)
+    problem = build_problem(config_from_plain(content))
+    falling = Falling([[0.0, 1.0], [0.0, 0.0]], torch.tensor(B).double().tolist())
+    fact = facts(content, problem.replaced(system=falling))["goal"]
+    assert words in fact.found
+    assert fact.advice
+    assert facts(content)["goal"].found == "an equilibrium without control"
+
+
+def test_stiffness_is_that_at_which_the_hjb_law_breaks():
+    """ẋ = u, φ = px²: the gain over a step is Δt p/R, and Euler steps of u = −px/R grow above 2."""
+    stiff = linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [30]})
+    fact = facts(stiff)["stiffness"]
+    assert "= 3 > 2" in fact.found
+    assert "horizon.dt ≤ 0.067" in fact.advice
+    assert (
+        "both control laws" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["stiffness"].found
+    )
+
+
+def test_a_step_that_euler_cannot_take():
+    assert "grow under Euler" in facts(linear([[-30]], [[1]]))["Δt"].found
+    assert "Δt" not in facts(linear([[-10]], [[1]]))
+
+
+def test_a_start_that_is_not_finite_says_so():
+    content = {**TASK, "experiment": "x", "rollout": {"policy": "hjb"}, "cost": {**TASK["cost"], "R": [1e-9]}}
+    found = facts({**content, "horizon": {"steps": 400, "dt": 0.05}})
+    assert "finite on 0%" in found["start from the Riccati solution at the goal"].found
+
+
+def test_the_command(tmp_path, capsys):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(TASK))
+    assert main(["check", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "mine, before training" in shown
+    assert f"lyapnet train --config {path}" in shown
+    assert main(["check", str(path), "horizon.steps=10", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["experiment"] == "mine"
+    assert report["facts"][0]["found"].endswith("0.5 s in 10 steps")
+    chosen = [fact for fact in report["facts"] if "training starts here" in fact["found"]]
+    assert [fact["fact"] for fact in chosen] == ["start from the Riccati solution at the goal"]
+    assert main(["check", str(path), "network.name=fcn", "--json"]) == 0
+    assert "expansion" in json.loads(capsys.readouterr().out)["facts"][-1]["advice"]
+    path.write_text(yaml.safe_dump({**TASK, "horizon": {"stepz": 3}}))
+    assert main(["check", str(path)]) == 2
+    assert "horizon.stepz" in capsys.readouterr().err

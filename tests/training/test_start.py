@@ -1,0 +1,105 @@
+"""The start of a training: chosen by trying, of all that is known before the first step."""
+
+import json
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet import load, train
+from lyapnet.config import config_from_plain
+from lyapnet.errors import UsageError
+from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.training.build import build_module
+from lyapnet.training.start import CALM, choose_start
+
+LINEAR = {
+    "experiment": "mine",
+    "system": {"name": "double_integrator"},
+    "cost": {"Q": [10, 0.1], "R": [1], "Q_T": [10, 0.1]},
+    "initial_states": {"lower": [-1, -0.7], "upper": [1, 0.7]},
+    "horizon": {"steps": 50, "dt": 0.05},
+}
+SWING = LINEAR | {
+    "system": {"name": "pendulum"},
+    "cost": {"Q": [0.5, 0.05], "R": [0.05], "Q_T": [50, 5]},
+    "initial_states": {"lower": [math.pi - 0.3, -0.5], "upper": [math.pi + 0.3, 0.5]},
+    "horizon": {"steps": 60, "dt": 0.04},
+}
+
+
+def started(content, *overrides):
+    module = build_module(config_from_plain(content, overrides))
+    return module.members, choose_start(list(module.members))
+
+
+def test_a_linear_task_is_solved_before_the_first_step():
+    (learner,), start = started(LINEAR)
+    problem = learner.problem
+    assert "Riccati" in start.chosen.name
+    assert [candidate.name for candidate in start.candidates] == [CALM, start.chosen.name], "X₀ is around the goal"
+    x = problem.initial_states.sample(20)
+    exact = discrete_riccati(problem.system, problem.cost, problem.horizon)
+    assert_close(learner.rollout(x).cost, exact.value(0, x), rtol=1e-5, atol=0)
+    assert_close(learner.V(torch.zeros(()), x), exact.value(0, x), rtol=1e-9, atol=0)
+
+
+def test_far_from_the_goal_an_optimum_is_the_best_start():
+    (learner,), start = started(SWING)
+    assert "centre" in start.chosen.name
+    costs = {candidate.name: candidate.cost for candidate in start.candidates}
+    assert start.chosen.cost == min(costs.values())
+    assert costs[CALM] > 10 * start.chosen.cost
+    mean = learner.rollout(learner.problem.initial_states.sample(64)).cost.mean()
+    assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
+
+
+def test_every_seed_of_an_ensemble_starts_from_it():
+    members, start = started(LINEAR, "seeds=2")
+    x = members[0].problem.initial_states.sample(5)
+    values = [member.V(torch.zeros(()), x) for member in members]
+    assert_close(*values)
+    assert start.chosen.cost < start.candidates[0].cost
+    weights = [member.V.network.hidden[0].weight for member in members]
+    assert not torch.equal(*weights), "their networks differ all the same"
+
+
+def test_states_that_V_ignores_are_left_out_of_the_expansion():
+    task = LINEAR | {
+        "system": {"name": "linear", "parameters": {"A": [[0, 1, 0], [0, 0, 0], [0, 0, -1]], "B": [[0], [1], [0]]}},
+        "cost": {"Q": [10, 0.1, 0], "R": [1], "Q_T": [10, 0.1, 0]},
+        "initial_states": {"lower": [-1, -0.7, -1], "upper": [1, 0.7, 1]},
+        "network": {"ignored_states": ["x3"]},
+    }
+    names = build_module(config_from_plain({**task, "network": {}})).members[0].problem.system.state_names
+    task["network"]["ignored_states"] = [names[2]]
+    (learner,), start = started(task)
+    (whole,), same = started(LINEAR)
+    x = learner.problem.initial_states.sample(5)
+    assert_close(learner.V(torch.zeros(()), x), whole.V(torch.zeros(()), x[:, :2]), rtol=1e-9, atol=0)
+    assert start.chosen.cost == pytest.approx(same.chosen.cost, rel=0.3)
+
+
+def test_a_network_without_a_place_for_it_starts_as_it_is():
+    assert started(LINEAR, "network.name=fcn")[1] is None
+
+
+def test_a_run_records_its_start_and_loads_with_it(tmp_path, capsys):
+    brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
+             "rollout.compile=off"]  # fmt: skip
+    run = train(LINEAR | {"logs": str(tmp_path)}, brief)
+    record = json.loads((run.folder / "run.json").read_text())["start"]
+    assert record["chosen"] == "the Riccati solution at the goal"
+    assert record["tried"][CALM] > record["tried"][record["chosen"]]
+    assert "start: the Riccati solution at the goal, mean cost" in capsys.readouterr().out
+    controller = load(run.best)
+    assert controller.config.rollout.policy == "sampled"
+    again = train(LINEAR | {"logs": str(tmp_path)}, ["training.iterations=3", *brief[1:]], resume="last")
+    assert "start:" not in capsys.readouterr().out, "a run that goes on has its start behind it"
+    assert again.folder == run.folder
+
+
+def test_exact_terminal_values_are_not_for_it():
+    with pytest.raises(UsageError, match="terminal"):
+        build_module(config_from_plain(LINEAR, ["network.terminal=exact"]))

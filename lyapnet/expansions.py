@@ -25,7 +25,8 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath, Valu
 
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
-SETTLED = 1e-9  # relative improvement of J_N that is none
+NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
+CURVED = 100  # entries of F_z, up to which second derivatives are worth their time
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
 
 
@@ -96,28 +97,31 @@ def riccati(problem: Problem) -> Expansion:
     return _backward(problem, x, u, curved=False).expansion
 
 
-def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations: int = 300) -> Optimum:
+def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations: int = 80) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
-    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Where the
-    controls lead nowhere finite the cost is infinite.
+    First without the second derivatives of F, which far from an optimum point anywhere, then with them, unless there
+    are so many that they take longer than the steps they save. Where the controls lead nowhere finite the cost is
+    infinite.
     """
     problem, given = _exact(problem), u.double()
     now = path_under(problem, lambda n, _: given[n], x0.double())
-    for curved in (False, True):
-        now = _descended(problem, now, curved, iterations)
-    return Optimum(now, _backward(problem, now.x, now.u).expansion)
+    curved = problem.system.n * (problem.system.n + problem.system.m) <= CURVED
+    now = _descended(problem, now, False, iterations, NEAR if curved else SETTLED)
+    if curved:
+        now = _descended(problem, now, True, iterations, SETTLED)
+    return Optimum(now, _backward(problem, now.x, now.u, curved=curved).expansion)
 
 
-def _descended(problem: Problem, now: Path, curved: bool, iterations: int) -> Path:
-    """Where line searches lead until none of the trajectories improves; each has a damping of its own."""
+def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float) -> Path:
+    """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
     for _ in range(iterations):
         if settled.all():
             break
         tried = _line_search(problem, now, _backward(problem, now.x, now.u, damping, curved))
         better = (tried.cost < now.cost) & ~settled
-        settled |= better & (now.cost - tried.cost <= SETTLED * now.cost.abs())
+        settled |= better & (now.cost - tried.cost <= enough * now.cost.abs())
         x, u = torch.where(better[:, None], tried.x, now.x), torch.where(better[:, None], tried.u, now.u)
         now = Path(x, u, torch.where(better, tried.cost, now.cost))
         failures = torch.where(better, 0, failures + 1)

@@ -11,7 +11,7 @@ import yaml
 from omegaconf import MISSING
 
 from lyapnet.comparison.plan import ComparisonConfig
-from lyapnet.config import Config
+from lyapnet.config import STANDARD, Config
 from lyapnet.networks import NETWORKS
 from tests.pages import PAGES, README, REPORT, ROOT
 
@@ -169,3 +169,9 @@ def test_the_table_of_keys_is_that_of_the_schema(schema, heading, end):
 
 
 NETWORK_NAMES = tuple(NETWORKS)  # of the further table on that page
+
+
+def test_the_standard_recipe_is_what_the_page_says():
+    (shown,) = [block for block in re.findall(r"```yaml\n(.*?)```", PAGES[ROOT / "docs" / "config.md"], re.DOTALL)
+                if "network: {name: expansion}" in block]  # fmt: skip
+    assert yaml.safe_load(shown) == STANDARD

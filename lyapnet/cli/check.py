@@ -29,7 +29,9 @@ def check(
     resolved = dataclasses.replace(load_config(config, overrides or []), seeds=1)
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
-    facts = facts_of(build_learner(resolved, build_problem(resolved, parts), parts))
+    learner = build_learner(resolved, build_problem(resolved, parts), parts)
+    with Console(stderr=True).status("trying what is known of V …"):
+        facts = facts_of(learner)
     console = Console(highlight=False, markup=False)
     if as_json:
         rows = [{"fact": fact.name, "found": fact.found, "advice": fact.advice or None} for fact in facts]

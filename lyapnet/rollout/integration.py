@@ -177,7 +177,10 @@ class Rollout(nn.Module):
         return arguments
 
 
-_REMEDY = "lower the learning rate or Δt, shorten the horizon, or start closer to the goal"
+_REMEDY = (
+    "lower the learning rate or Δt, shorten the horizon, or start closer to the goal; lyapnet check says how stiff the "
+    "control law is, and from where on X₀ the start is finite"
+)
 
 
 def _require_finite(x: StatePath, running_cost: ValuePath, t: Times) -> None:

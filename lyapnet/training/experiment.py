@@ -25,6 +25,7 @@ from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.loggers import log_result, take_back_after
 from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
+from lyapnet.training.start import choose_start
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -92,11 +93,10 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
-        if plan.start is not None:
-            run.note(start=plan.start.as_json())
-            console.print(str(plan.start), soft_wrap=True)
     started = time.perf_counter()
     try:
+        if plan.resume_from is None and run.finetuned_from is None:
+            _choose_start(plan, console, trainer.is_global_zero)
         torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
         data = build_data(config, module.members[0].problem)
         trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
@@ -110,6 +110,15 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         if trainer.is_global_zero and run.exists:
             _note_what_it_took(run, time.perf_counter() - started)
     return _finish(trainer, plan, console) if trainer.is_global_zero else {}
+
+
+def _choose_start(plan: Plan, console: Console, told: bool) -> None:
+    """Put what is known of V into the networks that have a place for it, and say what was chosen."""
+    with console.status("start: trying what is known of V …") if told else nullcontext():
+        start = choose_start(list(plan.module.members))
+    if told and start is not None:
+        plan.run.note(start=start.as_json())
+        console.print(str(start), soft_wrap=True)
 
 
 def _prepare_folder(plan: Plan) -> None:

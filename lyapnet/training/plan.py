@@ -19,7 +19,6 @@ from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
 from lyapnet.training.run_lock import RunLock
 from lyapnet.training.runs import CONFIG, LAST, Run, is_further_process, last_run, new_run
-from lyapnet.training.start import Start, choose_start
 from lyapnet.training.trainer_options import check_trainer_options
 
 CHANGEABLE_ON_RESUME = (
@@ -39,7 +38,6 @@ class Plan:
     run: Run
     resume_from: Path | None = None  # a checkpoint
     step: int = 0  # at which that was written
-    start: Start | None = None  # what a new run's weights were chosen from
     lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
 
     def __post_init__(self) -> None:
@@ -81,9 +79,9 @@ def plan_run(
     require_parts(config, parts, config.experiment)
     module = build_module(config, parts)
     if not resume:
-        start = _start_from(module, finetune)
+        _start_from(module, finetune)
         run, lock = new_run(config, finetune)
-        return Plan(config, parts, module, callbacks, run, start=start, lock=lock)
+        return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if not run.exists:
@@ -92,12 +90,12 @@ def plan_run(
     with ExitStack() as stack:
         lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
         if resume == LAST and not run.begun:
-            start = _start_as(run, config, module)
-            plan = Plan(config, parts, module, callbacks, run, start=start, lock=lock)
+            _start_as(run, config, module)
+            plan = Plan(config, parts, module, callbacks, run, lock=lock)
         else:
             content = _read(checkpoint, run)
             _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
-            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock=lock)
+            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
         if not plan.finished:
             stack.pop_all()
         return plan
@@ -113,24 +111,22 @@ def _read(checkpoint: Path, run: Run) -> dict[str, Any]:
         raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
 
 
-def _start_as(run: Run, config: Config, module: TrainingModule) -> Start | None:
+def _start_as(run: Run, config: Config, module: TrainingModule) -> None:
     """Begin a run again that was stopped before its first checkpoint: it stands where it began."""
     written = run.folder / CONFIG
     if written.exists():
         _require_same_experiment(config, load_config(written), written)
-    return _start_from(module, run.finetuned_from)
+    _start_from(module, run.finetuned_from)
 
 
-def _start_from(module: TrainingModule, checkpoint: Path | None) -> Start | None:
-    """Put the weights of a checkpoint into every member, if there is one to fine-tune from; else the best start."""
-    if checkpoint is None:
-        return choose_start(list(module.members))
-    content = read_checkpoint(checkpoint)
-    if content[KEY].get("config") is not None:
-        config_of(content, checkpoint)  # refuses what this version does not understand
-    for member in module.members:
-        load_value_function(member.V, content, checkpoint)
-    return None
+def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:
+    """Put the weights of a checkpoint into every member, if there is one to fine-tune from."""
+    if checkpoint is not None:
+        content = read_checkpoint(checkpoint)
+        if content[KEY].get("config") is not None:
+            config_of(content, checkpoint)  # refuses what this version does not understand
+        for member in module.members:
+            load_value_function(member.V, content, checkpoint)
 
 
 def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:

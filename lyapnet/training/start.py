@@ -14,10 +14,12 @@ from lyapnet.networks import ExpansionNetwork, IgnoringStates
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
-from lyapnet.types import State
+from lyapnet.training.pretraining import OPTIMA, examples_of, fit, optima_for
+from lyapnet.types import PerState, State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
+CLOSE = 1e-5  # relative excess over optima that leaves nothing to fit
 CALM = "V = 0"
 
 
@@ -47,35 +49,73 @@ class Start(NamedTuple):
 
 
 def choose_start(learners: Sequence[Learner]) -> Start | None:
-    """Put the best of some expansions into the networks of learners of one problem; None where there is no place.
+    """Put the best of what is known into the networks of learners of one problem; None where there is no place.
 
-    Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws.
+    Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws: V = 0, each
+    expansion, and the best expansion with its network fitted to optima from further states of X₀.
     """
     networks = [_network_of(learner.V) for learner in learners]
     if any(network is None for network in networks):
         return None
-    first, network, kept = learners[0], networks[0], _kept(learners[0].V)
-    x0 = first.problem.initial_states.sample(STATES, stream(0, START)).to(first.problem.goal)
-    calm, tried = {key: value.clone() for key, value in network.state_dict().items()}, []
-    for name, expansion in [(CALM, None), *expansions_of(first.problem)]:
-        if expansion is not None:
-            take(network, first.problem, expansion, kept, x0)
-        tried.append((_tried(name, first, x0), expansion))
-        network.load_state_dict(calm)
-    chosen, expansion = min(tried, key=lambda each: (-each[0].finite, each[0].cost))
-    for each in networks:
-        if expansion is not None:
-            take(each, first.problem, expansion, kept, x0)
-        elif math.isfinite(chosen.cost) and chosen.cost > 0:
-            each.scale.fill_(chosen.cost)
-    return Start(chosen, [candidate for candidate, _ in tried])
+    problem, kept = learners[0].problem, _kept(learners[0].V)
+    x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
+    calm = [copy.deepcopy(network.state_dict()) for network in networks]
+    tried, expansions = [_tried(CALM, learners[0], x0)], dict(expansions_of(problem))
+    for name, expansion in expansions.items():
+        take(networks[0], problem, expansion, kept, x0)
+        tried.append(_tried(name, learners[0], x0))
+        networks[0].load_state_dict(calm[0])
+    if expansions:
+        base = _best(tried[1:])
+        for network in networks:
+            take(network, problem, expansions[base.name], kept, x0)
+        tried += _fitted(learners, list(expansions.values()), base, x0)
+    chosen = _best(tried)
+    if chosen.name == CALM:
+        for network, state in zip(networks, calm, strict=True):
+            network.load_state_dict(state)
+            if math.isfinite(chosen.cost) and chosen.cost > 0:
+                network.scale.fill_(chosen.cost)
+    return Start(chosen, tried)
+
+
+def _fitted(
+    learners: Sequence[Learner], expansions: Sequence[Expansion], base: Candidate, x0: State
+) -> list[Candidate]:
+    """The candidate whose networks are fitted to optima; none where the base is as good as these, or there are none.
+
+    Where it is no better than the base, the networks are what they were before.
+    """
+    problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
+    states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
+    optimum = optima_for(problem, expansions, states)
+    best, found = optimum.path.cost, int(optimum.path.cost.isfinite().sum())
+    now = _costs(learners[0], states[: len(best)]).to(best)
+    if not found or bool((now <= (1 + CLOSE) * best).all()):
+        return []
+    examples = examples_of(problem, optimum)
+    for learner in learners:
+        fit(learner.V, examples, stream(learner.seed, START, 3))
+    fitted = _tried(f"{found} optima from states of X₀", learners[0], x0)
+    if _best([base, fitted]) == base:
+        for learner, state in zip(learners, before, strict=True):
+            learner.V.load_state_dict(state)
+    return [fitted]
+
+
+def _best(candidates: Sequence[Candidate]) -> Candidate:
+    return min(candidates, key=lambda each: (-each.finite, each.cost))
 
 
 def _tried(name: str, learner: Learner, x0: State) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    policy, times = learner.rollout.closed_loop.policy, learner.problem.horizon.times(x0)
-    cost = path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
+    cost = _costs(learner, x0)
     return Candidate(name, float(cost.mean()), float(cost.isfinite().double().mean()))
+
+
+def _costs(learner: Learner, x0: State) -> PerState:
+    policy, times = learner.rollout.closed_loop.policy, learner.problem.horizon.times(x0)
+    return path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:

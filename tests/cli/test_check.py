@@ -20,6 +20,12 @@ TASK = {
 }
 
 
+@pytest.fixture(autouse=True)
+def _few_optima(monkeypatch):
+    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", 200)
+
+
 def linear(A, B, **changes):
     n = len(A)
     ones = {"Q": [1] * n, "R": [1] * len(B[0]), "Q_T": [1] * n}
@@ -99,7 +105,7 @@ def test_the_command(tmp_path, capsys):
     assert report["experiment"] == "mine"
     assert report["facts"][0]["found"].endswith("0.5 s in 10 steps")
     chosen = [fact for fact in report["facts"] if "training starts here" in fact["found"]]
-    assert [fact["fact"] for fact in chosen] == ["start from the Riccati solution at the goal"]
+    assert [fact["fact"] for fact in chosen] == ["start from 12 optima from states of X₀"]
     assert main(["check", str(path), "network.name=fcn", "--json"]) == 0
     assert "expansion" in json.loads(capsys.readouterr().out)["facts"][-1]["advice"]
     path.write_text(yaml.safe_dump({**TASK, "horizon": {"stepz": 3}}))

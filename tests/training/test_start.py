@@ -29,6 +29,12 @@ SWING = LINEAR | {
 }
 
 
+@pytest.fixture(autouse=True)
+def _few_optima(monkeypatch):
+    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", 200)
+
+
 def started(content, *overrides):
     module = build_module(config_from_plain(content, overrides))
     return module.members, choose_start(list(module.members))
@@ -45,10 +51,11 @@ def test_a_linear_task_is_solved_before_the_first_step():
     assert_close(learner.V(torch.zeros(()), x), exact.value(0, x), rtol=1e-9, atol=0)
 
 
-def test_far_from_the_goal_an_optimum_is_the_best_start():
+def test_far_from_the_goal_optima_are_the_best_start():
     (learner,), start = started(SWING)
-    assert "centre" in start.chosen.name
+    assert "optim" in start.chosen.name
     costs = {candidate.name: candidate.cost for candidate in start.candidates}
+    assert {"the optimum from the centre of X₀", "12 optima from states of X₀"} < costs.keys()
     assert start.chosen.cost == min(costs.values())
     assert costs[CALM] > 10 * start.chosen.cost
     mean = learner.rollout(learner.problem.initial_states.sample(64)).cost.mean()
@@ -59,10 +66,10 @@ def test_every_seed_of_an_ensemble_starts_from_it():
     members, start = started(LINEAR, "seeds=2")
     x = members[0].problem.initial_states.sample(5)
     values = [member.V(torch.zeros(()), x) for member in members]
-    assert_close(*values)
+    assert_close(values[0], values[1])
     assert start.chosen.cost < start.candidates[0].cost
     weights = [member.V.network.hidden[0].weight for member in members]
-    assert not torch.equal(*weights), "their networks differ all the same"
+    assert not torch.equal(weights[0], weights[1]), "their networks differ all the same"
 
 
 def test_states_that_V_ignores_are_left_out_of_the_expansion():
@@ -79,6 +86,22 @@ def test_states_that_V_ignores_are_left_out_of_the_expansion():
     x = learner.problem.initial_states.sample(5)
     assert_close(learner.V(torch.zeros(()), x), whole.V(torch.zeros(()), x[:, :2]), rtol=1e-9, atol=0)
     assert start.chosen.cost == pytest.approx(same.chosen.cost, rel=0.3)
+
+
+def test_fitting_to_optima_is_kept_where_it_is_better_and_taken_back_where_not(monkeypatch):
+    """A cart-pole that is to be balanced: Riccati's law costs a few per cent more than the optimum."""
+    task = LINEAR | {
+        "system": {"name": "cartpole", "parameters": {"pole_mass": 0.1, "length": 0.3}},
+        "cost": {"Q": [0, 25, 0.5, 0.1], "R": [1], "Q_T": [0, 25, 0.5, 0.1]},
+        "initial_states": {"lower": [-0.6, -0.6, -0.2, -0.2], "upper": [0.6, 0.6, 0.2, 0.2]},
+        "horizon": {"steps": 40, "dt": 0.02},
+    }
+    _, better = started(task)
+    assert better.chosen.name == "12 optima from states of X₀"
+    monkeypatch.setattr("lyapnet.training.pretraining.RATE", 1e3)
+    (learner,), taken_back = started(task)
+    assert taken_back.chosen.name == "the Riccati solution at the goal"
+    assert not learner.V.network.output.weight.any(), "the network is zero again"
 
 
 def test_a_network_without_a_place_for_it_starts_as_it_is():

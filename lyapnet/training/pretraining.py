@@ -1,0 +1,97 @@
+"""Fitting V to optimal trajectories, before it trains in closed loop: supervised, and seconds long."""
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.expansions import Expansion, Optimum, greedy_law, optimal_trajectories, path_under
+from lyapnet.problem import Problem
+from lyapnet.types import PerState, State
+
+OPTIMA = 128  # at the most; fewer where their second derivatives would not fit into …
+NUMBERS = 20_000_000  # … so many numbers (160 MB)
+STEPS, BATCH, RATE = 1500, 1024, 0.01
+VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
+
+
+class Examples(NamedTuple):
+    """What is known along optimal trajectories, a row for each of their nodes but the last."""
+
+    t: Tensor  # t_n (k,)
+    x: State
+    value: PerState  # V(t_n, x_n)
+    after: Tensor  # t_{n+1}
+    drifted: State  # x_n + Δt f
+    gradient: State  # V_x(t_{n+1}, drifted)
+    weight: Tensor  # L⁻¹gᵀ (k, m, n), LLᵀ = 2R + Δt gᵀHg: for what a wrong V_x costs
+    mean_cost: float  # of the trajectories
+    duration: float
+
+
+def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> Optimum:
+    """Optimal trajectories from a batch of states, from the controls that expansions ask for, or none if cheaper."""
+    exact = copy.deepcopy(problem).double().cpu()
+    x0 = x0.double().cpu()[: _affordable(problem)]
+    still = [lambda _, x: torch.zeros(*x.shape[:-1], problem.system.m, dtype=x.dtype)]
+    paths = [path_under(exact, law, x0) for law in (*(greedy_law(exact, each) for each in expansions), *still)]
+    best = torch.stack([path.cost for path in paths]).argmin(0)
+    u = torch.stack([path.u for path in paths])[best, :, torch.arange(len(x0))]
+    return optimal_trajectories(problem, x0, u.movedim(0, 1))
+
+
+def _affordable(problem: Problem) -> int:
+    """How many trajectories at a time have second derivatives that fit into memory."""
+    n, m = problem.system.n, problem.system.m
+    return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * n * (n + m) ** 2)))
+
+
+def examples_of(problem: Problem, optimum: Optimum) -> Examples:
+    """The examples of those trajectories that are finite, in float64."""
+    problem, finite = copy.deepcopy(problem).double().cpu(), optimum.path.cost.isfinite()
+    (x, value, gradient, hessian), dt = (part[:, finite] for part in optimum.expansion), problem.horizon.dt
+    now, H = x[:-1], hessian[1:]
+    drifted = now + dt * problem.system.f(now)
+    g = problem.system.g(now)
+    values, vectors = torch.linalg.eigh(2 * problem.cost.R(now) + dt * g.mT @ H @ g)
+    floor = 2 * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1] / 10
+    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
+    target = gradient[1:] + (H @ (drifted - x[1:])[..., None])[..., 0]
+    t = problem.horizon.times(now)[:, None].expand(value.shape)
+    flat = [y.flatten(0, 1).detach() for y in (t[:-1], now, value[:-1], t[1:], drifted, target, weight)]
+    t, now, value, after, drifted, target, weight = flat
+    mean_cost = float(optimum.path.cost[finite].mean())
+    return Examples(t, now, value, after, drifted, target, weight, mean_cost, problem.horizon.duration)
+
+
+def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
+    """Of some of the examples: the mean of (V − V*)²/J̄², and of T/(2J̄) ‖L⁻¹gᵀ(V_x − V_x*)‖².
+
+    The second is what the held controls of V cost beyond the optimum, to second order, as a share of J̄: a step with
+    controls u + e costs ½ Δt eᵀ(2R + Δt gᵀHg)e more.
+    """
+    t, x, value, after, drifted, gradient, weight = (column[rows] for column in examples[:7])
+    wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]
+    excess = examples.duration / (2 * examples.mean_cost) * (wrong**2).sum((-2, -1)).mean()
+    return ((V(t, x) - value) ** 2).mean() / examples.mean_cost**2, excess
+
+
+def fit(V: ValueFunction, examples: Examples, generator: torch.Generator) -> None:
+    """Lower both errors at the examples, by Adam."""
+    trained = [p for p in V.parameters() if p.requires_grad]
+    columns = [column.to(trained[0]) for column in examples[:7]]
+    examples = Examples(*columns, *examples[7:])  # pyright: ignore[reportCallIssue]
+    optimizer = torch.optim.Adam(trained, RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS, RATE / 1000)
+    for _ in range(STEPS):
+        rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
+        value_error, excess = errors(V, examples, rows)
+        optimizer.zero_grad()
+        (VALUE_WEIGHT * value_error + excess).backward()
+        torch.nn.utils.clip_grad_norm_(trained, 1.0)
+        optimizer.step()
+        schedule.step()
+    optimizer.zero_grad()

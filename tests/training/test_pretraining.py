@@ -1,0 +1,93 @@
+"""Fitting V to optima: what the examples say, against Riccati's solution and rollouts; and what fitting brings."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.expansions import optimal_trajectories, path_under, riccati
+from lyapnet.networks import FCN, Scaling
+from lyapnet.policy import SampledPolicy
+from lyapnet.systems import Linear
+from lyapnet.training import pretraining
+from lyapnet.training.pretraining import errors, examples_of, fit, optima_for
+from tests.problems import Formula, problem_of
+from tests.test_expansions import hanging
+
+
+@pytest.fixture
+def problem():
+    return problem_of(Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]]), steps=20, dt=0.1)
+
+
+def shifted(problem, by):
+    """The value function of a linear problem at the nodes, with a slope of its own added."""
+    P = discrete_riccati(problem.system, problem.cost, problem.horizon).P
+
+    def value(t, x):
+        matrix = P[(t / problem.horizon.dt).round().long().clamp(0, problem.horizon.steps)]
+        return ((x[..., None, :] @ matrix)[..., 0, :] * x).sum(-1) + by * x.sum(-1)
+
+    return Formula(value)
+
+
+def test_examples_are_the_value_function_of_a_linear_problem(problem):
+    optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
+    examples = examples_of(problem, optimum)
+    assert len(examples.t) == 6 * problem.horizon.steps
+    value_error, excess = errors(shifted(problem, 0.0), examples)
+    assert float(value_error.detach()) < 1e-20
+    assert float(excess.detach()) < 1e-20
+
+
+def test_the_excess_is_what_wrong_controls_cost(problem):
+    """To the last digit where the problem is linear: here along one trajectory, from its start."""
+    x0, V = torch.tensor([[0.4, -0.7]]), shifted(problem, 0.3)
+    policy, times = SampledPolicy(problem, V), problem.horizon.times(torch.zeros(()))
+    path = path_under(problem, lambda n, x: policy(times[n], x).detach(), x0)
+    optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 1, 1))
+    along = examples_of(problem, optimum._replace(path=optimum.path._replace(x=path.x), expansion=at(path.x, problem)))
+    _, excess = errors(V, along)
+    expected = float(path.cost - optimum.path.cost)
+    assert expected > 0.01
+    assert float(excess.detach()) * along.mean_cost == pytest.approx(expected, rel=1e-9)
+
+
+def at(x, problem):
+    """Riccati's expansion around any states."""
+    P = discrete_riccati(problem.system, problem.cost, problem.horizon).P[:, None]
+    gradient = 2 * (P @ x[..., None])[..., 0]
+    return riccati(problem)._replace(
+        x=x, value=(gradient * x).sum(-1) / 2, gradient=gradient, hessian=2 * P.expand(*x.shape, x.shape[-1])
+    )
+
+
+def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(monkeypatch):
+    monkeypatch.setattr(pretraining, "STEPS", 300)
+    problem = hanging(steps=40)
+    expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
+    seen, unseen = (
+        examples_of(problem, optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)))
+        for _ in range(2)
+    )
+    V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, seen.mean_cost), (32, 32))
+    before = [float(error.detach()) for error in errors(V, unseen)]
+    fit(V, seen, torch.Generator().manual_seed(0))
+    after = [float(error.detach()) for error in errors(V, unseen)]
+    assert after[0] < before[0] / 20
+    assert after[1] < before[1] / 20
+
+
+def test_only_finite_trajectories_are_examples(problem):
+    x0 = problem.initial_states.sample(3)
+    optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
+    broken = optimum.path.cost.clone()
+    broken[1] = torch.inf
+    examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)))
+    assert len(examples.t) == 2 * problem.horizon.steps
+    assert_close(examples.mean_cost, float(optimum.path.cost[[0, 2]].mean()))
+
+
+def test_as_many_trajectories_as_fit_into_memory(problem, monkeypatch):
+    monkeypatch.setattr(pretraining, "NUMBERS", 2 * problem.horizon.steps * 2 * 3**2)
+    assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)

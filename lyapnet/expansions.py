@@ -38,8 +38,8 @@ class Expansion(NamedTuple):
     gradient: StatePath  # p
     hessian: Tensor  # H (N + 1, *batch, n, n), symmetric
 
-    def member(self, i: int) -> "Expansion":
-        """One of several."""
+    def member(self, i: int | Tensor) -> "Expansion":
+        """One of several, or those with some indices."""
         return Expansion(*(part[:, i] for part in self))
 
     def restricted_to(self, kept: list[int]) -> "Expansion":

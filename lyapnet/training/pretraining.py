@@ -14,6 +14,7 @@ from lyapnet.types import PerState, State
 
 OPTIMA = 128  # at the most; fewer where their second derivatives would not fit into …
 NUMBERS = 20_000_000  # … so many numbers (160 MB)
+NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
 STEPS, BATCH, RATE = 1500, 1024, 0.01
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
 
@@ -33,14 +34,47 @@ class Examples(NamedTuple):
 
 
 def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> Optimum:
-    """Optimal trajectories from a batch of states, from the controls that expansions ask for, or none if cheaper."""
+    """Optimal trajectories from a batch of states, from the controls that expansions ask for, or none if cheaper.
+
+    What was found from one state is tried from the states around it: which local minimum a start leads to is luck, but
+    the least cost is continuous in x₀.
+    """
     exact = copy.deepcopy(problem).double().cpu()
     x0 = x0.double().cpu()[: _affordable(problem)]
     still = [lambda _, x: torch.zeros(*x.shape[:-1], problem.system.m, dtype=x.dtype)]
     paths = [path_under(exact, law, x0) for law in (*(greedy_law(exact, each) for each in expansions), *still)]
     best = torch.stack([path.cost for path in paths]).argmin(0)
     u = torch.stack([path.u for path in paths])[best, :, torch.arange(len(x0))]
-    return optimal_trajectories(problem, x0, u.movedim(0, 1))
+    optimum = optimal_trajectories(problem, x0, u.movedim(0, 1))
+    for _ in range(ROUNDS):
+        around = [
+            path_under(exact, greedy_law(exact, optimum.expansion.member(neighbours)), x0)
+            for neighbours in _nearest(x0).unbind(1)
+        ]
+        cost, which = torch.stack([path.cost for path in around]).min(0)
+        improved = torch.nonzero(cost < BETTER * optimum.path.cost).flatten()
+        if not len(improved):
+            break
+        u = torch.stack([path.u for path in around])[which[improved], :, improved]
+        optimum = _with(optimum, improved, optimal_trajectories(problem, x0[improved], u.movedim(0, 1)))
+    return optimum
+
+
+def _nearest(x0: State) -> Tensor:
+    """The indices of the nearest other states of each (b, k), each component in units of its spread."""
+    scaled = x0 / (x0.amax(0) - x0.amin(0)).clamp_min(torch.finfo(x0.dtype).tiny)
+    distance = torch.cdist(scaled, scaled).fill_diagonal_(torch.inf)
+    return distance.argsort(1)[:, : min(NEIGHBOURS, len(x0) - 1)]
+
+
+def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
+    """Some trajectories exchanged for others that cost less."""
+    (path, expansion), (new_path, new_expansion) = optimum, others
+    path = path._replace(cost=path.cost.clone())
+    path.cost[rows] = new_path.cost
+    for part, new in zip((path.x, path.u, *expansion), (new_path.x, new_path.u, *new_expansion), strict=True):
+        part[:, rows] = new
+    return Optimum(path, expansion)
 
 
 def _affordable(problem: Problem) -> int:

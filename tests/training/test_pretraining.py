@@ -91,3 +91,24 @@ def test_only_finite_trajectories_are_examples(problem):
 def test_as_many_trajectories_as_fit_into_memory(problem, monkeypatch):
     monkeypatch.setattr(pretraining, "NUMBERS", 2 * problem.horizon.steps * 2 * 3**2)
     assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
+
+
+def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch):
+    problem = hanging(steps=40)
+    x0, expansions = problem.initial_states.sample(8), [riccati(problem)]
+    expected = optima_for(problem, expansions, x0).path.cost
+    begun = []
+
+    def spoiled(problem, x0, u):
+        found = optimal_trajectories(problem, x0, u)
+        if begun:
+            return found
+        begun.append(x0)
+        bad = optimal_trajectories(problem, x0[:1], 0 * u[:, :1], iterations=0)
+        return pretraining._with(found, torch.tensor([0]), bad)
+
+    monkeypatch.setattr(pretraining, "optimal_trajectories", spoiled)
+    assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)
+    begun.clear()
+    monkeypatch.setattr(pretraining, "ROUNDS", 0)
+    assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]

@@ -79,5 +79,7 @@ class ExpansionNetwork(ValueFunction):
         values, vectors = torch.linalg.eigh(early)
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
         s = (apply(vectors.mT, spread) ** 2 * values).sum(-1).mean() / self.n
-        self.scale.copy_(s)
-        self.coordinates.copy_(vectors * (values / s).sqrt())
+        s = s.clamp_min(1e-6 * float(value.abs().max()))  # no spread: X₀ is a point
+        if s > 0:
+            self.scale.copy_(s)
+            self.coordinates.copy_(vectors * (values / s).sqrt())

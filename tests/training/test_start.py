@@ -62,6 +62,15 @@ def test_far_from_the_goal_optima_are_the_best_start():
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
 
 
+@pytest.mark.parametrize("task", [LINEAR, SWING])
+def test_an_X0_of_one_point(task):
+    point = {"lower": task["initial_states"]["lower"], "upper": task["initial_states"]["lower"]}
+    (learner,), start = started({**task, "initial_states": point})
+    assert start.chosen.finite == 1
+    assert start.chosen.cost < start.candidates[0].cost / 2
+    assert all(buffer.isfinite().all() for buffer in learner.V.buffers())
+
+
 def test_every_seed_of_an_ensemble_starts_from_it():
     members, start = started(LINEAR, "seeds=2")
     x = members[0].problem.initial_states.sample(5)

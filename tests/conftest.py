@@ -12,7 +12,7 @@ import jaxtyping
 import pytest
 import torch
 
-CHECKED_CALLS = 20  # of each function in each test; with all of them the tests take three times as long
+CHECKED_CALLS = 8  # of each function in each test; with all of them the tests take three times as long
 _calls = Counter()
 
 

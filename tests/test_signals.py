@@ -21,7 +21,7 @@ def told_after(seconds, number):
     threading.Timer(seconds, os.kill, (os.getpid(), number)).start()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, monkeypatch, capsys):
     kept, reports = tmp_path / "proof", []
 

@@ -94,6 +94,7 @@ def test_conditions_lie_within_every_enclosure(case, enclosed, name):
         assert outside(case, enclosed[name], *random_boxes(case, side, 50)) == 0
 
 
+@pytest.mark.slow
 def test_a_mean_value_form_with_the_gradient_of_the_middle_alone_is_caught(case, monkeypatch):
     """The twin: sound only because the gradient is bounded on the whole box."""
 
@@ -105,6 +106,7 @@ def test_a_mean_value_form_with_the_gradient_of_the_middle_alone_is_caught(case,
     assert outside(case, wrong, *random_boxes(case, 0.3, 50)) > 0
 
 
+@pytest.mark.slow
 def test_orders_of_the_excess(case, enclosed):
     """Affine and mean-value forms gain two digits where intervals gain one; forms of second degree begin ahead."""
     rows = {row.enclosure: row for row in tightness(case, enclosed, 30, 1, sides=(0.1, 2e-3, 1e-3, 5e-4))}

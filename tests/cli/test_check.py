@@ -89,7 +89,7 @@ def test_a_step_that_euler_cannot_take():
 
 def test_a_start_that_is_not_finite_says_so():
     content = {**TASK, "experiment": "x", "rollout": {"policy": "hjb"}, "cost": {**TASK["cost"], "R": [1e-9]}}
-    found = facts({**content, "horizon": {"steps": 400, "dt": 0.05}})
+    found = facts({**content, "horizon": {"steps": 150, "dt": 0.05}})
     assert "finite on 0%" in found["start from the Riccati solution at the goal"].found
 
 

@@ -55,6 +55,7 @@ def measured(what):
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_a_scan_as_machine_code_computes_the_same(cache):
     """x ↦ sin(wx) + t, three times, with what all steps share computed once."""
     found = measured("scan")

@@ -84,6 +84,11 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
     return law
 
 
+def no_control(problem: Problem) -> Callable[[int, State], Control]:
+    """(n, x_n) ↦ 0."""
+    return lambda _, x: x.new_zeros(*x.shape[:-1], problem.system.m)
+
+
 class _Backward(NamedTuple):
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
@@ -92,7 +97,7 @@ class _Backward(NamedTuple):
 
 def riccati(problem: Problem) -> Expansion:
     """The value function of the problem linearised at its goal, x̄ = x*: F to first order, q, R and φ to second."""
-    problem, N = _exact(problem), problem.horizon.steps
+    problem, N = in_float64(problem), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), torch.zeros(N, problem.system.m, dtype=torch.float64)
     return _backward(problem, x, u, curved=False).expansion
 
@@ -104,7 +109,7 @@ def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations
     are so many that they take longer than the steps they save. Where the controls lead nowhere finite the cost is
     infinite.
     """
-    problem, given = _exact(problem), u.double()
+    problem, given = in_float64(problem), u.double()
     now = path_under(problem, lambda n, _: given[n], x0.double())
     curved = problem.system.n * (problem.system.n + problem.system.m) <= CURVED
     now = _descended(problem, now, False, iterations, NEAR if curved else SETTLED)
@@ -130,7 +135,8 @@ def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enoug
     return now
 
 
-def _exact(problem: Problem) -> Problem:
+def in_float64(problem: Problem) -> Problem:
+    """A copy of a problem for what is computed before training: on the CPU, without gradients of its parameters."""
     return copy.deepcopy(problem).double().cpu().requires_grad_(False)
 
 

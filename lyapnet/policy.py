@@ -71,11 +71,7 @@ class SontagPolicy(ValuePolicy):
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
-        if problem.controls.limited:
-            raise ValueError(
-                f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
-                "rollout.policy=hjb."
-            )
+        _require_unlimited(problem, "Sontag's formula")
         super().__init__(problem, V)
 
     def forward(self, t: Time, x: State) -> Control:
@@ -109,11 +105,7 @@ class SampledPolicy(ValuePolicy):
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
-        if problem.controls.limited:
-            raise ValueError(
-                f"Expected controls without limits for the sampled law, got {type(problem.controls).__name__}; take "
-                "rollout.policy=hjb."
-            )
+        _require_unlimited(problem, "the sampled law")
         super().__init__(problem, V)
         self.problem = problem
         self.riccati: Curve | None = None
@@ -126,6 +118,14 @@ class SampledPolicy(ValuePolicy):
         assert H is not None
         V_x = self.V.value_and_state_gradient(after, x + self.problem.horizon.dt * self.system.f(x))[1]
         return held_control(self.problem, x, V_x, H)
+
+
+def _require_unlimited(problem: Problem, law: str) -> None:
+    if problem.controls.limited:
+        raise ValueError(
+            f"Expected controls without limits for {law}, got {type(problem.controls).__name__}; take "
+            "rollout.policy=hjb."
+        )
 
 
 POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy}

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.expansions import riccati
+from lyapnet.expansions import in_float64, riccati
 from lyapnet.problem import Problem
 from lyapnet.training.learner import Learner
 from lyapnet.training.start import CALM, choose_start
@@ -24,7 +24,7 @@ class Fact(NamedTuple):
 def facts_of(learner: Learner) -> list[Fact]:
     """The facts of a learner's problem; its V is left at the best start."""
     problem = learner.problem
-    exact = type(problem).replaced(problem).double().cpu()
+    exact = in_float64(problem)
     facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact)]
     start = choose_start([learner])
     if start is None:

@@ -1,6 +1,5 @@
 """Fitting V to optimal trajectories, before it trains in closed loop: supervised, and seconds long."""
 
-import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -8,7 +7,16 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import Expansion, Optimum, greedy_law, optimal_trajectories, path_under
+from lyapnet.expansions import (
+    FLOOR,
+    Expansion,
+    Optimum,
+    greedy_law,
+    in_float64,
+    no_control,
+    optimal_trajectories,
+    path_under,
+)
 from lyapnet.problem import Problem
 from lyapnet.types import PerState, State
 
@@ -39,10 +47,10 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> 
     What was found from one state is tried from the states around it: which local minimum a start leads to is luck, but
     the least cost is continuous in x₀.
     """
-    exact = copy.deepcopy(problem).double().cpu()
+    exact = in_float64(problem)
     x0 = x0.double().cpu()[: _affordable(problem)]
-    still = [lambda _, x: torch.zeros(*x.shape[:-1], problem.system.m, dtype=x.dtype)]
-    paths = [path_under(exact, law, x0) for law in (*(greedy_law(exact, each) for each in expansions), *still)]
+    laws = [*(greedy_law(exact, each) for each in expansions), no_control(exact)]
+    paths = [path_under(exact, law, x0) for law in laws]
     best = torch.stack([path.cost for path in paths]).argmin(0)
     u = torch.stack([path.u for path in paths])[best, :, torch.arange(len(x0))]
     optimum = optimal_trajectories(problem, x0, u.movedim(0, 1))
@@ -85,13 +93,13 @@ def _affordable(problem: Problem) -> int:
 
 def examples_of(problem: Problem, optimum: Optimum) -> Examples:
     """The examples of those trajectories that are finite, in float64."""
-    problem, finite = copy.deepcopy(problem).double().cpu(), optimum.path.cost.isfinite()
+    problem, finite = in_float64(problem), optimum.path.cost.isfinite()
     (x, value, gradient, hessian), dt = (part[:, finite] for part in optimum.expansion), problem.horizon.dt
     now, H = x[:-1], hessian[1:]
     drifted = now + dt * problem.system.f(now)
     g = problem.system.g(now)
     values, vectors = torch.linalg.eigh(2 * problem.cost.R(now) + dt * g.mT @ H @ g)
-    floor = 2 * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1] / 10
+    floor = 2 * FLOOR * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1]
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
     target = gradient[1:] + (H @ (drifted - x[1:])[..., None])[..., 0]
     t = problem.horizon.times(now)[:, None].expand(value.shape)

@@ -9,7 +9,15 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import Expansion, greedy_law, optimal_trajectories, path_under, riccati
+from lyapnet.expansions import (
+    Expansion,
+    greedy_law,
+    in_float64,
+    no_control,
+    optimal_trajectories,
+    path_under,
+    riccati,
+)
 from lyapnet.networks import ExpansionNetwork, IgnoringStates
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
@@ -150,8 +158,8 @@ def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:
     The waves cost about what the better of the first two does.
     """
     N, m, waves = problem.horizon.steps, problem.system.m, torch.arange(1, 5)
-    exact = copy.deepcopy(problem).double().cpu()
-    laws = greedy_law(exact, at_goal), lambda _, x: torch.zeros(*x.shape[:-1], m).double()
+    exact = in_float64(problem)
+    laws = greedy_law(exact, at_goal), no_control(exact)
     paths = [path_under(exact, law, x0) for law in laws]
     cost = min(float(path.cost) for path in paths)
     dearest = float(torch.linalg.eigvalsh(exact.cost.R(x0))[..., -1])

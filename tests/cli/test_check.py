@@ -111,3 +111,10 @@ def test_the_command(tmp_path, capsys):
     path.write_text(yaml.safe_dump({**TASK, "horizon": {"stepz": 3}}))
     assert main(["check", str(path)]) == 2
     assert "horizon.stepz" in capsys.readouterr().err
+
+
+def test_the_problem_keeps_its_precision():
+    config = config_from_plain(linear([[0, 1], [0, 0]], [[0], [1]], training={"precision": "float32"}))
+    learner = build_learner(config, build_problem(config))
+    facts_of(learner)
+    assert learner.problem.goal.dtype == learner.problem.system.A.dtype == torch.float32

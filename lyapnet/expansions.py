@@ -26,7 +26,6 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath, Valu
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
 NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
-CURVED = 100  # entries of F_z, up to which second derivatives are worth their time
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
 
 
@@ -105,34 +104,41 @@ def riccati(problem: Problem) -> Expansion:
 def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations: int = 80) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
-    First without the second derivatives of F, which far from an optimum point anywhere, then with them, unless there
-    are so many that they take longer than the steps they save. Where the controls lead nowhere finite the cost is
-    infinite.
+    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Where the
+    controls lead nowhere finite the cost is infinite.
     """
     problem, given = in_float64(problem), u.double()
     now = path_under(problem, lambda n, _: given[n], x0.double())
-    curved = problem.system.n * (problem.system.n + problem.system.m) <= CURVED
-    now = _descended(problem, now, False, iterations, NEAR if curved else SETTLED)
-    if curved:
-        now = _descended(problem, now, True, iterations, SETTLED)
-    return Optimum(now, _backward(problem, now.x, now.u, curved=curved).expansion)
+    now = _descended(problem, now, False, iterations, NEAR)
+    now = _descended(problem, now, True, iterations, SETTLED)
+    return Optimum(now, _backward(problem, now.x, now.u).expansion)
 
 
 def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float) -> Path:
     """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
     for _ in range(iterations):
-        if settled.all():
+        rows = torch.nonzero(~settled).flatten()
+        if not len(rows):
             break
-        tried = _line_search(problem, now, _backward(problem, now.x, now.u, damping, curved))
-        better = (tried.cost < now.cost) & ~settled
-        settled |= better & (now.cost - tried.cost <= enough * now.cost.abs())
-        x, u = torch.where(better[:, None], tried.x, now.x), torch.where(better[:, None], tried.u, now.u)
-        now = Path(x, u, torch.where(better, tried.cost, now.cost))
-        failures = torch.where(better, 0, failures + 1)
-        damping = torch.where(better, damping / 10, (10 * damping).clamp_min(1e-3))
-        settled |= failures > TRIES
+        was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])
+        tried = _line_search(problem, was, _backward(problem, was.x, was.u, damping[rows], curved))
+        better = tried.cost < was.cost
+        x, u = torch.where(better[:, None], tried.x, was.x), torch.where(better[:, None], tried.u, was.u)
+        now = exchanged(now, rows, Path(x, u, torch.where(better, tried.cost, was.cost)))
+        failures[rows] = torch.where(better, 0, failures[rows] + 1)
+        damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
+        settled[rows] = better & (was.cost - tried.cost <= enough * was.cost.abs()) | (failures[rows] > TRIES)
     return now
+
+
+def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
+    """Some trajectories exchanged for others."""
+    return Path(
+        path.x.index_copy(1, rows, others.x),
+        path.u.index_copy(1, rows, others.u),
+        path.cost.index_copy(0, rows, others.cost),
+    )
 
 
 def in_float64(problem: Problem) -> Problem:
@@ -176,27 +182,46 @@ def _backward(
 ) -> _Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
 
+    With the second derivatives of F it runs twice. They enter as those of pᵀF, for p = V_x that the first pass finds
+    without them: n + m derivatives of one sum, not of each component; where k = 0 both passes have the same p.
+
     Args:
         damping: added to Q_uu, in units of the control cost.
         curved: with the second derivatives of F.
     """
-    n, dt = x.shape[-1], problem.horizon.dt
-    F, F_z, F_zz, paid, l_z, l_zz = _derivatives(problem, x[:-1], u, curved)
-    least = 2 * dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
-    end = x[-1].detach().requires_grad_()
+    steps = _derivatives(problem, x, u)
+    backward = _recursion(problem, x, steps, damping)
+    if not curved:
+        return backward
     with torch.enable_grad():
-        phi = problem.cost.terminal(end)
-        phi_x = _rows(phi[..., None], end)
-        p, H, c = phi_x[..., 0, :].detach(), _rows(phi_x[..., 0, :], end).detach(), phi.detach()
+        slopes = _rows((backward.expansion.gradient[1:] * steps.F).sum(-1, keepdim=True), steps.z)[..., 0, :]
+        bent = steps.l_zz + _rows(slopes, steps.z).detach()
+    return _recursion(problem, x, steps._replace(l_zz=bent), damping)
+
+
+class _Steps(NamedTuple):
+    """F(z), l(z) = Δt ℓ and their derivatives at z = (x, u) of all steps at once; F with its graph."""
+
+    z: Tensor
+    F: StatePath
+    F_z: Tensor
+    paid: Tensor
+    l_z: Tensor
+    l_zz: Tensor  # what the second derivatives of Q have besides F_zᵀHF_z
+
+
+def _recursion(problem: Problem, x: StatePath, steps: _Steps, damping: Tensor | None) -> _Backward:
+    n, F_z = x.shape[-1], steps.F_z
+    least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
+    jumps = steps.F.detach() - x[1:]
+    c, p, H = _terminal(problem, x[-1])
     nodes, gains = [(c, p, H)], []
-    for k in reversed(range(len(u))):
-        moved = F[k] - x[k + 1]
-        c = c + (p * moved).sum(-1) + (moved * (H @ moved[..., None])[..., 0]).sum(-1) / 2 + paid[k]
+    for k in reversed(range(len(F_z))):
+        moved = jumps[k]
+        c = c + (p * moved).sum(-1) + (moved * (H @ moved[..., None])[..., 0]).sum(-1) / 2 + steps.paid[k]
         p = p + (H @ moved[..., None])[..., 0]
-        Q_z = l_z[k] + (F_z[k].mT @ p[..., None])[..., 0]
-        Q_zz = l_zz[k] + F_z[k].mT @ H @ F_z[k]
-        if curved:
-            Q_zz = Q_zz + (p[..., None, None] * F_zz[k]).sum(-3)
+        Q_z = steps.l_z[k] + (F_z[k].mT @ p[..., None])[..., 0]
+        Q_zz = steps.l_zz[k] + F_z[k].mT @ H @ F_z[k]
         Q_u, Q_uu, Q_ux = Q_z[..., n:], Q_zz[..., n:, n:], Q_zz[..., n:, :n]
         raised = _raised(Q_uu, FLOOR * least[k], 0 if damping is None else damping * least[k])
         gain = -torch.linalg.solve(raised, torch.cat([Q_u[..., None], Q_ux], -1))
@@ -215,22 +240,28 @@ def _backward(
 
 
 def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:
-    """Q_uu with eigenvalues of no less than a floor, and with damping added to each."""
-    values, vectors = torch.linalg.eigh(Q_uu)
+    """Q_uu with eigenvalues of no less than a floor, and with damping added; what overflowed is zero."""
+    values, vectors = torch.linalg.eigh(Q_uu.where(Q_uu.isfinite(), 0))
     values = values.clamp_min(0).maximum(floor[..., None])
     values = values + (damping[..., None] if isinstance(damping, Tensor) else damping)
     return (vectors * values[..., None, :]) @ vectors.mT
 
 
-def _derivatives(problem: Problem, x: StatePath, u: ControlPath, curved: bool) -> tuple[Tensor, ...]:
-    """F, F_z, F_zz (none unless curved), Δt ℓ, and its gradient and Hessian, by z = (x, u), of all steps at once."""
+def _terminal(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
+    """φ, φ_x and φ_xx."""
     with torch.enable_grad():
-        z = torch.cat([x, u], -1).detach().requires_grad_()
+        x = x.detach().requires_grad_()
+        phi = problem.cost.terminal(x)
+        phi_x = _rows(phi[..., None], x)[..., 0, :]
+        return phi.detach(), phi_x.detach(), _rows(phi_x, x).detach()
+
+
+def _derivatives(problem: Problem, x: StatePath, u: ControlPath) -> _Steps:
+    with torch.enable_grad():
+        z = torch.cat([x[:-1], u], -1).detach().requires_grad_()
         F, paid = _step(problem, z[..., : x.shape[-1]], z[..., x.shape[-1] :])
-        F_z, l_z = _rows(F, z), _rows(paid[..., None], z)[..., 0, :]
-        l_zz = _rows(l_z, z)
-        F_zz = _rows(F_z.flatten(-2), z).unflatten(-2, F_z.shape[-2:]) if curved else F_z.new_empty(len(x))
-    return tuple(y.detach() for y in (F, F_z, F_zz, paid, l_z, l_zz))
+        l_z = _rows(paid[..., None], z)[..., 0, :]
+        return _Steps(z, F, _rows(F, z).detach(), paid.detach(), l_z.detach(), _rows(l_z, z).detach())
 
 
 def _rows(y: Tensor, z: Tensor) -> Tensor:

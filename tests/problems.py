@@ -16,7 +16,7 @@ from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Horizon, Problem
 from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box, ControlSet, Unbounded
-from lyapnet.systems import ControlAffineSystem, MechanicalSystem
+from lyapnet.systems import ControlAffineSystem
 
 CONF = Path(__file__).parents[1] / "conf"
 
@@ -61,32 +61,6 @@ class Quadratic(ValueFunction):
     def forward(self, t, x):
         P = self.P[(t / self.dt).round().long().clamp(0, len(self.P) - 1)]
         return ((P @ x[..., None])[..., 0] * x).sum(-1)
-
-
-class ThreeLinkArm(MechanicalSystem):
-    """Three links in the horizontal plane, in absolute angles, with torques at the joints:
-
-    M_ij = c_ij cos(θ_i − θ_j) and h_i = −Σ_j c_ij sin(θ_i − θ_j) θ̇_j².
-    """
-
-    state_names = ("first angle", "second angle", "third angle", "first rate", "second rate", "third rate")
-    state_units = ("rad",) * 3 + ("rad/s",) * 3
-    control_names, control_units = ("shoulder torque", "elbow torque", "wrist torque"), ("N·m",) * 3
-    angles = (0, 1, 2)
-
-    def __init__(self, mass: float = 1.0, length: float = 0.5, damping: float = 0.25):
-        super().__init__([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]], [damping] * 3)
-        c = torch.tensor([[7 / 3, 3 / 2, 1 / 2], [3 / 2, 4 / 3, 1 / 2], [1 / 2, 1 / 2, 1 / 3]])
-        self.register_buffer("c", mass * length**2 * c.to(self.B), persistent=False)
-
-    def mass_matrix(self, q):
-        return self.c * torch.cos(q[..., :, None] - q[..., None, :])
-
-    def forces(self, q, qdot):
-        return -(self.c * torch.sin(q[..., :, None] - q[..., None, :]) * qdot[..., None, :] ** 2).sum(-1)
-
-    def energy(self, x):
-        return self.kinetic_energy(x[..., :3], x[..., 3:])
 
 
 class Formula(ValueFunction):

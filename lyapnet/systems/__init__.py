@@ -1,11 +1,14 @@
 """The registered systems; a new one is a subclass and one line here, or `module:Class` in a config."""
 
+from lyapnet.systems.acrobot import Acrobot
 from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
 from lyapnet.systems.cartpole import Cartpole
 from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
 from lyapnet.systems.pendulum import Pendulum
 from lyapnet.systems.planar_quadrotor import PlanarQuadrotor
 from lyapnet.systems.reacher import Reacher
+from lyapnet.systems.rigid_body import BodyFrameQuadrotor, Quadrotor, Satellite
+from lyapnet.systems.three_link_arm import ThreeLinkArm
 
 SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "double_integrator": DoubleIntegrator,
@@ -15,10 +18,17 @@ SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "reacher": Reacher,
     "pendulum": Pendulum,
     "planar_quadrotor": PlanarQuadrotor,
+    "acrobot": Acrobot,
+    "three_link_arm": ThreeLinkArm,
+    "quadrotor": Quadrotor,
+    "body_frame_quadrotor": BodyFrameQuadrotor,
+    "satellite": Satellite,
 }
 
 __all__ = [
     "SYSTEMS",
+    "Acrobot",
+    "BodyFrameQuadrotor",
     "Cartpole",
     "ControlAffineSystem",
     "DoubleIntegrator",
@@ -27,6 +37,9 @@ __all__ = [
     "MechanicalSystem",
     "Pendulum",
     "PlanarQuadrotor",
+    "Quadrotor",
     "Reacher",
+    "Satellite",
+    "ThreeLinkArm",
     "is_linear",
 ]

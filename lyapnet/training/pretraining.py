@@ -11,6 +11,7 @@ from lyapnet.expansions import (
     FLOOR,
     Expansion,
     Optimum,
+    exchanged,
     greedy_law,
     in_float64,
     no_control,
@@ -77,18 +78,15 @@ def _nearest(x0: State) -> Tensor:
 
 def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
     """Some trajectories exchanged for others that cost less."""
-    (path, expansion), (new_path, new_expansion) = optimum, others
-    path = path._replace(cost=path.cost.clone())
-    path.cost[rows] = new_path.cost
-    for part, new in zip((path.x, path.u, *expansion), (new_path.x, new_path.u, *new_expansion), strict=True):
-        part[:, rows] = new
-    return Optimum(path, expansion)
+    parts = zip(optimum.expansion, others.expansion, strict=True)
+    expansion = Expansion(*(part.index_copy(1, rows, new) for part, new in parts))
+    return Optimum(exchanged(optimum.path, rows, others.path), expansion)
 
 
 def _affordable(problem: Problem) -> int:
     """How many trajectories at a time have second derivatives that fit into memory."""
     n, m = problem.system.n, problem.system.m
-    return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * n * (n + m) ** 2)))
+    return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * (n + m) ** 2)))
 
 
 def examples_of(problem: Problem, optimum: Optimum) -> Examples:

@@ -10,7 +10,19 @@ import torch
 from scipy.integrate import solve_ivp
 from torch.testing import assert_close
 
-from lyapnet.systems import SYSTEMS, Cartpole, DoubleIntegrator, Linear, MechanicalSystem, Reacher
+from lyapnet.systems import (
+    SYSTEMS,
+    Acrobot,
+    BodyFrameQuadrotor,
+    Cartpole,
+    DoubleIntegrator,
+    Linear,
+    MechanicalSystem,
+    Quadrotor,
+    Reacher,
+    Satellite,
+    ThreeLinkArm,
+)
 from lyapnet.systems.base import ControlAffineSystem
 
 ENERGETIC = [name for name, cls in SYSTEMS.items() if hasattr(cls, "energy")]
@@ -236,6 +248,19 @@ def reacher_by_geometry(elbow_offset=0.16, friction=0.25):
     return lagrangian_dynamics(kinetic + rotation, (u1 - friction * v1, u2 - friction * v2))
 
 
+def acrobot_by_geometry(length=1.0, friction=0.1):
+    """Two uniform rods, of angles from upright, as points at their centres with an inertia about them."""
+
+    def along(angle, distance):
+        return sympy.Matrix([distance * sympy.sin(angle), distance * sympy.cos(angle)])
+
+    first, second = along(q1, length / 2), along(q1, length) + along(q1 + q2, length / 2)
+    rotation = length**2 / 12 * (v1**2 + (v1 + v2) ** 2) / 2
+    height = first[1] + second[1]
+    kinetic = moving(1.0, first) + moving(1.0, second) + rotation
+    return lagrangian_dynamics(kinetic - 9.81 * height, (-friction * v1, u1 - friction * v2))
+
+
 def matches_geometry(system, dynamics):
     x, u = draw(system, 20)
     expected = np.stack([dynamics(*pair) for pair in zip(x.numpy(), u.numpy(), strict=True)])
@@ -255,6 +280,7 @@ BALANCING = {"cart_mass": 1.0, "pole_mass": 0.1, "length": 0.3}
             id="balancing",
         ),
         pytest.param(Reacher, reacher_by_geometry, id="reacher"),
+        pytest.param(Acrobot, acrobot_by_geometry, id="acrobot"),
     ],
 )
 def test_dynamics_follow_from_the_lagrangian(system, geometry):
@@ -268,6 +294,8 @@ def test_dynamics_follow_from_the_lagrangian(system, geometry):
         pytest.param(Cartpole, partial(cartpole_by_geometry, friction=(0.1, 0.0)), id="friction"),
         pytest.param(Reacher, partial(reacher_by_geometry, elbow_offset=0.15), id="a2"),
         pytest.param(ReleasedReacher, reacher_by_geometry, id="coriolis"),
+        pytest.param(Acrobot, partial(acrobot_by_geometry, length=1.01), id="rod"),
+        pytest.param(Acrobot, partial(acrobot_by_geometry, friction=0.11), id="joints"),
     ],
 )
 def test_another_geometry_does_not_match(system, geometry):
@@ -297,6 +325,12 @@ SQUARE, COLUMN = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]
         *((Cartpole, {name: -0.1}) for name in ("cart_damping", "pole_damping")),
         *((Cartpole, {name: math.nan}) for name in ("length", "pole_damping", "gravity")),
         *((Reacher, {name: -1.0}) for name in ("a1", "a2", "a3", "damping")),
+        *((Acrobot, {name: 0.0}) for name in ("mass", "length", "gravity")),
+        *((ThreeLinkArm, {name: 0.0}) for name in ("mass", "length")),
+        *((Quadrotor, {name: -1.0}) for name in ("mass", "gravity")),
+        *((BodyFrameQuadrotor, {"inertia": value}) for value in ((1.0, 0.0, 1.0), (1.0, 1.0))),
+        *((Satellite, {"inertia": value}) for value in ((2.0, 3.0, -4.0), (1.0, 1.0, 1.0, 1.0))),
+        (Satellite, {"momentum": (1.0, 1.0)}),
         (Reacher, {"a2": 0.1}),  # no positive definite mass matrix
         (Linear, {"A": [[0.0, 1.0]], "B": COLUMN}),
         (Linear, {"A": SQUARE, "B": [[1.0]]}),

@@ -11,7 +11,8 @@ from lyapnet.graphs.tracing import name_of, trace
 from lyapnet.policy import HJBPolicy
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
-from tests.problems import Formula, ThreeLinkArm, problem_of
+from lyapnet.systems import ThreeLinkArm
+from tests.problems import Formula, problem_of
 
 TEMPTING = {"_linalg_solve_ex", "linalg_inv_ex", "linalg_lu_solve"}  # what the compiler hands back to the library
 

@@ -89,7 +89,7 @@ def test_only_finite_trajectories_are_examples(problem):
 
 
 def test_as_many_trajectories_as_fit_into_memory(problem, monkeypatch):
-    monkeypatch.setattr(pretraining, "NUMBERS", 2 * problem.horizon.steps * 2 * 3**2)
+    monkeypatch.setattr(pretraining, "NUMBERS", 2 * problem.horizon.steps * 3**2)
     assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
 
 

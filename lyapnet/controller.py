@@ -1,6 +1,7 @@
 """What training leaves behind: V, the control law, and the closed loop of a checkpoint."""
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, overload
@@ -189,6 +190,8 @@ def load(
 ) -> Controller:
     """The controller of a checkpoint. Nothing that the file names is imported or run.
 
+    A note is logged where f, g, the cost, U or the names of the states are others than those that it was trained with.
+
     Args:
         path: a .ckpt file of a run.
         system, cost, controls, program: each is needed where the run's own is not a registered one, and replaces it.
@@ -207,6 +210,11 @@ def load(
     V = build_value_function(config, problem, network)
     load_value_function(V, content, path)
     problem.check_value_function(V)
+    if others := problem.differences(content[KEY].get("problem")):
+        logging.getLogger(__name__).warning(
+            "note: %s was trained for a problem with other %s; what follows is about the one that is given here.",
+            path, ", ".join(others),
+        )  # fmt: skip
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
     return Controller(problem, V, build_rollout(config, problem, V), own, config)

@@ -15,6 +15,7 @@ from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import State, Times
 
 TRIED = 64  # states at which functions of others are tried
+ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
 
 
 @dataclass(frozen=True)
@@ -139,3 +140,45 @@ class Problem(nn.Module):
                 f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than "
                 "autograd's: correct it, or leave it out."
             )
+
+    def record(self) -> dict[str, list[Any]]:
+        """What a checkpoint keeps of its problem, as plain data: state names; f, g, the cost and U in numbers.
+
+        They are evaluated in float64 at 3 fixed states of X₀. Where X₀ is thin they are apart nevertheless: friction
+        counts for those who start at rest too.
+        """
+        own = copy.deepcopy(self).double().cpu()
+        box, cost, m = own.initial_states, own.cost, own.system.m
+        generator = torch.Generator().manual_seed(0)
+        x = box.sample(3, generator)
+        thin = torch.where(box.widths > 0, 0.0, torch.where(box.center == 0, 1.0, box.center.abs()))
+        x = x + 0.1 * thin * torch.rand(x.shape, generator=generator, dtype=x.dtype)
+        b = torch.tensor([[1e4], [-1e4], [1.0]], dtype=x.dtype).expand(-1, m)  # which a bounded set clips at its bounds
+        with torch.no_grad():
+            numbers = {
+                "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
+                "φ": cost.terminal(x), "U": own.controls.minimise(torch.eye(m, dtype=x.dtype).expand(3, m, m), b),
+            }  # fmt: skip
+        return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
+
+    def differences(self, record: Any) -> list[str]:
+        """The parts in which the problem of a record is another one; none where there is no record for this X₀."""
+        own = self.record()
+        if not isinstance(record, dict) or not _alike(record.get("x"), own.pop("x")):
+            return []
+        return [name for name, value in own.items() if not _alike(record.get(name), value)]
+
+
+def _alike(recorded: Any, own: list[Any]) -> bool:
+    """Whether two records of the same hold equal names, or equal numbers up to rounding."""
+    if isinstance(own[0], str):
+        return recorded == own
+    try:
+        one, other = (torch.tensor(numbers, dtype=torch.float64) for numbers in (recorded, own))
+    except Exception:  # of any kind: what was recorded comes from a file
+        return False
+    if one.shape != other.shape:
+        return False
+    size = other.nan_to_num(0.0, 0.0, 0.0).abs()
+    tolerance = ALIKE * size.amax(0) + 1e-7 * size.max()  # a component that cancels has the rounding of its terms
+    return bool(((one == other) | (one.isnan() & other.isnan()) | ((one - other).abs() <= tolerance)).all())

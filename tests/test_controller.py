@@ -351,6 +351,44 @@ def test_passed_system_replaces_the_one_of_the_checkpoint(controller, path):
     assert not torch.allclose(heavier.rollout(x).x[-1], controller.rollout(x).x[-1])
 
 
+def test_another_plant_is_noted_at_load(path, caplog):
+    lyapnet.load(path)
+    lyapnet.load(path, system=DoubleIntegrator())
+    assert not caplog.records
+    lyapnet.load(path, system=DoubleIntegrator(mass=2.0))
+    (note,) = (record.getMessage() for record in caplog.records)
+    assert str(path) in note
+    assert "other g, R;" in note
+
+
+def test_evaluate_notes_another_plant_once_and_measures_it(path, tmp_path, monkeypatch, capsys, caplog):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "swapped.py").write_text(
+        "from lyapnet.systems import DoubleIntegrator\n"
+        "class Other(DoubleIntegrator):\n"
+        "    def __init__(self):\n"
+        "        super().__init__()\n"
+        "        self.state_names = ['velocity', 'position']\n"
+    )
+    arguments = ["evaluate", str(path), "--samples", "5", "--json", "--robustness"]
+    assert main(arguments) == 0
+    assert not caplog.records
+    assert main([*arguments, "--system", "swapped:Other"]) == 0
+    (note,) = (record.getMessage() for record in caplog.records)
+    assert "other state names;" in note
+    own, other = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert own["cost_mean"] == other["cost_mean"]
+
+
+def test_a_checkpoint_without_a_record_is_taken_as_it_is(path, tmp_path, caplog):
+    content = read_checkpoint(path)
+    assert content[KEY].pop("problem")
+    write_checkpoint(content, tmp_path / "old.ckpt")
+    lyapnet.load(tmp_path / "old.ckpt", system=DoubleIntegrator(mass=2.0))
+    assert not caplog.records
+
+
 # lyapnet evaluate
 
 

@@ -16,7 +16,7 @@ from lyapnet.cost import Cost, QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.networks import FCN, Scaling
 from lyapnet.problem import Horizon
-from lyapnet.sets import Box, Unbounded
+from lyapnet.sets import Box, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem, DoubleIntegrator
 from tests.problems import problem_of
 
@@ -338,3 +338,88 @@ def test_a_control_set_whose_minimum_lies_outside_is_refused():
     problem_of(DoubleIntegrator()).check()
     with pytest.raises(ValueError, match=r"Leaky\.minimise"):
         problem_of(DoubleIntegrator(), controls=Leaky()).check()
+
+
+# The record by which another problem is noticed
+
+
+class Rubbed(DoubleIntegrator):
+    """With friction on the velocity."""
+
+    def f(self, x):
+        return super().f(x) - 0.01 * torch.stack([torch.zeros_like(x[..., 1]), x[..., 1]], -1)
+
+
+class Renamed(DoubleIntegrator):
+    def __init__(self):
+        super().__init__()
+        self.state_names = ["velocity", "position"]
+
+
+class Between(ControlSet):
+    """[−1, upper]."""
+
+    def __init__(self, upper):
+        super().__init__()
+        self.upper = upper
+
+    def minimise(self, R, b):
+        return self.project(-b / (2 * R[..., 0]))
+
+    def contains(self, u):
+        return (u == self.project(u)).all(-1)
+
+    def project(self, u):
+        return u.clamp(-1.0, self.upper)
+
+
+def cost_of(q=1.0, r=1.0, end=1.0):
+    return QuadraticCost(q * torch.eye(2), r * torch.eye(1), end * torch.eye(2))
+
+
+OTHERS = {
+    "the same": ({}, []),
+    "in float32 and back": ({"cost": cost_of(1 + 1e-7)}, []),
+    "f": ({"system": Rubbed()}, ["f"]),
+    "g": ({"system": DoubleIntegrator(mass=1.01)}, ["g"]),
+    "names": ({"system": Renamed()}, ["state names"]),
+    "q": ({"cost": cost_of(q=1.01)}, ["q"]),
+    "R": ({"cost": cost_of(r=1.01)}, ["R"]),
+    "the end": ({"cost": cost_of(end=1.01)}, ["φ"]),
+    "limits": ({"controls": Between(2.0)}, ["U"]),
+    "other limits": ({"controls": Between(2.01)}, ["U"]),
+}
+
+
+@pytest.mark.parametrize("at_rest", [False, True])
+@pytest.mark.parametrize("other", OTHERS)
+def test_another_problem_is_noticed_by_its_record(other, at_rest):
+    box = Box([-1.0, 0.0], [1.0, 0.0]) if at_rest else None
+    own = {"controls": Between(2.0)} if other == "other limits" else {}
+    changes, expected = OTHERS[other]
+    common = {"system": DoubleIntegrator(), "initial_states": box}
+    record = problem_of(**common | own).record()
+    assert problem_of(**common | changes).differences(record) == expected
+
+
+def test_the_precision_is_no_difference():
+    problem = problem_of(DoubleIntegrator(mass=0.3), cost_of(0.1))
+    record = problem.record()
+    assert not problem.float().differences(record)
+
+
+@pytest.mark.parametrize("evil", [None, "record", [], {}, {"x": "x"}, {"x": [[[]]]}, {"x": {"y": 1}}])
+def test_a_record_that_is_none_tells_nothing(evil):
+    assert problem_of(DoubleIntegrator()).differences(evil) == []
+
+
+@pytest.mark.parametrize("evil", [None, "f", [], [[1.0]], [["a", "b"]], [[1.0, 2.0], [3.0]], {"f": 1}, [[[[]]]], 1e308])
+def test_a_part_that_is_none_is_another(evil):
+    problem = problem_of(DoubleIntegrator())
+    assert problem.differences({**problem.record(), "f": evil}) == ["f"]
+
+
+def test_numbers_that_are_none_are_the_same():
+    problem = problem_of(DoubleIntegrator())
+    infinite = {**problem.record(), "U": [[math.nan], [math.inf], [1.0]]}
+    assert problem.differences(infinite) == ["U"]

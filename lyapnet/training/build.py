@@ -45,7 +45,7 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
     else:
         members = [build_learner(each, problem, parts, label_of(each)) for each in configs_of_seeds(config)]
         module = EnsembleModule(members, config.training.batch_size, options)
-    module.metadata = {"config": to_plain(config)}
+    module.metadata = {"config": to_plain(config), "problem": problem.record()}
     return module
 
 
@@ -55,7 +55,7 @@ def build_learner(config: Config, problem: Problem, parts: Parts | None = None, 
     V = build_value_function(config, problem, parts.network)
     rollout, program = build_rollout(config, problem, V), parts.program or build_program(config)
     learner = Learner(problem, V, rollout, program, build_pointwise(config, rollout, program), config.seed, label)
-    learner.metadata = {"config": to_plain(config)}
+    learner.metadata = {"config": to_plain(config), "problem": problem.record()}
     return learner
 
 

@@ -3,8 +3,10 @@
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
 
+import os
 import signal
 import sys
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -39,12 +41,16 @@ for group in (certify, bench):
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly."""
+    """Run a command; the exit status: 0 done or cleanly interrupted, 1 failed, 2 asked wrongly, 141 nobody reads it."""
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         with signals_taken(_stop):
-            return app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
+            status = app(arguments or ["--help"], prog_name="lyapnet", standalone_mode=False) or 0
+            sys.stdout.flush()
+            return status
     except (Exception, SystemExit) as error:  # the outermost frame: one line for the user, whatever happened
+        if _is_closed_output(error):
+            return 128 + signal.SIGPIPE
         if "--debug" in arguments:
             raise
         line, status = _explain(error)
@@ -57,6 +63,18 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _stop(number: int, frame: Any) -> None:
     raise Interrupted(f"{signal.Signals(number).name}: stopped at once; what was saved before is kept.", 130)
+
+
+def _is_closed_output(error: BaseException) -> bool:
+    """Whether nobody reads the output any more, as after `| head -1`; what is left of it goes nowhere then.
+
+    Rich and Typer make a SystemExit of it.
+    """
+    if not isinstance(error.__context__ if isinstance(error, SystemExit) else error, BrokenPipeError):
+        return False
+    with suppress(OSError):  # a stream without a descriptor, as in tests
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return True
 
 
 def _explain(error: Any) -> tuple[str, int]:

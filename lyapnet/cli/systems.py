@@ -13,8 +13,8 @@ def systems(debug: Debug = False) -> None:
     from lyapnet.build import REGISTRIES
     from lyapnet.systems import SYSTEMS
 
-    parameters_column = Column("parameters (default)", overflow="fold")
-    table = Table("system", "states", "controls", parameters_column, title="system.name in a config")
+    columns = (Column(name, overflow="fold") for name in ("system", "states", "controls", "parameters (default)"))
+    table = Table(*columns, title="system.name in a config")
     for name, cls in SYSTEMS.items():
         parameters = inspect.signature(cls).parameters.values()
         shown = [p.name if p.default is p.empty else f"{p.name}={p.default}" for p in parameters]

@@ -1,6 +1,11 @@
 """lyapnet systems."""
 
+import os
 import re
+import subprocess
+import sys
+
+import pytest
 
 from lyapnet.cli import main
 from lyapnet.cost import COSTS
@@ -11,7 +16,7 @@ from lyapnet.systems import SYSTEMS
 
 
 def test_systems_command_lists_every_registered_system(capsys, monkeypatch, build_system):
-    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setenv("COLUMNS", "1000")
     assert main(["systems"]) == 0
     *rows, cost, controls, network, program, _ = capsys.readouterr().out.splitlines()
     for name in SYSTEMS:
@@ -22,3 +27,23 @@ def test_systems_command_lists_every_registered_system(capsys, monkeypatch, buil
                 assert word in row
     for line, known in ((cost, COSTS), (controls, CONTROL_SETS), (network, NETWORKS), (program, PROGRAMS)):
         assert line.split(": ")[1].split(", ") == list(known)
+
+
+def into(output, command):
+    """(status, standard error) of a command whose standard output is a descriptor."""
+    done = subprocess.run([sys.executable, "-m", "lyapnet", *command], stdout=output, stderr=subprocess.PIPE, text=True)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("command", [["systems"], ["--version"], ["--help"]])
+def test_an_output_that_nobody_reads_ends_the_command_silently(command):
+    read, write = os.pipe()
+    os.close(read)
+    assert into(write, command) == (141, "")
+    os.close(write)
+
+
+def test_code_of_the_users_own_that_leaves_is_named(monkeypatch, capsys):
+    monkeypatch.setattr("lyapnet.cli.app", lambda *arguments, **options: sys.exit(3))
+    assert main(["systems"]) == 1
+    assert "Expected code of your own that returns, got SystemExit: 3" in capsys.readouterr().err

@@ -1,5 +1,7 @@
 """A finished proof, checked: what others can do with its file and the checkpoint, without trusting either search."""
 
+import copy
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -8,8 +10,9 @@ from typing import Any
 import torch
 
 from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.funnel import sound_claim
-from lyapnet.certification.kept_proofs import read_content, refusing
+from lyapnet.certification.kept_proofs import KeptProof, about, read_content, refusing
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.controller import Controller
@@ -38,9 +41,10 @@ def check(
     try:
         content = read_content(path)
         with refusing(path):
-            about = content["of"][0]
-            lower, upper = (torch.tensor(about[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
-            alpha, delta, states = float(about["alpha"]), float(about["delta"]), Box(lower, upper)
+            of = content["of"][0]
+            lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
+            alpha, delta, states = float(of["alpha"]), float(of["delta"]), Box(lower, upper)
+        _require_claim(controller, path, alpha, delta, states)
         claim = sound_claim(
             controller.closed_loop, controller.problem, alpha, delta, states, Budget(UNLIMITED, workers=workers),
             torch.Generator().manual_seed(0), report, path, True,
@@ -53,3 +57,17 @@ def check(
         verdict, numbers["reason"] = "refused", str(error)
     seconds = time.monotonic() - started
     return plain({"kind": "check", "verdict": verdict, **numbers, "seconds": seconds, "share_of_search": share})
+
+
+def _require_claim(controller: Controller, path: Path, alpha: float, delta: float, states: Box) -> None:
+    """Refuse an unfinished proof, or that of another controller, before anything is computed.
+
+    Raises:
+        UsageError: it is one; or as bounded_condition.
+    """
+    condition = DecreaseCondition(copy.deepcopy(controller.closed_loop).double().requires_grad_(False), alpha, delta)
+    times = torch.tensor([[0.0], [controller.horizon.duration]], dtype=torch.float64)
+    lower, upper = torch.cat([times[0], states.lower]), torch.cat([times[1], states.upper])
+    if states.dimension == controller.system.n:  # sound_claim says so else
+        of = about(bounded_condition(condition, (lower, upper)), condition, lower, upper)
+        KeptProof(path, of, math.inf).claim((lower, upper))

@@ -9,11 +9,12 @@ has lowered the level; before all that stands its SHA-256. What is read is belie
 * A finished proof is not believed: its leaves are bounded again.
 
 Someone who edits a file and its digest can still call closed what waits in an unfinished proof. Resuming trusts the
-digest there; `lyapnet certify check` does not, since it bounds every leaf and reads neither of the two lists.
+digest there; `lyapnet certify check` does not, since it bounds every leaf and believes neither of the two lists.
 """
 
 import hashlib
 import io
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -149,15 +150,20 @@ class KeptProof:
         """The leaves of a proof of the same, none of them decided, and the level that it claims.
 
         Raises:
-            UsageError: the file holds another proof, or none.
+            UsageError: the file holds another proof, an unfinished one, or none.
         """
         content = read_content(self.path)
         with refusing(self.path):
             leaves, of = CutTree(content["node"], content["axis"]).leaves(*domain), content["of"][:1]
-            claimed = Standing(Search(leaves), float(content["proved"]), None)
+            claimed, waiting = Standing(Search(leaves), float(content["proved"]), None), len(content["frontier"])
         if of != [self.about]:
             raise UsageError(
                 f"Expected the proof of this V, α, δ and set in {str(self.path)!r}, got another; name its checkpoint."
+            )
+        if waiting:
+            raise UsageError(
+                f"Expected a finished proof in {str(self.path)!r}, got one with {waiting} boxes undecided; go on with "
+                f"lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the options that it began with."
             )
         return claimed
 
@@ -173,17 +179,24 @@ def read_content(path: Path) -> dict[str, Any]:
         start = len(FORMAT) + hashlib.sha256().digest_size
         head, payload = content[:start], content[start:]
         if head != FORMAT + hashlib.sha256(payload).digest():
-            raise ValueError("another first line or digest")
+            if not content.startswith(FORMAT):
+                raise ValueError("another first line")
+            raise UsageError(
+                f"Expected the proof that was written, got {str(path)!r}, which was changed or damaged since; name a "
+                "copy of it, or another."
+            )
         return torch.load(io.BytesIO(payload), weights_only=True)
 
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Whatever fails while a file is read is a UsageError that names the file."""
+    """Whatever fails while a file is read is a UsageError that names the file; a UsageError says so itself."""
     try:
         yield
+    except UsageError:
+        raise
     except Exception as error:
         raise UsageError(
-            f"Expected a proof in this version's format, unchanged since, in {str(path)!r}, got "
-            f"{'no' if isinstance(error, OSError) else 'another'} file; name a new one."
+            f"Expected a proof in this version's format in {str(path)!r}, got "
+            f"{'no' if isinstance(error, OSError) else 'another'} file; name another."
         ) from error

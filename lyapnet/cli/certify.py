@@ -270,7 +270,7 @@ def check(
     if as_json:
         print(json.dumps(result, allow_nan=False))
     else:
-        Console(highlight=False).print(certificate_table(f"{proof}, {checkpoint}", result, LABELS))
+        Console(highlight=False, markup=False).print(certificate_table(f"{proof}, {checkpoint}", result, LABELS))
     raise typer.Exit(result["verdict"] != "certified")
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -42,4 +43,5 @@ def check(
     for fact in facts:
         table.add_row(*fact)
     console.print(table)
-    console.print(f"train     lyapnet train --config {config}", soft_wrap=True)
+    command = shlex.join(["lyapnet", "train", "--config", str(config), *(overrides or [])])
+    console.print(f"train     {command}", soft_wrap=True)

@@ -1,5 +1,6 @@
 """lyapnet train."""
 
+import json
 import shlex
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,14 +49,15 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         evaluation_table(title, result) if len(members) == 1 else table_over_seeds(f"{title} of each seed", result)
     )
     best, own = members[0].best, own_parts(plan.config)
+    quoted = shlex.quote(str(best))
     options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
     arguments = "".join(f", {part}=…" for part in own)
     for what, shown in (
         ("run", plan.run.folder),
-        ("watch", f"tensorboard --logdir {plan.config.logs}"),
-        ("measure", f"lyapnet evaluate {best}{options}"),
-        ("certify", f"lyapnet certify {best}{options}"),
-        ("fine-tune", f"{command} --finetune {best}"),
-        ("use", f'lyapnet.load("{best}"{arguments})'),
+        ("watch", shlex.join(["tensorboard", "--logdir", str(plan.config.logs)])),
+        ("measure", f"lyapnet evaluate {quoted}{options}"),
+        ("certify", f"lyapnet certify {quoted}{options}"),
+        ("fine-tune", f"{command} --finetune {quoted}"),
+        ("use", f"lyapnet.load({json.dumps(str(best), ensure_ascii=False)}{arguments})"),
     ):
         console.print(f"{what:<10}{shown}", soft_wrap=True)

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from lyapnet.expansions import in_float64, riccati
+from lyapnet.policy import SampledPolicy
 from lyapnet.problem import Problem
+from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
 from lyapnet.training.start import CALM, choose_start
 
@@ -25,7 +27,7 @@ def facts_of(learner: Learner) -> list[Fact]:
     """The facts of a learner's problem; its V is left at the best start."""
     problem = learner.problem
     exact = in_float64(problem)
-    facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact)]
+    facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact, learner.rollout)]
     start = choose_start([learner])
     if start is None:
         return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
@@ -44,8 +46,8 @@ def _task(problem: Problem) -> Fact:
     horizon, system = problem.horizon, problem.system
     return Fact(
         "task",
-        f"{type(system).__name__}: {system.n} states, {system.m} controls; T = {horizon.duration:g} s in "
-        f"{horizon.steps} steps",
+        f"{type(system).__name__}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}; "
+        f"T = {horizon.duration:g} s in {_counted(horizon.steps, 'step')}",
     )
 
 
@@ -89,7 +91,7 @@ def _linearisation(problem: Problem) -> list[Fact]:
     return facts
 
 
-def _stiffness(problem: Problem) -> Fact:
+def _stiffness(problem: Problem, rollout: Rollout) -> Fact:
     """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
     g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
     weighted = torch.linalg.solve(R, g.mT @ riccati(problem).hessian @ g)
@@ -97,17 +99,20 @@ def _stiffness(problem: Problem) -> Fact:
     found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
     if gain <= STABLE:
         return Fact("stiffness", f"{found}: both control laws are stable at this Δt")
-    return Fact(
-        "stiffness",
-        f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt",
-        f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}",
-    )
+    found = f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt"
+    if isinstance(rollout.closed_loop.policy, SampledPolicy):
+        return Fact("stiffness", f"{found}, rollout.policy=sampled, which this config has, is stable")
+    return Fact("stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}")
 
 
 def _rank(A: Tensor, B: Tensor, value: Tensor) -> int:
     """The rank of (A − λI, B): n where u reaches the mode (Popov, Belevitch, Hautus)."""
     shifted = A.to(value.dtype) - value * torch.eye(len(A), dtype=value.dtype)
     return int(torch.linalg.matrix_rank(torch.cat([shifted, B.to(value.dtype)], 1), rtol=1e-9))
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _listed(values: Tensor) -> str:

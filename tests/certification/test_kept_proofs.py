@@ -153,7 +153,10 @@ def broken(path):
 @pytest.mark.parametrize("kind", ["empty", "truncated", "words", "of something", "with code"])
 def test_a_broken_file_is_refused(kind, P, kept):
     kept.write_bytes(broken(kept)[kind])
-    with pytest.raises(UsageError, match=r"^Expected a proof in .*proof.pt', got another file; name a new one\.$"):
+    expected = {"truncated": r"^Expected the proof that was written, got .*proof.pt', which was changed or damaged"}
+    with pytest.raises(
+        UsageError, match=expected.get(kind, r"^Expected a proof in .*, got another file; name another")
+    ):
         go_on(dipped(P), kept)
 
 
@@ -195,7 +198,8 @@ def test_no_flipped_bit_is_used(P, finished):
         changed = bytearray(content)
         changed[bit // 8] ^= 1 << bit % 8
         finished.write_bytes(changed)
-        with pytest.raises(UsageError, match="another file; name a new one"):
+        expected = "another file; name another" if bit < 8 * len(kept_proofs.FORMAT) else "changed or damaged since"
+        with pytest.raises(UsageError, match=expected):
             kept_proofs.read_content(finished)
     finished.write_bytes(content)
     assert kept_proofs.read_content(finished)["proved"] == 2.0
@@ -251,7 +255,7 @@ def of_another_v(content):
 )
 def test_resuming_refuses_what_does_not_fit_together(change, P, kept):
     rewritten(kept, change)
-    with pytest.raises(UsageError, match=r"got another(?: file)?; (?:name a new one|take a new file)\.$"):
+    with pytest.raises(UsageError, match=r"got another(?: file)?; (?:name another|take a new file)\.$"):
         go_on(dipped(P), kept)
 
 
@@ -287,9 +291,18 @@ def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
 
 @pytest.mark.parametrize("change", [without_a_cut, raised, called_closed, emptied], ids=lambda f: f.__name__)
 def test_a_check_believes_neither_lists_nor_levels(change, P, kept):
-    """The proof was stopped early; its digest is right."""
+    """The proof was stopped early, and says that it was not; its digest is right."""
+    rewritten(kept, emptied)
     rewritten(kept, change)
     assert checked(dipped(P), kept, 6.0 if change is raised else 2.0).verdict != "certified"
+
+
+def test_a_check_refuses_an_unfinished_proof_at_once(P, kept, monkeypatch):
+    waiting = len(kept_proofs.read_content(kept)["frontier"])
+    assert waiting > 0
+    monkeypatch.setattr("lyapnet.certification.proof.WhereItHolds.undecided", None)
+    with pytest.raises(UsageError, match=f"got one with {waiting} boxes undecided; go on with .*--keep .*proof.pt"):
+        checked(dipped(P), kept)
 
 
 def test_a_check_refuses_other_cuts_and_another_v(P, finished):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from lyapnet.certification import funnel
+from lyapnet.certification import checking, funnel
 from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
 from lyapnet.certification.sound_certificate import SoundCertificate, parse_set, sound_certificate
 from lyapnet.cli import certify, main
@@ -148,7 +148,8 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
     assert result["share_of_search"] > 0
     assert main(["certify", "check", path, checkpoint]) == 0
     assert "check: certified" in capsys.readouterr().out
-    for other in (0.999, 1.0):  # another V, then a changed file
+    monkeypatch.setattr(checking, "sound_claim", lambda *a, **o: pytest.fail("Expected no work on another proof."))
+    for other, why in ((0.999, "name its checkpoint."), (1.0, "changed or damaged")):  # another V, then a changed file
         V = planted.stationary(other * planted.riccati())
         monkeypatch.setattr(certify, "load_controller", lambda *a, V=V, **own: Controller(planted.problem(), V))
         if other == 1.0:
@@ -156,6 +157,8 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
             Path(path).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
         assert main(["certify", "check", path, checkpoint]) == 1
         assert "check: refused" in capsys.readouterr().out
+        assert main(["certify", "check", path, checkpoint, "--json"]) == 1
+        assert why in json.loads(capsys.readouterr().out)["reason"]
 
 
 @pytest.mark.parametrize(("kind", "make"), list(MAKERS.items()))

@@ -1,6 +1,7 @@
 """lyapnet check: facts of a task before training, against systems whose facts are known."""
 
 import json
+import shlex
 
 import pytest
 import torch
@@ -74,9 +75,14 @@ def test_a_goal_that_is_no_equilibrium(B, words):
 def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     """ẋ = u, φ = px²: the gain over a step is Δt p/R, and Euler steps of u = −px/R grow above 2."""
     stiff = linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [30]})
-    fact = facts(stiff)["stiffness"]
-    assert "= 3 > 2" in fact.found
-    assert "horizon.dt ≤ 0.067" in fact.advice
+    for policy in ("hjb", "sontag"):
+        fact = facts({**stiff, "rollout": {"policy": policy}})["stiffness"]
+        assert "= 3 > 2" in fact.found
+        assert fact.advice == "rollout.policy=sampled, or horizon.dt ≤ 0.067"
+    sampled = facts({**stiff, "rollout": {"policy": "sampled"}})["stiffness"]
+    assert "= 3 > 2" in sampled.found
+    assert "which this config has, is stable" in sampled.found
+    assert not sampled.advice
     assert (
         "both control laws" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["stiffness"].found
     )
@@ -103,7 +109,7 @@ def test_the_command(tmp_path, capsys):
     assert main(["check", str(path), "horizon.steps=10", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["experiment"] == "mine"
-    assert report["facts"][0]["found"].endswith("0.5 s in 10 steps")
+    assert report["facts"][0]["found"].endswith(": 2 states, 1 control; T = 0.5 s in 10 steps")
     chosen = [fact for fact in report["facts"] if "training starts here" in fact["found"]]
     assert [fact["fact"] for fact in chosen] == ["start from 12 optima from states of X₀"]
     assert main(["check", str(path), "network.name=fcn", "--json"]) == 0
@@ -118,3 +124,12 @@ def test_the_problem_keeps_its_precision():
     learner = build_learner(config, build_problem(config))
     facts_of(learner)
     assert learner.problem.goal.dtype == learner.problem.system.A.dtype == torch.float32
+
+
+def test_the_next_command_is_the_experiment_that_was_checked(tmp_path, capsys):
+    path = tmp_path / "my task.yaml"
+    path.write_text(yaml.safe_dump(TASK))
+    assert main(["check", str(path), "network.name=fcn", "network.hidden=[4, 4]"]) == 0
+    command = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("train"))
+    expected = ["lyapnet", "train", "--config", str(path), "network.name=fcn", "network.hidden=[4, 4]"]
+    assert shlex.split(command)[1:] == expected

@@ -1,5 +1,6 @@
 """Training as a user meets it: killed, interrupted, resumed, fine-tuned, failed, and what it shows meanwhile."""
 
+import ast
 import csv
 import ctypes
 import functools
@@ -9,6 +10,7 @@ import math
 import os
 import random
 import resource
+import shlex
 import shutil
 import signal
 import struct
@@ -51,6 +53,7 @@ from tests.runs import (
     differences,
     logged,
     origin,
+    tiny_checkpoint,
     values,
     without_figures,
 )  # fmt: skip
@@ -128,6 +131,17 @@ def test_run_tells_where_it_is_and_what_comes_next(reference):
         assert text in output
     for command in ("lyapnet evaluate", "--finetune", 'lyapnet.load("'):
         assert command in output
+
+
+def test_the_commands_that_come_next_can_be_pasted(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "it's mine"
+    best = tiny_checkpoint(folder)
+    shown = {line[:10].strip(): line[10:] for line in capsys.readouterr().out.splitlines()}
+    assert shlex.split(shown["watch"]) == ["tensorboard", "--logdir", str(folder)]
+    assert shlex.split(shown["measure"]) == ["lyapnet", "evaluate", str(best)]
+    assert shlex.split(shown["certify"]) == ["lyapnet", "certify", str(best)]
+    assert shlex.split(shown["fine-tune"])[-2:] == ["--finetune", str(best)]
+    assert ast.literal_eval(shown["use"].removeprefix("lyapnet.load")) == str(best)
 
 
 def test_folder_of_a_run(reference):

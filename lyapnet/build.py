@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, CostConfig, SystemConfig
+from lyapnet.contracts import initialised, remedy
 from lyapnet.cost import COSTS, Cost, QuadraticCost
 from lyapnet.errors import LyapnetError, UsageError, did_you_mean, raised
 from lyapnet.networks import NETWORKS, IgnoringStates, Scaling, TerminalAnchor
@@ -90,7 +91,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
     parts, dtype = parts or Parts(), DTYPES[config.training.precision]
     with _float64_defaults():
         # in float64 for the checks below, and copies: the caller's own parts keep their precision
-        system, cost, controls = copy.deepcopy((parts.system, parts.cost, parts.controls))
+        system, cost, controls = (copy.deepcopy(initialised(p)) for p in (parts.system, parts.cost, parts.controls))
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         with _section("initial_states"):
@@ -169,8 +170,7 @@ def _build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -
     for key in ("Q", "R", "Q_T"):
         if getattr(config, key) is None:
             raise UsageError(
-                f"Expected a value for cost.{key}, got none; add it to the config file or append cost.{key}=… to the "
-                "command."
+                f"Expected a value for cost.{key}, got none; add it to the config, or cost.{key}=… to the command."
             )
     if config.parameters:
         raise UsageError("Expected no cost.parameters with the quadratic cost, got some; it has Q, R and Q_T.")
@@ -191,8 +191,7 @@ def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
     inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
     if inverse_mass is None:
         raise ValueError(
-            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} does not have; "
-            "write R as a list of rows."
+            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} has not; write R as rows."
         )
     # constant for a linear system: a matrix then, as the Riccati equation needs it
     return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
@@ -203,7 +202,7 @@ def _with_parameters(section: Any, part: str) -> Any:
     cls = resolve(section.name, REGISTRIES[part][0], f"{part}.name", REGISTRIES[part][1])
     _check_parameters(cls, section.name, section.parameters, part)
     with _float64_defaults(), _section(f"{part}.parameters of {section.name}"):
-        return cls(**section.parameters)
+        return initialised(cls(**section.parameters))
 
 
 def _class_of(config: Config, part: str) -> Any:
@@ -236,10 +235,9 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         raise UsageError(
             f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."
         )
-    for key in chosen:
-        if key not in accepted:
-            name = {"embedded_angles": "embed_angles"}.get(key, key)
-            raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
+    for key in (key for key in chosen if key not in accepted):
+        name = {"embedded_angles": "embed_angles"}.get(key, key)
+        raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
     with _float64_defaults(), torch.random.fork_rng(devices=[]), _section("network"):
         torch.manual_seed(config.seed)
         V = cls(scaling=_scaling(config, problem, kept), **chosen)
@@ -295,12 +293,15 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     if name in registry:
         return registry[name]
     module_name, _, class_name = name.partition(":")
+    choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
+    if not class_name:
+        hint = did_you_mean(name, registry, f"name the class too, as in {module_name}:Class.")
+        raise UsageError(f"Expected {key} as {choices}, got {name!r}; {hint}")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
         cls = getattr(importlib.import_module(module_name), class_name)
     except (Exception, SystemExit) as error:  # of any kind: the module is the user's
-        choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
         raise UsageError(
             f"Expected {key} as {choices}, got {name!r} ({raised(error)}); correct the name, or the module."
         ) from error
@@ -312,11 +313,10 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
 def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
     """The indices of the states that V depends on."""
     names, ignored = list(system.state_names), config.network.ignored_states
-    for name in ignored:
-        if name not in names:
-            raise UsageError(
-                f"Expected network.ignored_states among {', '.join(names)}, got {name!r}; name states of the system."
-            )
+    if unknown := [name for name in ignored if name not in names]:
+        raise UsageError(
+            f"Expected network.ignored_states among {', '.join(names)}, got {unknown[0]!r}; name states of the system."
+        )
     if len(set(ignored)) == len(names):
         raise UsageError("Expected V to depend on a state, got all in network.ignored_states; leave some out.")
     return [i for i, name in enumerate(names) if name not in ignored]
@@ -386,7 +386,7 @@ def _section(name: str):
     except (Exception, SystemExit) as error:
         if str(error).startswith("Expected "):  # lyapnet's own words
             raise UsageError(f"{name}: {error}") from error
-        raise UsageError(f"Expected {name} that can be built, got {raised(error)}; correct it.") from error
+        raise UsageError(f"Expected {name} that can be built, got {raised(error)}; {remedy(error)}.") from error
 
 
 @contextmanager

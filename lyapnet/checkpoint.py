@@ -114,6 +114,10 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         raise UsageError(
             f"Expected a checkpoint file, got the folder {str(path)!r}; in a run's it is checkpoints/best.ckpt."
         )
+    if path.is_file() and not path.stat().st_size:
+        raise CheckpointError(
+            f"Expected a lyapnet checkpoint, got {str(path)!r}, which is empty; use another of the run."
+        )
     if not path.is_file():
         raise UsageError(
             f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
@@ -145,10 +149,10 @@ def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
         write_atomically(Path(path), buffer.getbuffer())
     except OSError as error:
         raise CheckpointError(
-            f"Expected to write checkpoint {str(path)!r}, got {error.strerror}; make room and continue with "
-            "--resume last: the previous checkpoint is untouched."
+            f"Expected to write checkpoint {str(path)!r}, got {error.strerror}; make room and continue with --resume "
+            f"last: {'the previous checkpoint is untouched' if Path(path).exists() else 'there is no earlier one yet'}."
         ) from error
 
 
 def _first_sentence(error: Exception) -> str:
-    return str(error).split("\n")[0].split(". ")[0][:120]
+    return str(error).split("\n")[0].split(". ")[0][:120] or type(error).__name__

@@ -8,10 +8,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.errors import UsageError, raised
 
+REMEDIES = {  # what an error of torch's says ↦ what to do
+    "before Module.__init__() call": "call super().__init__() first in __init__",
+    "Boolean value of Tensor": "write torch.where(x > 0, a, b) in the place of an if",
+    "converted to Python scalars": "stay in torch: no float(x) and no x.item()",
+    "numpy": "stay in torch: torch.sin for np.sin, and lyapnet.Table for np.interp",
+}
 STEP = 1e-6  # of central differences, relative to the spread of an argument
 DIRECTIONS = 4  # along which derivatives are compared at each state
 
@@ -43,9 +49,11 @@ def check_function(
     got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
     if got != ((batch, *shape), given[0].dtype):
         shapes = " and ".join(str(tuple(argument.shape)) for argument in given)
+        precision = "append .to(x), which gives it the precision of x"
+        advice = precision if got[0] == (batch, *shape) else "return one result for each state"
         raise UsageError(
             f"Expected {name} as a tensor of {(batch, *shape)} and {given[0].dtype} for arguments of shape {shapes}, "
-            f"got {got}; return one result for each state."
+            f"got {got}; {advice}."
         )
     if any(not torch.equal(one, before) for one, before in zip(given, arguments, strict=True)):
         raise UsageError(f"Expected {name} to leave its arguments as they are, got others; clone them first.")
@@ -68,8 +76,26 @@ def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor])
     except (Exception, SystemExit) as error:
         shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
         raise UsageError(
-            f"Expected {name} for arguments of shape {shapes}, got {raised(error)}; correct it there."
+            f"Expected {name} for arguments of shape {shapes}, got {raised(error)}; {remedy(error)}."
         ) from error
+
+
+def remedy(error: BaseException) -> str:
+    """What to do about an error of a function of others."""
+    return next((advice for words, advice in REMEDIES.items() if words in str(error)), "correct it there")
+
+
+def initialised(part: Any) -> Any:
+    """A part of a problem that is a module, or none; one whose __init__ forgot the module's is refused.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if isinstance(part, nn.Module) and "_modules" not in vars(part):
+        raise UsageError(
+            f"Expected {type(part).__name__}.__init__ to call super().__init__(), got one that does not; call it first."
+        )
+    return part
 
 
 def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
@@ -86,7 +112,7 @@ def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: S
             raise UsageError(
                 f"Expected {name} to be a function of each state by itself, in batches of any shape, got another "
                 f"result for a batch of {tuple(expected.shape[: expected.ndim - value.ndim + 1]) or 'one state'}; use "
-                "x[..., i] and sums over the last axis alone, and no random numbers."
+                "x[..., i], sums over the last axis alone, torch.where in the place of an if, and no random numbers."
             )
 
 

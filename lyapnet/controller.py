@@ -206,6 +206,7 @@ def load(
     config = config_of(content, path)
     parts = Parts(system=system, cost=cost, controls=controls, network=network, program=program)
     require_parts(config, parts, path)
+    _require_dimension(config, system, path)
     problem = build_problem(config, parts)
     V = build_value_function(config, problem, network)
     load_value_function(V, content, path)
@@ -218,6 +219,18 @@ def load(
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
     return Controller(problem, V, build_rollout(config, problem, V), own, config)
+
+
+def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:
+    """Refuse a system in the place of a checkpoint's that has another number of states than its X₀."""
+    if system is None or len(lower := config.initial_states.lower) == 1:  # one bound may be that of every state
+        return
+    system.check_coordinates()
+    if system.n != len(lower):
+        raise UsageError(
+            f"Expected a system of {len(lower)} states, as {str(path)!r} was trained with, got "
+            f"{type(system).__name__} of {system.n} ({', '.join(system.state_names)}); pass the class of its training."
+        )
 
 
 def require_parts(config: Config, parts: Parts, origin: str | Path) -> None:

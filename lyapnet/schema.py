@@ -184,15 +184,15 @@ def _check_value(key: str, value: Any, rule: Mapping[str, Any]) -> None:
     holds = {">": operator.gt, "≥": operator.ge, "<": operator.lt}
     bounds = {symbol: bound for symbol, bound in rule["bounds"].items() if bound is not None}
     if bounds and value == []:
-        raise UsageError(f"Expected {key} with at least one entry, got none; {rule['doc']}")
+        raise UsageError(f"Expected {key} with at least one entry, got none; correct it: {rule['doc']}")
     for symbol, bound in bounds.items():
         for number in value if isinstance(value, list) else [value]:
             if not (holds[symbol](number, bound) and math.isfinite(number)):
-                raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; {rule['doc']}")
+                raise UsageError(f"Expected {key} {symbol} {bound}, got {value}; correct it: {rule['doc']}")
 
 
 def _check_text(key: str, value: Any, rule: Mapping[str, Any]) -> None:
     if rule["folder"] and (not value.isprintable() or {"", ".", ".."} & {*value.replace("\\", "/").split("/")}):
-        raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; {rule['doc']}")
+        raise UsageError(f"Expected {key} as a name, or several joined by /, got {value!r}; correct it: {rule['doc']}")
     if isinstance(value, str) and any(character < " " for character in value):
-        raise UsageError(f"Expected {key} without control characters, got {value!r}; {rule['doc']}")
+        raise UsageError(f"Expected {key} without control characters, got {value!r}; correct it: {rule['doc']}")

@@ -7,9 +7,11 @@ import torch
 import yaml
 from torch.testing import assert_close
 
+from lyapnet.build import resolve
 from lyapnet.config import config_from_plain, load_config, to_plain
+from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram, ValueProgram
-from lyapnet.systems import Cartpole, DoubleIntegrator, Reacher
+from lyapnet.systems import SYSTEMS, Cartpole, ControlAffineSystem, DoubleIntegrator, Reacher
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
 
 # The shipped configs against the task sheet
@@ -131,3 +133,11 @@ def test_classes_of_the_users_own_are_built(name, mass, own_classes, plain):
     assert problem.system.mass == mass
     assert V.width == 6
     assert_close(rollout.closed_loop.policy(torch.tensor(0.0), x), -x[:, 1:] / mass)  # −½ R⁻¹gᵀV_x with V = ‖x‖²
+
+
+@pytest.mark.parametrize("name", ["maglev", "json", "maglev:"])
+def test_a_module_without_a_class_is_told_from_one_with_it(name):
+    with pytest.raises(UsageError, match=rf"got '{name}'; name the class too, as in {name.rstrip(':')}:Class\.$"):
+        resolve(name, SYSTEMS, "system.name", ControlAffineSystem)
+    with pytest.raises(UsageError, match=r"got 'cartpol'; did you mean cartpole\?$"):
+        resolve("cartpol", SYSTEMS, "system.name", ControlAffineSystem)

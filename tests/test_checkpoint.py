@@ -460,3 +460,25 @@ def test_states_that_are_ignored_are_so_after_loading(tmp_path):
     write_checkpoint(content, path)
     with pytest.raises(CheckpointError, match="only in the config"):
         lyapnet.load(path)
+
+
+# What is said of files
+
+
+def test_an_empty_checkpoint_says_so(tmp_path):
+    (tmp_path / "empty.ckpt").write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"empty\.ckpt', which is empty; use another"):
+        read_checkpoint(tmp_path / "empty.ckpt")
+
+
+def test_a_full_disk_claims_no_checkpoint_that_is_not_there(tmp_path, monkeypatch):
+    def full(path, content):
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "last.ckpt"
+    monkeypatch.setattr("lyapnet.checkpoint.write_atomically", full)
+    with pytest.raises(CheckpointError, match=r"No space left .*: there is no earlier one yet\.$"):
+        write_checkpoint({}, path)
+    path.touch()
+    with pytest.raises(CheckpointError, match=r"No space left .*: the previous checkpoint is untouched\.$"):
+        write_checkpoint({}, path)

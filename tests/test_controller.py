@@ -22,7 +22,7 @@ from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.policy import HJBPolicy
 from lyapnet.random_streams import TEST, stream
 from lyapnet.rollout import Rollout
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.systems import DoubleIntegrator, Linear
 from tests.problems import Quadratic, problem_of
 
 CONF = Path(__file__).parents[1] / "conf"
@@ -379,6 +379,11 @@ def test_evaluate_notes_another_plant_once_and_measures_it(path, tmp_path, monke
     assert "other state names;" in note
     own, other = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     assert own["cost_mean"] == other["cost_mean"]
+
+
+def test_a_system_of_another_number_of_states_is_named(path):
+    with pytest.raises(UsageError, match=r"a system of 2 states.*best\.ckpt.*got Linear of 3 \(x1, x2, x3\); pass the"):
+        lyapnet.load(path, system=Linear(np.zeros((3, 3)).tolist(), [[0.0], [0.0], [1.0]]))
 
 
 def test_a_checkpoint_without_a_record_is_taken_as_it_is(path, tmp_path, caplog):

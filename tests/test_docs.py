@@ -10,6 +10,7 @@ import pytest
 import yaml
 from omegaconf import MISSING
 
+from lyapnet.build import REGISTRIES
 from lyapnet.comparison.plan import ComparisonConfig
 from lyapnet.config import STANDARD, Config
 from lyapnet.networks import NETWORKS
@@ -175,3 +176,9 @@ def test_the_standard_recipe_is_what_the_page_says():
     (shown,) = [block for block in re.findall(r"```yaml\n(.*?)```", PAGES[ROOT / "docs" / "config.md"], re.DOTALL)
                 if "network: {name: expansion}" in block]  # fmt: skip
     assert yaml.safe_load(shown) == STANDARD
+
+
+@pytest.mark.parametrize("part", REGISTRIES)
+def test_the_table_names_what_is_registered(part):
+    (row,) = re.findall(rf"^\| `{part}\.name` .*$", PAGES[ROOT / "docs" / "config.md"], re.MULTILINE)
+    assert "`lyapnet systems`" in row or set(re.findall(r"`(\w+)`", row)) >= {*REGISTRIES[part][0]}

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.build import build_problem
+from lyapnet.build import Parts, build_problem
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import load_config
 from lyapnet.cost import Cost, QuadraticCost
@@ -423,3 +423,74 @@ def test_numbers_that_are_none_are_the_same():
     problem = problem_of(DoubleIntegrator())
     infinite = {**problem.record(), "U": [[math.nan], [math.inf], [1.0]]}
     assert problem.differences(infinite) == ["U"]
+
+
+# What is said of code that breaks a contract
+
+
+class Toy(DoubleIntegrator):
+    """f or g by some way of writing it."""
+
+    dynamics = ControlAffineSystem.dynamics
+
+    def __init__(self, f=None, g=None):
+        super().__init__()
+        self.own_f, self.own_g = f, g
+
+    def f(self, x):
+        return super().f(x) if self.own_f is None else torch.stack([x[..., 1], self.own_f(x[..., 0])], -1)
+
+    def g(self, x):
+        return super().g(x) if self.own_g is None else self.own_g(x)
+
+
+WRITTEN = {
+    "an if": ({"f": lambda q: q if q > 0 else 2 * q}, "torch.where"),
+    "an if over the batch": ({"f": lambda q: q if q.sum() > 0 else 2 * q}, "torch.where"),
+    "float": ({"f": lambda q: q * float(q)}, r"no float\(x\)"),
+    "np.interp": ({"f": lambda q: torch.as_tensor(np.interp(q, [-1, 1], [-1, 1]))}, "lyapnet.Table for np.interp"),
+    "np.sin": ({"f": np.sin}, "torch.sin for np.sin"),
+    "NumPy and detach": ({"f": lambda q: torch.as_tensor(np.sin(q.detach().numpy()))}, "lyapnet.Table"),
+    "float32": ({"g": lambda x: torch.ones(*x.shape, 1).float()}, r"append \.to\(x\)"),
+    "another shape": ({"g": lambda x: torch.ones(*x.shape)}, "return one result for each state"),
+    "anything else": ({"f": lambda q: q.nothing}, "correct it there"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Converting a tensor")
+@pytest.mark.parametrize("written", WRITTEN)
+def test_a_broken_contract_says_what_to_write(written):
+    own, remedy = WRITTEN[written]
+    with pytest.raises(UsageError, match=rf"^Expected Toy\.[fg]\(x\).*; .*{remedy}.*\.$"):
+        problem_of(Toy(**own)).check()
+
+
+def test_what_only_looks_at_values_keeps_the_contract():
+    def looked_at(q):
+        if (q.abs() > 100).any():
+            raise ValueError
+        return q
+
+    problem_of(Toy(looked_at)).check()
+
+
+class Forgotten(DoubleIntegrator):
+    """Without super().__init__()."""
+
+    def __init__(self, k=1.0):
+        self.k = k
+
+
+class ForgottenBuffer(DoubleIntegrator):
+    def __init__(self):
+        self.register_buffer("k", torch.ones(()))
+
+
+def test_a_forgotten_super_is_named():
+    config = load_config(CONF / "double_integrator.yaml")
+    with pytest.raises(UsageError, match=r"Expected Forgotten\.__init__ to call super\(\)\.__init__\(\)"):
+        build_problem(config, Parts(system=Forgotten()))
+    for name in ("Forgotten", "ForgottenBuffer"):
+        config.system.name = f"{__name__}:{name}"
+        with pytest.raises(UsageError, match=r"call .*super\(\)\.__init__\(\)"):
+            build_problem(config)

@@ -49,7 +49,7 @@ def test_what_is_listed_replaces_the_defaults():
         ({"name": "x", "power": 2}, "unknown key power; did you mean engine.power?"),
         ({"name": "x", "engine": 2}, "Expected engine as a section with power, fuels, driver, got 2"),
         ({"name": "x", "doors": "two"}, "Expected doors as int"),
-        ({"name": "x", "doors": 0}, "Expected doors ≥ 1, got 0; Number of doors."),
+        ({"name": "x", "doors": 0}, "Expected doors ≥ 1, got 0; correct it: Number of doors."),
         ({"name": "x", "doors": 9}, "Expected doors < 9, got 9"),
         ({"name": "x", "engine": {"power": 0}}, "Expected engine.power > 0, got 0"),
         ({"name": "x", "engine": {"fuels": ["petrol", "desel"]}}, "got 'desel'; did you mean diesel?"),

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shlex
 import sys
 import time
@@ -14,7 +15,7 @@ from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
 from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
 
 DEFAULT = "statistical"
@@ -34,6 +35,9 @@ class ByKind(TyperGroup):
     def _with_kind(self, args: list[str]) -> list[str]:
         kind, others = _without_option("--kind", args)
         if kind is None:  # options may stand before the kind, or none: those of the group itself are none
+            if args and re.fullmatch(r"\w+", args[0]) and args[0] not in self.commands and not Path(args[0]).exists():
+                hint = did_you_mean(args[0], self.commands, "choose one, or name a file.")
+                raise UsageError(f"Expected {', '.join(self.commands)} or a checkpoint, got {args[0]!r}; {hint}")
             named = next((argument for argument in args if argument in self.commands), DEFAULT)
             return [named, *(argument for argument in args if argument != named)]
         kinds = [name for name in self.commands if name != "check"]

@@ -92,6 +92,8 @@ REFUSED = [
     ("certify statistical --share=1.1", "Expected --share in (0, 1], got 1.1"),
     ("certify sampled --radius=-1", "Expected --radius ≥ 0, got -1"),
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
+    ("certify sond", "Expected sampled, statistical, sound, check or a checkpoint, got 'sond'; did you mean sound?"),
+    ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),
     ("certify sampled --share=0.9", "No such option: --share"),
     ("certify sound --radius=1", "No such option: --radius"),

@@ -162,7 +162,7 @@ class KeptProof:
             )
         if waiting:
             raise UsageError(
-                f"Expected a finished proof in {str(self.path)!r}, got one with {waiting} boxes undecided; go on with "
+                f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); go on with "
                 f"lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the options that it began with."
             )
         return claimed

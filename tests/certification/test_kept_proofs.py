@@ -301,7 +301,9 @@ def test_a_check_refuses_an_unfinished_proof_at_once(P, kept, monkeypatch):
     waiting = len(kept_proofs.read_content(kept)["frontier"])
     assert waiting > 0
     monkeypatch.setattr("lyapnet.certification.proof.WhereItHolds.undecided", None)
-    with pytest.raises(UsageError, match=f"got one with {waiting} boxes undecided; go on with .*--keep .*proof.pt"):
+    with pytest.raises(
+        UsageError, match=f"got an unfinished one .undecided boxes: {waiting}.; go on with .*--keep .*proof.pt"
+    ):
         checked(dipped(P), kept)
 
 

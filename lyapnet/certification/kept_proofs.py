@@ -162,8 +162,8 @@ class KeptProof:
             )
         if waiting:
             raise UsageError(
-                f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); go on with "
-                f"lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the options that it began with."
+                f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
+                f"go on with lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the options that it began with."
             )
         return claimed
 

@@ -163,7 +163,7 @@ class KeptProof:
         if waiting:
             raise UsageError(
                 f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
-                f"go on with lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the options that it began with."
+                f"go on with lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the same options."
             )
         return claimed
 

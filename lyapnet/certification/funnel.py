@@ -123,9 +123,7 @@ def sound_claim(
     started, budget = time.monotonic(), budget or Budget()
     condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta)
     duration, goal = problem.horizon.duration, problem.goal.double()
-    start = _over_time(problem.initial_states, duration)
-    condition.V = OwnOperations(condition.V, start)
-    _check_states(condition, start)
+    _freeze(condition, _over_time(problem.initial_states, duration))
     left_out = ignorable_states(condition.closed_loop)
     initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
@@ -136,8 +134,8 @@ def sound_claim(
         states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
-    _check_states(condition, domain)
     require_own_gradient(condition.V, domain)
+    _check_states(condition, domain)
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
@@ -232,6 +230,13 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
+
+
+def _freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None:
+    """Trace V once, for every question that is asked of it, after a look at what it is."""
+    own = OwnOperations(condition.V, sample)
+    _check_states(condition, sample)
+    condition.V = own
 
 
 def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:

@@ -21,9 +21,9 @@ class DecreaseCondition(nn.Module):
 
     def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float):
         super().__init__()
-        if not (isinstance(alpha, int | float) and 0 < alpha <= 1):
+        if not 0 < alpha <= 1:
             raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
-        if not (isinstance(delta, int | float) and 0 <= delta < float("inf")):
+        if not 0 <= delta < float("inf"):
             raise UsageError(f"Expected delta ≥ 0, got {delta}; give it in cost per second.")
         if closed_loop.V is None:
             raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")

@@ -137,7 +137,8 @@ class WhereItHolds(Question):
         return boxes[chosen], axis_to_cut(self.bounded, c, boxes, chosen)
 
     def look_at(self, boxes: Boxes) -> None:
-        self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
+        if len(boxes.key):  # code of others need not know batches of none
+            self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
 
     def lower_to(self, found: Counterexample | None) -> None:
         """Go on under a counterexample, if there is one."""

@@ -307,7 +307,7 @@ def _of_shape(operation: Any) -> Rule:
 
 
 for _operation in (
-    aten.zeros_like.default, aten.ones_like.default, aten.full_like.default,
+    aten.zeros_like.default, aten.ones_like.default, aten.full_like.default, aten.empty_like.default,
     aten.new_zeros.default, aten.new_ones.default, aten.new_full.default, aten.fill.Scalar,
 ):  # fmt: skip
     rule(_operation)(_of_shape(_operation))

@@ -64,7 +64,7 @@ def trace(
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
     for node in graph_module.graph.nodes:
-        if name_of(node.target) in UNINITIALISED:
+        if name_of(node.target) in UNINITIALISED and not all(name_of(user.target) == "fill" for user in node.users):
             raise UsageError(
                 f"Expected f, g, the cost and V without memory that nothing was written to, got {node.target}; use "
                 "zeros or full."

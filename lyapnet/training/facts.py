@@ -25,7 +25,7 @@ def facts_of(learner: Learner) -> list[Fact]:
     """The facts of a learner's problem; its V is left at the best start."""
     problem = learner.problem
     exact = in_float64(problem)
-    facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact)]
+    facts = [_task(exact), _goal(exact), *_linearisation(exact), stiffness(exact)]
     start = choose_start([learner])
     if start is None:
         return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
@@ -89,7 +89,7 @@ def _linearisation(problem: Problem) -> list[Fact]:
     return facts
 
 
-def _stiffness(problem: Problem) -> Fact:
+def stiffness(problem: Problem) -> Fact:
     """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
     g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
     weighted = torch.linalg.solve(R, g.mT @ riccati(problem).hessian @ g)

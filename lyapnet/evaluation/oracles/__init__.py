@@ -1,4 +1,4 @@
-"""Ground truth: optima known by another route than learning. Never used in training."""
+"""Ground truth: optima known by another route than learning; training asks for none but of other states, to start."""
 
 import importlib.util
 

@@ -251,12 +251,12 @@ def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -
     t, x = points[:, 0], points[:, 1:]
     check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False)
     with torch.no_grad():
-        _check_parts(condition.closed_loop, t, x)
         own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
         if not _close(own, condition.V(t, x)):
             raise UsageError(
                 "Expected V to be one function of (t, x), got another one than at first; read nothing else."
             )
+        _check_parts(condition.closed_loop, t, x)
 
 
 def _check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
@@ -267,7 +267,7 @@ def _check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
         raise UsageError(
             f"Expected a closed loop that runs by ẋ = f(x) + g(x)u, ℓ and u = policy(t, x), got another one; make "
             f"{type(system).__name__}.dynamics, {type(loop.policy).__name__}.with_value and "
-            f"{type(loop).__name__}.slope agree with these."
+            f"{type(loop).__name__}.slope agree with these each time."
         )
     cost = parts[..., -1]
     least = int(cost.argmin())

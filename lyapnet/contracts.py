@@ -4,6 +4,7 @@ They are tried on states at random. What passes may still break its contract at 
 certificate does not rely on this gate (docs/trust.md).
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -98,12 +99,29 @@ def initialised(part: Any) -> Any:
     return part
 
 
+def copied(module: nn.Module) -> Any:
+    """A float64 copy of a module on the CPU.
+
+    Raises:
+        UsageError: it holds what cannot be copied.
+    """
+    try:
+        return copy.deepcopy(module).double().cpu()
+    except Exception as error:
+        raise UsageError(
+            f"Expected a {type(module).__name__} that can be copied, got {raised(error)}; call what it holds there by "
+            "its global name."
+        ) from error
+
+
 def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
     """Refuse results that depend on the other states of a batch, on its shape, or on chance."""
     tolerance = torch.finfo(value.dtype).eps ** 0.5
     folded = called(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
+    first = called(name, function, [argument[:1] for argument in arguments])
     alone = [called(name, function, [argument[i] for argument in arguments]) for i in range(3)]
-    for some, expected in ((folded, value.reshape(2, -1, *value.shape[1:])), *zip(alone, value[:3], strict=True)):
+    batches = (folded, value.reshape(2, -1, *value.shape[1:])), (first, value[:1])
+    for some, expected in (*batches, *zip(alone, value[:3], strict=True)):
         if (
             not isinstance(some, Tensor)
             or some.shape != expected.shape

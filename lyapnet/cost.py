@@ -3,6 +3,7 @@
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import TypeGuard
 
 import torch
 from jaxtyping import Float
@@ -171,6 +172,12 @@ class QuadraticCost(Cost):
     def restricted_to(self, kept: Sequence[int], n: int) -> "QuadraticCost":
         kept = list(kept)
         return QuadraticCost(self.Q[kept][:, kept], torch.eye(1), self.Q_T[kept][:, kept])
+
+
+def is_quadratic(cost: Cost) -> TypeGuard[QuadraticCost]:
+    """Whether a cost is what its matrices say: no class or object put another function in the place of one of it."""
+    own = ("state", "R", "terminal", "control", "running", "ignores")
+    return all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
 
 
 class _RestrictedCost(Cost):

@@ -1,13 +1,12 @@
 """The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
 
-import copy
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lyapnet.contracts import called, check_function
+from lyapnet.contracts import called, check_function, copied
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.sets import Box, ControlSet
@@ -88,7 +87,7 @@ class Problem(nn.Module):
         Raises:
             UsageError: naming what is wrong, and where.
         """
-        own = copy.deepcopy(self).double().cpu()
+        own = copied(self)
         system, cost, n, m = own.system, own.cost, own.system.n, own.system.m
         system.check_coordinates()
         name = type(system).__name__
@@ -124,7 +123,7 @@ class Problem(nn.Module):
             UsageError: naming what is wrong, and where.
         """
         name, generator = type(V).__name__, torch.Generator().manual_seed(0)
-        own: Any = copy.deepcopy(V).double().cpu().eval()
+        own: Any = copied(V).eval()
         x = self.initial_states.sample(TRIED, generator).double().cpu()
         t = self.horizon.duration * torch.rand(TRIED, generator=generator, dtype=torch.float64)
         check_function(f"{name}.forward(t, x)", own, [t, x], ())
@@ -147,7 +146,7 @@ class Problem(nn.Module):
         They are evaluated in float64 at 3 fixed states of X₀. Where X₀ is thin they are apart nevertheless: friction
         counts for those who start at rest too.
         """
-        own = copy.deepcopy(self).double().cpu()
+        own = copied(self)
         box, cost, m = own.initial_states, own.cost, own.system.m
         generator = torch.Generator().manual_seed(0)
         x = box.sample(3, generator)

@@ -45,7 +45,15 @@ TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width o
 PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
 
 
-OWN = ("pendulum_swingup", "planar_quadrotor")  # of four sections, as a user writes them
+OWN = (
+    "acrobot",
+    "landing",
+    "pendulum_swingup",
+    "planar_quadrotor",
+    "quadrotor",
+    "satellite",
+    "three_link_arm",
+)  # of four sections, as a user writes them
 
 
 @pytest.mark.parametrize("name", OWN)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import Boxes, CutTree, roots, single
 from lyapnet.certification.stopping import Stop
+from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import TaylorForm, wide_axes
 from lyapnet.types import Corner, Corners, PerBox, Value
@@ -38,6 +39,12 @@ class Budget:
     workers: int = 1
     started: float = field(default_factory=time.monotonic)
     stop: Stop = field(default_factory=Stop)  # asked by the user
+
+    def __post_init__(self) -> None:
+        if min(self.chunk, self.frontier, self.workers) < 1:
+            raise UsageError(
+                f"Expected chunk, frontier and workers ≥ 1, got {self.chunk}, {self.frontier} and {self.workers}."
+            )
 
     @property
     def elapsed(self) -> float:

@@ -33,13 +33,21 @@ class DecreaseCondition(nn.Module):
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
         return time_derivative(self.V, loop.system, t, x, u) + self.alpha * loop.cost.running(x, u) - self.delta
 
+    def rise(self, t: Time, x: State) -> PerState:
+        """Ẇ = V_t + V_xᵀ(f + g u) − δ: below 0 where c is, unless the cost is negative."""
+        loop, u = self.closed_loop, self.closed_loop.policy(t, x)
+        return time_derivative(self.V, loop.system, t, x, u) - self.delta
+
     def height(self, t: Time, x: State) -> PerState:
-        """W(t, x) = V(t, x) − δt: where c ≤ 0, Ẇ ≤ −αℓ ≤ 0, so that sublevel sets of W hold what starts in them."""
+        """W(t, x) = V(t, x) − δt: where Ẇ ≤ 0, sublevel sets of W hold what starts in them."""
         return self.V(t, x) - self.delta * t
 
 
 class OwnOperations(ValueFunction):
-    """V at one (t, x) as the torch operations that it runs: its gradient is theirs, by torch's derivative of each.
+    """V as the torch operations that it runs at one (t, x): its gradient is theirs, by torch's derivative of each.
+
+    They are traced once: a V that changes with the calls is what it was then. On batches, where nothing is proved, it
+    is the declared V itself.
 
     What V says of its gradient has no say here: an autograd.Function with another backward pass, hooks, `detach` and
     `no_grad` leave no trace among the operations of V itself, and `value_and_state_gradient` is not asked.
@@ -47,21 +55,30 @@ class OwnOperations(ValueFunction):
 
     def __init__(self, V: ValueFunction, domain: tuple[Corner, Corner]):
         super().__init__()
-        self.graph = BoundedFunction(lambda t, x: (V(t, x),), domain).graph
+        self.declared, self.graph = V, BoundedFunction(lambda t, x: (V(t, x),), domain).graph
 
     def forward(self, t: Time, x: State) -> PerState:
-        return self.graph(t, x)[0]
+        return self.graph(t, x)[0] if x.ndim == 1 else self.declared(t, x)
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        own = x.ndim == 1
+        return super().value_and_state_gradient(t, x) if own else self.declared.value_and_state_gradient(t, x)
+
+
+def own_operations(V: ValueFunction, domain: tuple[Corner, Corner]) -> OwnOperations:
+    """V as its operations, traced unless it is so already."""
+    return V if isinstance(V, OwnOperations) else OwnOperations(V, domain)
 
 
 def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
-    """(c, W) with bounds on boxes, where the V_t and V_x of V̇ are those of V's own operations.
+    """(c, W, Ẇ) with bounds on boxes, where the V_t and V_x of V̇ are those of V's own operations.
 
     So c ≤ 0 proves that V falls, whatever gradient V declares; the control law is the one that runs.
     """
     declared = condition.V
     try:
-        condition.V = OwnOperations(declared, domain)
-        return BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x)), domain)
+        condition.V = own_operations(declared, domain)
+        return BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x), condition.rise(t, x)), domain)
     finally:
         condition.V = declared
 
@@ -75,7 +92,8 @@ def require_own_gradient(V: ValueFunction, domain: tuple[Corner, Corner], points
     Raises:
         UsageError: the bounds at a point exclude 0.
     """
-    own = OwnOperations(V, domain)
+    own = own_operations(V, domain)
+    V = own.declared
 
     def difference(t: Time, x: State) -> tuple[Tensor, Tensor, Tensor]:
         (V_t, V_x), true = gradients(V, t, x), torch.hstack(gradients(own, t, x))

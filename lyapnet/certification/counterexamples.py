@@ -31,7 +31,7 @@ def find_counterexample(
     """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64.
 
     Args:
-        bounded: (c, W).
+        bounded: (c, W, Ẇ).
     """
     points = _likely_violations(condition, lower, upper, level, generator)
     return lowest_violation(condition, bounded, points, level)
@@ -46,7 +46,7 @@ def lowest_violation(
     candidates = candidates[W[candidates].argsort()][:256]
     if not len(candidates):
         return None
-    (c_low, _), _ = bounded.bounds(points[candidates], points[candidates])
+    (c_low, _), *_ = bounded.bounds(points[candidates], points[candidates])
     candidates = candidates[c_low > 0]
     if not len(candidates):
         return None
@@ -92,7 +92,8 @@ def _ascend(
     for step in range(steps):
         with torch.enable_grad():
             leaf = path[-1].detach().requires_grad_()
-            (slope,) = torch.autograd.grad(condition(leaf[:, 0], leaf[:, 1:]).sum(), leaf)
+            c = condition(leaf[:, 0], leaf[:, 1:]).sum()
+            (slope,) = torch.autograd.grad(c, leaf, materialize_grads=True)
         length = 0.05 * 0.9**step * (upper - lower)
         path.append((path[-1] + length * slope.sign().nan_to_num()).clamp(lower, upper))
     return torch.cat(path)

@@ -1,6 +1,5 @@
 """The sound claim: a funnel that closed loops do not leave, and the cost that it guarantees."""
 
-import copy
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,15 +11,16 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
-from lyapnet.certification.condition import DecreaseCondition, bounded_condition, require_own_gradient
+from lyapnet.certification.condition import DecreaseCondition, OwnOperations, bounded_condition, require_own_gradient
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict
-from lyapnet.contracts import check_function
+from lyapnet.contracts import check_function, copied
 from lyapnet.errors import Interrupted, UsageError, signals_taken
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
+from lyapnet.linear_algebra import apply
 from lyapnet.problem import TRIED, Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
@@ -121,8 +121,9 @@ def sound_claim(
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget = time.monotonic(), budget or Budget()
-    condition = DecreaseCondition(copy.deepcopy(closed_loop).double().requires_grad_(False), alpha, delta)
+    condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta)
     duration, goal = problem.horizon.duration, problem.goal.double()
+    _freeze(condition, _over_time(problem.initial_states, duration))
     left_out = ignorable_states(condition.closed_loop)
     initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
@@ -133,8 +134,8 @@ def sound_claim(
         states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
     states = _without(states, left_out)
     domain = _domain(states, initial_states, duration, left_out)
-    _check_states(condition, domain)
     require_own_gradient(condition.V, domain)
+    _check_states(condition, domain)
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in left_out]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
@@ -231,6 +232,13 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))
 
 
+def _freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None:
+    """Trace V once, for every question that is asked of it, after a look at what it is."""
+    own = OwnOperations(condition.V, sample)
+    _check_states(condition, sample)
+    condition.V = own
+
+
 def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
     """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
     lower, upper = domain
@@ -240,7 +248,38 @@ def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -
     def all_three(t: Tensor, x: Tensor) -> Tensor:
         return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
 
-    check_function("the condition, V and φ", all_three, [points[:, 0], points[:, 1:]], (3,), differentiable=False)
+    t, x = points[:, 0], points[:, 1:]
+    check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False)
+    with torch.no_grad():
+        own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
+        if not _close(own, condition.V(t, x)):
+            raise UsageError(
+                "Expected V to be one function of (t, x), got another one than at first; read nothing else."
+            )
+        _check_parts(condition.closed_loop, t, x)
+
+
+def _check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
+    """Refuse a closed loop that runs as another one than its parts say, and a cost below 0, at some states."""
+    system, u = loop.system, loop.policy(t, x)
+    parts = torch.cat([system.f(x) + apply(system.g(x), u), loop.cost.running(x, u)[..., None]], -1)
+    if not _close(loop.slope(x, u), parts) or not _close(loop.control(t, x).u, u):
+        raise UsageError(
+            f"Expected a closed loop that runs by ẋ = f(x) + g(x)u, ℓ and u = policy(t, x), got another one; make "
+            f"{type(system).__name__}.dynamics, {type(loop.policy).__name__}.with_value and "
+            f"{type(loop).__name__}.slope agree with these each time."
+        )
+    cost = parts[..., -1]
+    least = int(cost.argmin())
+    if cost[least] < -1e-9 * cost.abs().max():
+        raise UsageError(
+            f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there: "
+            "correct the cost, or choose a smaller set."
+        )
+
+
+def _close(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6 * float(other.abs().max()))
 
 
 def _require_continuous(V: Value, x_low: State, x_high: State) -> None:
@@ -281,5 +320,10 @@ def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequenc
             f"Expected a set around X₀, got [{states.lower[i]:g}, {states.upper[i]:g}] around "
             f"[{initial_states.lower[i]:g}, {initial_states.upper[i]:g}] at index {i}; choose a larger one."
         )
+    return _over_time(states, duration)
+
+
+def _over_time(states: Box, duration: float) -> tuple[Corner, Corner]:
+    """[0, T] × a box as (lower, upper)."""
     time = torch.tensor([0.0, duration], dtype=torch.float64)
     return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])

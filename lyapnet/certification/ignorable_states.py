@@ -2,6 +2,7 @@
 
 import torch
 
+from lyapnet.cost import is_quadratic
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.graphs.tracing import trace
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -15,15 +16,19 @@ def ignorable_states(closed_loop: ClosedLoop) -> list[int]:
     """
     if has_jumps(closed_loop):
         return []
-    return [i for i in range(closed_loop.system.n) if not _depends_on(closed_loop, i)]
+    n = closed_loop.system.n
+    found = [i for i in range(n) if not _depends_on(closed_loop, i)]
+    return found if len(found) < n else []  # something has to bound a funnel
 
 
 def _depends_on(closed_loop: ClosedLoop, i: int) -> bool:
-    if not closed_loop.cost.ignores(i, closed_loop.system.n):
+    by_matrices = is_quadratic(closed_loop.cost)
+    if by_matrices and not closed_loop.cost.ignores(i, closed_loop.system.n):
         return True
     t, x = _some_point(closed_loop)
     x[i] = torch.nan
-    return any(bool(y.isnan().any()) for y in _ingredients(closed_loop, t, x))
+    parts = _ingredients(closed_loop, t, x) if by_matrices else _all_ingredients(closed_loop, t, x)
+    return any(bool(y.isnan().any()) for y in parts)
 
 
 def has_jumps(closed_loop: ClosedLoop) -> bool:
@@ -44,12 +49,12 @@ def _some_point(closed_loop: ClosedLoop) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _ingredients(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """What the condition and V are made of, but for q and φ, which the cost itself answers for."""
-    system, V = closed_loop.system, closed_loop.V
+    """What the condition and V are made of, but for q and φ, of which the matrices of a quadratic cost tell."""
+    system, V, u = closed_loop.system, closed_loop.V, closed_loop.policy(t, x)
     assert V is not None
-    return system.f(x), system.g(x), closed_loop.cost.R(x), V(t, x), closed_loop.policy(t, x)
+    return system.f(x), system.g(x), system.dynamics(x, u), closed_loop.cost.R(x), V(t, x), u
 
 
 def _all_ingredients(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    cost = closed_loop.cost
-    return cost.state(x), cost.terminal(x), *_ingredients(closed_loop, t, x)
+    cost, parts = closed_loop.cost, _ingredients(closed_loop, t, x)
+    return cost.running(x, parts[-1]), cost.terminal(x), *parts

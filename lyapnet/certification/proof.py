@@ -68,10 +68,10 @@ def prove(
     keep: Path | None = None,
     replay: bool = False,
 ) -> Proof:
-    """Prove c ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
+    """Prove c ≤ 0 and Ẇ ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
     Counterexamples are sought first, by samples and by ascent from the worst of them, then boxes of lowest W are
-    bounded. A box is dropped where c ≤ 0 on all of it or W > level on all of it, and else cut in two. A
+    bounded. A box is dropped where both hold on all of it or W > level on all of it, and else cut in two. A
     counterexample that turns up among their centres lowers the level, and the search goes on under it.
 
     Args:
@@ -124,20 +124,21 @@ class WhereItHolds(Question):
     """Up to which level of W the condition c ≤ 0 holds; boxes are sorted by their lower bound of W."""
 
     condition: DecreaseCondition
-    bounded: BoundedFunction  # of (c, W)
+    bounded: BoundedFunction  # of (c, W, Ẇ)
     level: float  # it can only fall
     stop_at_counterexample: bool
     worst: Counterexample | None = None
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        c, W = self.bounded.forms(boxes.lower, boxes.upper)
-        (_, c_high), (W_low, _) = c.interval(), W.interval()
+        c, W, rise = self.bounded.forms(boxes.lower, boxes.upper)
+        (_, c_high), (W_low, _), (_, rise_high) = c.interval(), W.interval(), rise.interval()
         boxes = boxes._replace(key=torch.maximum(W_low, boxes.key))
-        chosen = ~(c_high <= 0) & (boxes.key <= self.level)
+        chosen = ~((c_high <= 0) & (rise_high <= 0)) & (boxes.key <= self.level)
         return boxes[chosen], axis_to_cut(self.bounded, c, boxes, chosen)
 
     def look_at(self, boxes: Boxes) -> None:
-        self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
+        if len(boxes.key):  # code of others need not know batches of none
+            self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
 
     def lower_to(self, found: Counterexample | None) -> None:
         """Go on under a counterexample, if there is one."""

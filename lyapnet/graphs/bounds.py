@@ -9,6 +9,7 @@ Every operator passes one gate, _apply. What depends on the point stays in float
 in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the shape that the trace recorded.
 """
 
+import copy
 import hashlib
 from collections.abc import Callable
 from typing import Any
@@ -57,10 +58,10 @@ class BoundedFunction:
         share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            self.graph = trace(function, first, others)
+            self.graph = copy.deepcopy(trace(function, first, others))  # with constants that no one else writes to
         except LyapnetError as error:
             raise UsageError(str(error)) from error
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             line = one_line(error)
             raise UsageError(
                 f"Expected f, g, the cost and V in torch operations, each state's result its own, got {line}"
@@ -150,13 +151,21 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         return result.to(recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
-            real = value.dtype == torch.float64 or (value.dtype == torch.bool and node.target in OF_TRUTHS)
+            truth = value.dtype == torch.bool and node.target in OF_TRUTHS and _compares_as_it_is(node, values)
+            real = value.dtype == torch.float64 or truth
             if not real or form.shape != value.shape:
                 raise UsageError(
                     f"Expected operators with a rule for bounds, got {node.target} in {value.dtype} of shape "
                     f"{tuple(value.shape)}; stay in x.dtype, to which truths convert, or write it with others."
                 )
     return result
+
+
+def _compares_as_it_is(node: Node, values: dict[Node, Any]) -> bool:
+    """Whether torch rounds neither of two numbers before it compares them: one without axes takes the other's dtype."""
+    sources = node.all_input_nodes
+    both = [values[source] if isinstance(values[source], Tensor) else source.meta["val"] for source in sources]
+    return len(both) != 2 or torch.result_type(*both) in (torch.float64, torch.bool)
 
 
 def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:

@@ -4,8 +4,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._functorch.compile_utils import fx_graph_cse
 from torch.fx import Graph, Node
+
+from lyapnet.graphs.tracing import without_repetitions
 
 aten = torch.ops.aten
 
@@ -21,7 +22,7 @@ def without_copies(graph: Graph) -> Graph:
         elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
             node.replace_all_uses_with(node.args[0])
             graph.erase_node(node)
-    graph = fx_graph_cse(graph)
+    graph = without_repetitions(graph)
     graph.eliminate_dead_code()
     return graph
 

@@ -13,6 +13,8 @@ from torch._functorch.compile_utils import fx_graph_cse
 from torch.func import functionalize, vmap
 from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.node import map_aggregate
+from torch.overrides import TorchFunctionMode
 from torch.testing import assert_close
 
 from lyapnet.errors import UntraceableError, UsageError, own_line
@@ -42,7 +44,7 @@ def trace(
         Exception: of any other kind that the function raises.
     """
     options = {"decomposition_table": decompositions, "tracing_mode": "fake", "_allow_non_fake_inputs": True}
-    with _reading_values():
+    with _reading_values(), _Watch():
         graph_module = make_fx(function, **options)(*arguments)
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
         graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
@@ -61,9 +63,38 @@ def trace(
             node.replace_all_uses_with(node.args[0])
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
+    for node in graph_module.graph.nodes:
+        if name_of(node.target) in UNINITIALISED and not all(name_of(user.target) == "fill" for user in node.users):
+            raise UsageError(
+                f"Expected f, g, the cost and V without memory that nothing was written to, got {node.target}; use "
+                "zeros or full."
+            )
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
+
+
+class _Watch(TorchFunctionMode):
+    """Hold what code asks of tensors without values against it, even where it makes something else of the answer.
+
+    It may write such a tensor as text, in which no number stands, or take whatever torch raises for a reason to go on.
+    """
+
+    refusal: Exception | None = None
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        try:
+            if func in (Tensor.__repr__, Tensor.__format__, Tensor.__reduce_ex__):
+                raise RuntimeError("FakeTensor as text")
+            return func(*args, **(kwargs or {}))
+        except Exception as error:
+            self.refusal = self.refusal or (error if NO_VALUES.search(str(error)) else None)
+            raise
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        super().__exit__(kind, error, trace)
+        if error is None and self.refusal is not None:
+            raise self.refusal
 
 
 @contextmanager
@@ -80,6 +111,8 @@ def _reading_values():
             f"values of a tensor{_where(own_line(error))}; use torch.where, or lyapnet.Table for a table."
         ) from error
 
+
+UNINITIALISED = ("empty", "empty_like", "empty_strided", "empty_permuted", "new_empty", "new_empty_strided")
 
 NO_VALUES = re.compile(r"tensor subclasses|data pointer|'meta' device|Cannot copy out of meta|FakeTensor")
 """What torch says of code that asks a tensor without values for them."""
@@ -220,7 +253,22 @@ def _results(graph: Graph) -> tuple[Node, ...]:
     return tuple(result) if isinstance(result, list | tuple) else (result,)  # pyright: ignore
 
 
+class _MinusZero(float):
+    """−0.0, which equals 0.0, told from it by its type."""
+
+
+def without_repetitions(graph: Graph) -> Graph:
+    """The graph with each expression computed once."""
+    for node in graph.nodes:
+        node.args, node.kwargs = map_aggregate((node.args, node.kwargs), _telling_zeros_apart)  # pyright: ignore
+    return fx_graph_cse(graph)
+
+
+def _telling_zeros_apart(value: Any) -> Any:
+    return _MinusZero(value) if isinstance(value, float) and str(value) == "-0.0" else value
+
+
 def _tidied(root: GraphModule, graph: Graph) -> GraphModule:
-    graph = fx_graph_cse(graph)
+    graph = without_repetitions(graph)
     graph.eliminate_dead_code()
     return GraphModule(root, graph)

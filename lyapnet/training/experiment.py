@@ -24,8 +24,9 @@ from lyapnet.training.build import build_data
 from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.loggers import log_result, take_back_after
 from lyapnet.training.plan import Plan, plan_run
+from lyapnet.training.recovery import Returns
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.start import choose_start
+from lyapnet.training.start import Start, choose_start
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -88,18 +89,17 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
 
 
 def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
-    config, run, module = plan.config, plan.run, plan.module
+    config, run = plan.config, plan.run
     trainer = build_trainer(plan, console)
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
     started = time.perf_counter()
     try:
+        start = None
         if plan.resume_from is None and run.finetuned_from is None:
-            _choose_start(plan, console, trainer.is_global_zero)
-        torch.manual_seed(config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
-        data = build_data(config, module.members[0].problem)
-        trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
+            start = _choose_start(plan, console, trainer.is_global_zero)
+        trainer = _train(plan, trainer, console, start)
     except Interrupted as stop:
         hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
         raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
@@ -112,13 +112,28 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     return _finish(trainer, plan, console) if trainer.is_global_zero else {}
 
 
-def _choose_start(plan: Plan, console: Console, told: bool) -> None:
+def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None) -> L.Trainer:
+    """All iterations, going back where they diverge; the trainer that came to their end."""
+    returns, module = Returns(plan, console, start), plan.module
+    while True:
+        torch.manual_seed(plan.config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
+        data = build_data(plan.config, module.members[0].problem)
+        try:
+            trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
+            return trainer
+        except DivergenceError as error:
+            plan = returns.go_back(error, trainer)
+            trainer = build_trainer(plan, console)
+
+
+def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
     with console.status("start: trying what is known of V …") if told else nullcontext():
         start = choose_start(list(plan.module.members))
     if told and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)
+    return start
 
 
 def _prepare_folder(plan: Plan) -> None:

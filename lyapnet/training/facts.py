@@ -27,7 +27,7 @@ def facts_of(learner: Learner) -> list[Fact]:
     """The facts of a learner's problem; its V is left at the best start."""
     problem = learner.problem
     exact = in_float64(problem)
-    facts = [_task(exact), _goal(exact), *_linearisation(exact), _stiffness(exact, learner.rollout)]
+    facts = [_task(exact), _goal(exact), *_linearisation(exact), stiffness(exact, learner.rollout)]
     start = choose_start([learner])
     if start is None:
         return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
@@ -91,7 +91,7 @@ def _linearisation(problem: Problem) -> list[Fact]:
     return facts
 
 
-def _stiffness(problem: Problem, rollout: Rollout) -> Fact:
+def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
     """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
     g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
     weighted = torch.linalg.solve(R, g.mT @ riccati(problem).hessian @ g)
@@ -100,7 +100,7 @@ def _stiffness(problem: Problem, rollout: Rollout) -> Fact:
     if gain <= STABLE:
         return Fact("stiffness", f"{found}: both control laws are stable at this Δt")
     found = f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt"
-    if isinstance(rollout.closed_loop.policy, SampledPolicy):
+    if rollout is not None and isinstance(rollout.closed_loop.policy, SampledPolicy):
         return Fact("stiffness", f"{found}, rollout.policy=sampled, which this config has, is stable")
     return Fact("stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}")
 

@@ -60,6 +60,7 @@ class TrainingModule(L.LightningModule):
         super().__init__()
         self.members: Sequence[Learner] = nn.ModuleList(members)  # pyright: ignore
         self.optimizer_options = optimizer
+        self.rate_share = 1.0  # of the scheduled learning rate; less, once a training had to go back
         self.metadata: dict[str, Any] = {}  # plain data that checkpoints carry: the config, where there is one
 
     @abstractmethod
@@ -139,7 +140,9 @@ class TrainingModule(L.LightningModule):
         options = self.optimizer_options
         optimizer = options.optimizer([p for member in self.members for p in member.V.parameters()])
         iterations = options.iterations or self.trainer.estimated_stepping_batches
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: options.rate(step, iterations))
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: self.rate_share * options.rate(step, iterations)
+        )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_callbacks(self) -> list[L.Callback]:
@@ -164,8 +167,16 @@ class TrainingModule(L.LightningModule):
         return super().load_from_checkpoint(checkpoint_path, *args, **{"weights_only": True, **kwargs})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what `lyapnet.load` needs, as plain data."""
-        checkpoint[KEY] = {**self.metadata, "version": __version__}
+        """Add what `lyapnet.load` needs, as plain data, and the share of the learning rate."""
+        checkpoint[KEY] = {**self.metadata, "version": __version__, "rate_share": self.rate_share}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Go on no faster than the checkpoint's training did, and where this one had to go back, more slowly."""
+        stored = checkpoint.get(KEY, {}).get("rate_share", 1.0)
+        self.rate_share = min(self.rate_share, stored)
+        for state in checkpoint.get("optimizer_states", []):
+            for group in state["param_groups"]:
+                group["lr"] *= self.rate_share / stored
 
     # A checkpoint holds each weight once, under the name that it has had since version 0.1.
 

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.evaluation.oracles import optimal_cost
 from lyapnet.expansions import (
     FLOOR,
     Expansion,
     Optimum,
+    Path,
     exchanged,
     greedy_law,
     in_float64,
@@ -21,10 +23,10 @@ from lyapnet.expansions import (
 from lyapnet.problem import Problem
 from lyapnet.types import PerState, State
 
-OPTIMA = 128  # at the most; fewer where their second derivatives would not fit into …
-NUMBERS = 20_000_000  # … so many numbers (160 MB)
+OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
+NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
-STEPS, BATCH, RATE = 1500, 1024, 0.01
+STEPS, BATCH, RATE = 3000, 1024, 0.01
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
 
 
@@ -43,37 +45,83 @@ class Examples(NamedTuple):
 
 
 def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> Optimum:
-    """Optimal trajectories from a batch of states, from the controls that expansions ask for, or none if cheaper.
+    """Optimal trajectories from a batch of states.
 
-    What was found from one state is tried from the states around it: which local minimum a start leads to is luck, but
-    the least cost is continuous in x₀.
+    The first few are sought: from the controls that expansions ask for, or none if cheaper, and some of them by the
+    oracle, where there is one, whose starts need not be trajectories. The others begin with the laws of the few that
+    are nearest. Which local minimum a start leads to is luck, but the least cost is continuous in x₀: at last, what was
+    found from one state is tried from the states around it.
     """
     exact = in_float64(problem)
     x0 = x0.double().cpu()[: _affordable(problem)]
+    few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), no_control(exact)]
-    paths = [path_under(exact, law, x0) for law in laws]
-    best = torch.stack([path.cost for path in paths]).argmin(0)
-    u = torch.stack([path.u for path in paths])[best, :, torch.arange(len(x0))]
-    optimum = optimal_trajectories(problem, x0, u.movedim(0, 1))
+    optimum = optimal_trajectories(problem, few, _cheapest([path_under(exact, law, few) for law in laws]).u)
+    optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR]))
+    if len(others):
+        nearest = _nearest(others, few)
+        u = _cheapest([_along(exact, optimum, column, others) for column in nearest.unbind(1)]).u
+        optimum = _joined(optimum, optimal_trajectories(problem, others, u))
+    return _followed(exact, optimum)
+
+
+def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:
+    """The first of some optima, exchanged for those of the oracle that cost less."""
+    oracle = optimal_cost(problem)
+    if oracle is None:
+        return optimum
+    found = oracle.solve(x0)
+    if found.u is None:
+        return optimum
+    better = torch.nonzero(found.cost < BETTER * optimum.path.cost[: len(x0)]).flatten()
+    if not len(better):
+        return optimum
+    return _with(optimum, better, optimal_trajectories(problem, x0[better], found.u[:, better]))
+
+
+def _followed(exact: Problem, optimum: Optimum) -> Optimum:
+    """Optima of which each has been tried from the states around it."""
+    x0 = optimum.path.x[0]
     for _ in range(ROUNDS):
-        around = [
-            path_under(exact, greedy_law(exact, optimum.expansion.member(neighbours)), x0)
-            for neighbours in _nearest(x0).unbind(1)
-        ]
-        cost, which = torch.stack([path.cost for path in around]).min(0)
-        improved = torch.nonzero(cost < BETTER * optimum.path.cost).flatten()
+        paths = [_along(exact, optimum, column, x0) for column in _nearest(x0, x0, itself=False).unbind(1)]
+        best = _cheapest(paths)
+        improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()
         if not len(improved):
             break
-        u = torch.stack([path.u for path in around])[which[improved], :, improved]
-        optimum = _with(optimum, improved, optimal_trajectories(problem, x0[improved], u.movedim(0, 1)))
+        optimum = _with(optimum, improved, optimal_trajectories(exact, x0[improved], best.u[:, improved]))
     return optimum
 
 
-def _nearest(x0: State) -> Tensor:
+def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
+    """From each of some states under the law of one of the optima."""
+    return path_under(exact, greedy_law(exact, optimum.expansion.member(which)), x0)
+
+
+def _cheapest(paths: Sequence[Path]) -> Path:
+    """Of each state, that of several trajectories which costs least."""
+    best, each = torch.stack([path.cost for path in paths]).argmin(0), torch.arange(len(paths[0].cost))
+    x, u = (torch.stack([getattr(path, name) for path in paths])[best, :, each].movedim(0, 1) for name in ("x", "u"))
+    return Path(x, u, torch.stack([path.cost for path in paths])[best, each])
+
+
+def _nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:
     """The indices of the nearest other states of each (b, k), each component in units of its spread."""
-    scaled = x0 / (x0.amax(0) - x0.amin(0)).clamp_min(torch.finfo(x0.dtype).tiny)
-    distance = torch.cdist(scaled, scaled).fill_diagonal_(torch.inf)
-    return distance.argsort(1)[:, : min(NEIGHBOURS, len(x0) - 1)]
+    scale = (others.amax(0) - others.amin(0)).clamp_min(torch.finfo(x0.dtype).tiny)
+    distance = torch.cdist(x0 / scale, others / scale)
+    if not itself:
+        distance.fill_diagonal_(torch.inf)
+    return distance.argsort(1)[:, : min(NEIGHBOURS, len(others) - (not itself))]
+
+
+def _joined(one: Optimum, other: Optimum) -> Optimum:
+    """Two batches of optima as one."""
+    path = Path(
+        torch.cat([one.path.x, other.path.x], 1),
+        torch.cat([one.path.u, other.path.u], 1),
+        torch.cat([one.path.cost, other.path.cost]),
+    )
+    parts = zip(one.expansion, other.expansion, strict=True)
+    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)))
 
 
 def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:

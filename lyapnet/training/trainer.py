@@ -16,6 +16,7 @@ from lyapnet.training.figure_logger import FigureLogger
 from lyapnet.training.loggers import loggers_of_run
 from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
+from lyapnet.training.recovery import RisingCost
 from lyapnet.training.trainer_options import trainer_options
 from lyapnet.training.validation_optimum import ValidationOptimum
 
@@ -55,6 +56,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         FigureLogger(every * options.figures_every),
         *([certified] if options.certify_every else []),
         TrainingProgress(console),
+        RisingCost(),
         *plan.callbacks,
         Checkpoints(run.last, best, every, partial(run.note, saved=True)),
     ]

@@ -86,7 +86,7 @@ def test_a_wrong_value_function_is_falsified(P, factor):
 
 def test_an_unstable_loop_is_falsified():
     system = Linear([[0.0, 1.0], [4.0, 0.0]], [[0.0], [1.0]])
-    claim = certify(loop(1e-2 * torch.eye(2), system), budget=Budget(5, boxes=1000))
+    claim = certify(loop(1e-2 * torch.eye(2), system), budget=Budget(60, boxes=1000))
     assert claim.verdict == "falsified"
     assert claim.counterexample.condition > 0
 

@@ -1,11 +1,14 @@
 """Fitting V to optima: what the examples say, against Riccati's solution and rollouts; and what fitting brings."""
 
+import math
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.evaluation.oracles import discrete_riccati
-from lyapnet.expansions import optimal_trajectories, path_under, riccati
+from lyapnet.evaluation.oracles import Optima, discrete_riccati
+from lyapnet.expansions import no_control, optimal_trajectories, path_under, riccati
 from lyapnet.networks import FCN, Scaling
 from lyapnet.policy import SampledPolicy
 from lyapnet.systems import Linear
@@ -93,7 +96,54 @@ def test_as_many_trajectories_as_fit_into_memory(problem, monkeypatch):
     assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
 
 
-def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch):
+@pytest.fixture
+def without_oracle(monkeypatch):
+    monkeypatch.setattr(pretraining, "optimal_cost", lambda _: None)
+
+
+def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
+    problem = hanging(steps=40)
+    x0, expansions, batches = problem.initial_states.sample(9), [riccati(problem)], []
+    expected = optima_for(problem, expansions, x0)
+
+    def counted(problem, x0, u):
+        batches.append(len(x0))
+        return optimal_trajectories(problem, x0, u)
+
+    monkeypatch.setattr(pretraining, "optimal_trajectories", counted)
+    monkeypatch.setattr(pretraining, "SOUGHT", 4)
+    optimum = optima_for(problem, expansions, x0)
+    assert batches[0] == 4
+    assert 5 in batches
+    assert_close(optimum.path.x[0], x0)
+    assert_close(optimum.path.cost, expected.path.cost, rtol=1e-6, atol=0)
+    assert_close(optimum.expansion.hessian, expected.expansion.hessian, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.5, [5, 3]), (math.inf, [5])])
+def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without_oracle):
+    problem = hanging(steps=40)
+    x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
+    monkeypatch.setattr(pretraining, "ROUNDS", 0)
+    monkeypatch.setattr(pretraining, "FAR", 3)
+    good, idle = optima_for(problem, expansions, x0).path, path_under(problem, no_control(problem), x0)
+
+    def solve(states):
+        return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])
+
+    def spoiled(problem, x0, u):
+        batches.append(len(x0))
+        return optimal_trajectories(problem, x0, u) if batches[1:] else optimal_trajectories(problem, x0, 0 * u, 0)
+
+    monkeypatch.setattr(pretraining, "optimal_cost", lambda _: SimpleNamespace(solve=solve))
+    monkeypatch.setattr(pretraining, "optimal_trajectories", spoiled)
+    cost = optima_for(problem, expansions, x0).path.cost
+    assert batches == taken
+    assert_close(cost[3:], idle.cost[3:])
+    assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
+
+
+def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_oracle):
     problem = hanging(steps=40)
     x0, expansions = problem.initial_states.sample(8), [riccati(problem)]
     expected = optima_for(problem, expansions, x0).path.cost

@@ -1,8 +1,8 @@
-"""Ground truth: optima known by another route than learning. Never used in training."""
+"""Ground truth: optima known by another route than learning; training asks for none but of other states, to start."""
 
 import importlib.util
 
-from lyapnet.cost import QuadraticCost
+from lyapnet.cost import is_quadratic
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.riccati import (
@@ -45,7 +45,7 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
             "alone."
         )
     system, cost, horizon = problem.system, problem.cost, problem.horizon
-    if is_linear(system) and isinstance(cost, QuadraticCost) and cost.R_constant is not None:
+    if is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         return RiccatiOracle(solve(system, cost, horizon))
     if method != "euler":

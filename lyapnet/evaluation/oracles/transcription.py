@@ -20,8 +20,7 @@ from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
-RANDOM_STARTS = 2  # for each initial state
-AT_LEAST = 8  # random starts in all, however few states
+BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
 
 
 class Transcription(Oracle):
@@ -104,18 +103,24 @@ class Transcription(Oracle):
     def _starts(
         self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None]
     ) -> Iterator[list[Candidate]]:
-        """For each pending state: what the caller knows, the line to the goal without control, and curves around it."""
+        """For each pending state: what the caller knows, and the line to the goal without control.
+
+        A few states, evenly spread over the batch, try random curves around that line too; a better minimum that these
+        find reaches the others from neighbour to neighbour.
+        """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal = self.problem.goal.numpy()
         s = np.arange(1, N + 1)[:, None] / N
         waves = np.stack([np.sin(k * np.pi * s) / k for k in (1, 2, 3)])  # smooth, and zero at both ends
         extent = states.abs().amax(0).numpy()
         scale = np.where(extent > 0, extent, 1.0)
-        curves = max(RANDOM_STARTS, math.ceil(AT_LEAST / len(pending)))
-        for i in pending:
+        curves = math.ceil(BENT * BENDS / min(BENT, len(pending)))
+        bent = {len(pending) * k // BENT for k in range(BENT)}
+        for k, i in enumerate(pending):
             line = goal + (1 - s) * (states[i].numpy() - goal)
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
-            cold = [Candidate(x, np.zeros((N, self.problem.system.m)), math.inf) for x in (line, *(line + bends))]
+            paths = (line, *(line + bends)) if k in bent else (line,)
+            cold = [Candidate(x, np.zeros((N, self.problem.system.m)), math.inf) for x in paths]
             known = given[i]
             yield cold if known is None else [known, *cold]
 

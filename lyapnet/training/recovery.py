@@ -1,0 +1,126 @@
+"""What becomes of a training that leaves the finite numbers, or whose cost rises: it goes back, and on more slowly."""
+
+import copy
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.console import Console
+
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.errors import DivergenceError
+from lyapnet.expansions import in_float64
+from lyapnet.policy import HJBPolicy
+from lyapnet.training.curves import members_of
+from lyapnet.training.facts import stiffness
+from lyapnet.training.learner import Learner
+from lyapnet.training.loggers import take_back_after
+from lyapnet.training.plan import Plan
+from lyapnet.training.start import Start
+
+RETURNS = 4  # at the most
+SLOWER = 3.0  # by which each divides the learning rate
+RISE = 2.0  # times the least cost of the validation states so far, from which on a run is taken for lost
+
+
+class RisingCost(Callback):
+    """Ends a training whose cost on the validation states has risen to RISE times the least so far.
+
+    Raises:
+        DivergenceError: it has.
+    """
+
+    def __init__(self) -> None:
+        self.least: dict[str, float] = {}
+
+    def state_dict(self) -> dict[str, Any]:
+        return dict(self.least)
+
+    def load_state_dict(self, state_dict: Mapping[str, float]) -> None:
+        self.least = dict(state_dict)
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for member in members_of(pl_module):
+            assert member.validation is not None
+            cost = member.validation.summary()["cost_mean"]
+            least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
+            if cost > RISE * least > 0:
+                place = f"Iteration {trainer.global_step}" + (f", {member.label}" if member.label else "")
+                raise DivergenceError(
+                    f"{place}: Expected a cost on the validation states of at most {RISE:g} times the least so far, "
+                    f"{least:.4g}, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
+                )
+
+
+class Returns:
+    """Trains a plan's module; where that diverges, from its last checkpoint on with a third of the learning rate.
+
+    Before the first checkpoint it goes back to the weights that the training began with. Each return is told, and kept
+    in the run's record; after RETURNS of them, or in several processes, the divergence is raised with its cause.
+
+    Args:
+        plan: what is trained.
+        console: where returns are told.
+        start: what the training began with, if that was chosen.
+    """
+
+    def __init__(self, plan: Plan, console: Console, start: Start | None):
+        self.plan, self.console, self.start = plan, console, start
+        self.weights = copy.deepcopy(plan.module.state_dict())
+        self.found = _written(
+            plan.run.last
+        )  # by an earlier process, perhaps beyond the checkpoint that this one resumes
+        self.count = 0
+
+    def go_back(self, error: DivergenceError, trainer: L.Trainer) -> Plan:
+        """The plan from the last checkpoint on, more slowly.
+
+        Raises:
+            DivergenceError: there were too many returns.
+        """
+        if self.count == RETURNS or trainer.world_size > 1:
+            raise DivergenceError(f"{error}{self._diagnosis()}") from error
+        plan, module = self.plan, self.plan.module
+        if _written(plan.run.last) != self.found:
+            plan = replace(plan, resume_from=plan.run.last, step=int(read_checkpoint(plan.run.last)["global_step"]))
+        elif plan.resume_from is None:
+            module.load_state_dict(self.weights)
+        module.train()  # a validation may have ended in the middle
+        module.rate_share /= SLOWER
+        self.count += 1
+        entry = {"to": plan.step, "rate_share": module.rate_share, "because": str(error)}
+        plan.run.note(returns=[*plan.run.record().get("returns", []), entry])
+        self.console.print(
+            f"{error} Going back to step {plan.step}, with {module.rate_share:.2g} of the scheduled learning rate "
+            f"(return {self.count} of at most {RETURNS}).",
+            soft_wrap=True,
+        )
+        for run in plan.run.members(plan.config):
+            take_back_after(run, plan.step if plan.resume_from else None)
+        return plan
+
+    def _diagnosis(self) -> str:
+        """Why going back has not helped, where that is known."""
+        member: Learner = self.plan.module.members[0]
+        tried = (
+            f" {self.count} returns did not help, with {self.plan.module.rate_share:.2g} of the learning rate at last."
+        )
+        with suppress(RuntimeError):  # of a problem whose linearisation is singular
+            stiff = stiffness(in_float64(member.problem))
+            if isinstance(member.rollout.closed_loop.policy, HJBPolicy) and stiff.advice:
+                return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
+        if self.start is not None and self.start.chosen.finite < 1:
+            share = self.start.chosen.finite
+            return (
+                f"{tried} The start itself is finite on {share:.0%} of X₀: choose a smaller X₀, or a shorter horizon."
+            )
+        return tried
+
+
+def _written(path: Path) -> int | None:
+    """When a file was written, if it was."""
+    return path.stat().st_mtime_ns if path.exists() else None

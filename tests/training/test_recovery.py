@@ -1,0 +1,144 @@
+"""A training that diverges goes back and on more slowly; it gives up after a while, with the cause."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning import Trainer
+from rich.console import Console
+
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.config import config_from_plain
+from lyapnet.errors import DivergenceError
+from lyapnet.files import read_json
+from lyapnet.training.build import build_module
+from lyapnet.training.experiment import train
+from lyapnet.training.learner import Learner
+from lyapnet.training.recovery import RETURNS, RISE, SLOWER, RisingCost
+
+
+@pytest.fixture
+def traced():
+    return False
+
+
+@pytest.fixture
+def config(tmp_path):
+    return {
+        "logs": str(tmp_path),
+        "experiment": "recovery",
+        "system": {"name": "double_integrator"},
+        "cost": {"Q": [1, 1], "R": [1], "Q_T": [1, 1]},
+        "initial_states": {"lower": [-1, -1], "upper": [1, 1]},
+        "horizon": {"steps": 8, "dt": 0.1},
+        "program": {"name": "value", "trajectory_cost": 1},
+        "network": {"name": "fcn", "hidden": [8]},
+        "rollout": {"gradient": "discrete", "compile": "off"},
+        "training": {"iterations": 12, "batch_size": 4, "learning_rate": 0.01, "validate_every": 4},
+        "evaluation": {"figures_every": 1000, "optimum": False, "test_states": 4},
+        "loggers": ["csv"],
+    }
+
+
+def run_of(config, capsys, **options):
+    run = train(config, console=Console(), **options)
+    return run, capsys.readouterr().out
+
+
+class Breaks:
+    """Has the n-th losses of training, counted from 1, raise as a divergence does."""
+
+    def __init__(self, monkeypatch, calls):
+        self.count, self.calls, self.original = 0, set(calls), Learner.train_on
+        monkeypatch.setattr(Learner, "train_on", lambda learner, *rest: self.loss(learner, *rest))
+
+    def loss(self, learner, *rest):
+        self.count += 1
+        if self.count in self.calls:
+            raise DivergenceError("Expected a finite loss, got nan.")
+        return self.original(learner, *rest)
+
+
+def rates(run):
+    return [group["lr"] for group in read_checkpoint(run.last)["optimizer_states"][0]["param_groups"]]
+
+
+def test_without_divergence_nothing_goes_back(config, capsys):
+    run, out = run_of(config, capsys)
+    assert "Going back" not in out
+    assert "returns" not in run.record()
+    assert read_checkpoint(run.last)["lyapnet"]["rate_share"] == 1
+
+
+def test_it_goes_on_from_the_last_checkpoint_with_a_smaller_rate(config, capsys, monkeypatch):
+    untroubled, _ = run_of(config, capsys)
+    Breaks(monkeypatch, [7])  # the step after 6, with last.ckpt at 4
+    run, out = run_of(config, capsys)
+    assert "Going back to step 4" in out.replace("\n", " ")
+    assert len(out.split("Going back")) == 2
+    assert read_checkpoint(run.last)["global_step"] == 12
+    (entry,) = run.record()["returns"]
+    assert entry["to"] == 4
+    assert math.isclose(entry["rate_share"], 1 / SLOWER)
+    assert [r / u for r, u in zip(rates(run), rates(untroubled), strict=True)] == pytest.approx([1 / SLOWER])
+    steps = [line.split(",")[0] for line in (run.folder / "metrics.csv").read_text().splitlines()[1:]]
+    assert len(steps) == len(set(steps))
+
+
+def test_before_the_first_checkpoint_it_goes_back_to_its_start(config, capsys, monkeypatch):
+    Breaks(monkeypatch, [3])
+    run, out = run_of(config, capsys)
+    assert "Going back to step 0" in out.replace("\n", " ")
+    assert read_checkpoint(run.last)["global_step"] == 12
+    slower = {**config, "training": {**config["training"], "learning_rate": 0.01 / SLOWER}}
+    slower["training"]["final_learning_rate"] = 1e-4 / SLOWER
+    expected, _ = run_of(slower, capsys)
+    weights, others = (read_checkpoint(r.last)["state_dict"] for r in (run, expected))
+    for name in weights:
+        torch.testing.assert_close(weights[name], others[name])
+
+
+def test_it_gives_up(config, capsys, monkeypatch):
+    Breaks(monkeypatch, range(2, 100))
+    with pytest.raises(DivergenceError, match=f"{RETURNS} returns did not help"):
+        run_of(config, capsys)
+    assert len(capsys.readouterr().out.split("Going back")) == RETURNS + 1
+
+
+def test_a_stiff_law_is_named(config, capsys, monkeypatch):
+    Breaks(monkeypatch, range(2, 100))
+    config["cost"] = {"Q": [1, 1], "R": [1e-5], "Q_T": [1, 1]}
+    config["rollout"] = {**config["rollout"], "policy": "sampled"}
+    with pytest.raises(DivergenceError) as error:
+        run_of(config, capsys)
+    assert "too stiff" not in str(error.value)
+    config["rollout"]["policy"] = "hjb"
+    with pytest.raises(DivergenceError, match=r"too stiff.*rollout\.policy=sampled"):
+        run_of(config, capsys)
+
+
+def test_a_rising_cost_is_a_divergence(config, tmp_path):
+    module, watch, resumed = build_module(config_from_plain(config)), RisingCost(), RisingCost()
+    trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
+
+    def validate(watch, cost):
+        module.members[0].validation = SimpleNamespace(summary=lambda: {"cost_mean": cost})
+        watch.on_validation_end(trainer, module)
+
+    for cost in (3.0, 2.0, 0.99 * 2 * RISE, 2.0):
+        validate(watch, cost)
+    resumed.load_state_dict(watch.state_dict())
+    for each in (watch, resumed):
+        with pytest.raises(DivergenceError, match=f"at most {RISE:g} times the least so far, 2,"):
+            validate(each, 1.01 * 2 * RISE)
+
+
+def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
+    Breaks(monkeypatch, [7])
+    run, _ = run_of(config, capsys)
+    longer = {**config, "training": {**config["training"], "iterations": 16}}
+    again, _ = run_of(longer, capsys, resume="last")
+    assert again.folder == run.folder
+    assert math.isclose(read_checkpoint(run.last)["lyapnet"]["rate_share"], 1 / SLOWER)
+    assert len(read_json(run.folder / "run.json", "")["returns"]) == 1

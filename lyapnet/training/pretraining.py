@@ -82,7 +82,7 @@ def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:
 def _followed(exact: Problem, optimum: Optimum) -> Optimum:
     """Optima of which each has been tried from the states around it."""
     x0 = optimum.path.x[0]
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS if len(x0) > 1 else 0):
         paths = [_along(exact, optimum, column, x0) for column in _nearest(x0, x0, itself=False).unbind(1)]
         best = _cheapest(paths)
         improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()
@@ -99,14 +99,15 @@ def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
 
 def _cheapest(paths: Sequence[Path]) -> Path:
     """Of each state, that of several trajectories which costs least."""
-    best, each = torch.stack([path.cost for path in paths]).argmin(0), torch.arange(len(paths[0].cost))
-    x, u = (torch.stack([getattr(path, name) for path in paths])[best, :, each].movedim(0, 1) for name in ("x", "u"))
-    return Path(x, u, torch.stack([path.cost for path in paths])[best, each])
+    x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
+    best, each = cost.argmin(0), torch.arange(cost.shape[1])
+    return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
 
 
 def _nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:
     """The indices of the nearest other states of each (b, k), each component in units of its spread."""
-    scale = (others.amax(0) - others.amin(0)).clamp_min(torch.finfo(x0.dtype).tiny)
+    spread = others.amax(0) - others.amin(0)
+    scale = spread.where(spread > 0, 1)
     distance = torch.cdist(x0 / scale, others / scale)
     if not itself:
         distance.fill_diagonal_(torch.inf)

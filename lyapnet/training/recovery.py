@@ -47,6 +47,7 @@ class RisingCost(Callback):
         for member in members_of(pl_module):
             assert member.validation is not None
             cost = member.validation.summary()["cost_mean"]
+            assert cost is not None
             least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
             if cost > RISE * least > 0:
                 place = f"Iteration {trainer.global_step}" + (f", {member.label}" if member.label else "")
@@ -57,10 +58,10 @@ class RisingCost(Callback):
 
 
 class Returns:
-    """Trains a plan's module; where that diverges, from its last checkpoint on with a third of the learning rate.
+    """Where a training that diverged goes on: from its last checkpoint, with a third of the learning rate.
 
-    Before the first checkpoint it goes back to the weights that the training began with. Each return is told, and kept
-    in the run's record; after RETURNS of them, or in several processes, the divergence is raised with its cause.
+    Before the first checkpoint that is the weights that it began with. Each return is told, and kept in the run's
+    record; after RETURNS of them, or in several processes, the divergence is raised with its cause.
 
     Args:
         plan: what is trained.
@@ -71,9 +72,7 @@ class Returns:
     def __init__(self, plan: Plan, console: Console, start: Start | None):
         self.plan, self.console, self.start = plan, console, start
         self.weights = copy.deepcopy(plan.module.state_dict())
-        self.found = _written(
-            plan.run.last
-        )  # by an earlier process, perhaps beyond the checkpoint that this one resumes
+        self.found = _written(plan.run.last)  # by an earlier process, perhaps beyond the checkpoint that is resumed
         self.count = 0
 
     def go_back(self, error: DivergenceError, trainer: L.Trainer) -> Plan:
@@ -106,18 +105,17 @@ class Returns:
     def _diagnosis(self) -> str:
         """Why going back has not helped, where that is known."""
         member: Learner = self.plan.module.members[0]
-        tried = (
-            f" {self.count} returns did not help, with {self.plan.module.rate_share:.2g} of the learning rate at last."
-        )
+        if not self.count:  # several processes
+            return ""
+        share = f"{self.plan.module.rate_share:.2g}"
+        tried = f" {self.count} returns did not help, the last with {share} of the learning rate."
         with suppress(RuntimeError):  # of a problem whose linearisation is singular
             stiff = stiffness(in_float64(member.problem))
             if isinstance(member.rollout.closed_loop.policy, HJBPolicy) and stiff.advice:
                 return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
         if self.start is not None and self.start.chosen.finite < 1:
-            share = self.start.chosen.finite
-            return (
-                f"{tried} The start itself is finite on {share:.0%} of X₀: choose a smaller X₀, or a shorter horizon."
-            )
+            known = f"{self.start.chosen.finite:.0%}"
+            return f"{tried} The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."
         return tried
 
 

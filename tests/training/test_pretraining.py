@@ -162,3 +162,12 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     begun.clear()
     monkeypatch.setattr(pretraining, "ROUNDS", 0)
     assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
+
+
+def test_one_state_and_states_that_share_a_coordinate(without_oracle):
+    problem = hanging(steps=20)
+    x0 = problem.initial_states.sample(3)
+    x0[:, 1] = 0.25
+    whole = optima_for(problem, [riccati(problem)], x0)
+    assert whole.path.cost.isfinite().all()
+    assert_close(optima_for(problem, [riccati(problem)], x0[:1]).path.x[0], x0[:1])

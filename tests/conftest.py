@@ -12,12 +12,12 @@ import jaxtyping
 import pytest
 import torch
 
-CHECKED_CALLS = 8  # of each function in each test; with all of them the tests take three times as long
+CHECKED_CALLS = 50  # of each function in each file; with all of them the tests take three times as long
 _calls = Counter()
 
 
 def _checked_at_first(typechecker):
-    """jaxtyping's decorator, in effect for the first calls of a function in each test."""
+    """jaxtyping's decorator, in effect for the first calls of a function in each file of tests."""
 
     def decorate(function):
         if not inspect.isfunction(function):
@@ -67,9 +67,13 @@ def _cache(tmp_path_factory):
     os.environ["LYAPNET_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _checked_anew():
+    _calls.clear()
+
+
 @pytest.fixture(autouse=True)
 def _float64_and_seeded():
-    _calls.clear()
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(0)
 

@@ -64,7 +64,7 @@ def trace(
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
     for node in graph_module.graph.nodes:
-        if name_of(node.target) in UNINITIALISED and not all(name_of(user.target) == "fill" for user in node.users):
+        if name_of(node.target) in UNINITIALISED and not all(_overwrites(user, node) for user in node.users):
             raise UsageError(
                 f"Expected f, g, the cost and V without memory that nothing was written to, got {node.target}; use "
                 "zeros or full."
@@ -72,6 +72,11 @@ def trace(
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
+
+
+def _overwrites(node: Node, memory: Node) -> bool:
+    """Whether nothing of what is in some memory reaches a node's result."""
+    return name_of(node.target) in ("fill", "copy") and node.args[0] is memory and memory not in node.args[1:]
 
 
 class _Watch(TorchFunctionMode):

@@ -311,7 +311,7 @@ class EnsembleModule(TrainingModule):
 
     def save_member(self, member: Learner, path: Path) -> None:
         weights = {f"V.{name}": tensor for name, tensor in member.V.state_dict().items()}
-        kept = {**member.metadata, "version": __version__}
+        kept = {**member.metadata, "version": __version__, "rate_share": self.rate_share}
         write_checkpoint({"state_dict": weights, "global_step": self.global_step, KEY: kept}, path)
 
     def compile_for(self, batch_size: int) -> None:

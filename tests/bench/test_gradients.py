@@ -145,6 +145,7 @@ def test_without_a_compiler_a_notice_and_eager_rows(run, monkeypatch):
     assert [row["compiled"] for row in json.loads(out)] == [False]
 
 
+@pytest.mark.slow
 def test_table_names_every_route_and_batch(run):
     routes = ("adjoint", "adjoint-autograd", "backprop")
     status, out, _ = run(

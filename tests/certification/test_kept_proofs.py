@@ -55,7 +55,7 @@ def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), (violated, 6.0)])
+@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), pytest.param(violated, 6.0, marks=pytest.mark.slow)])
 def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):
     condition, path = condition(P), tmp_path / "proof.pt"
     whole = go_on(condition, None, wanted=wanted)

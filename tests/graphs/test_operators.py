@@ -1,6 +1,8 @@
 """All of torch's operators, with all that they can be told: each is refused by name, or its bounds hold its values."""
 
 import itertools
+import json
+import os
 import zlib
 
 import pytest
@@ -131,13 +133,42 @@ def test_a_part_of_all_operators_is_refused_or_bounded():
     assert taken > 2 * bounded
 
 
+def in_a_child(function, *arguments):
+    """What a function returns in a process of its own; None where that is ended by a signal.
+
+    A few of torch's operators end the process on arguments that they were not made for.
+    """
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            os.write(writer, json.dumps(function(*arguments)).encode())
+            status = 0
+        finally:
+            os._exit(status)
+    os.close(writer)
+    with os.fdopen(reader) as answer:
+        result = answer.read()
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) or status == 0, "an exception of its own"
+    return json.loads(result) if status == 0 else None
+
+
+def test_a_process_that_ends_is_noticed():
+    assert in_a_child(examined, aten.sin.default, 4) == list(examined(aten.sin.default, 4))
+    assert in_a_child(os.abort) is None
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # deprecations in torch's own operators
 def test_each_operator_is_refused_or_bounded():
     every = list(operators())
     assert len(every) > 400
-    counts = {operator: examined(operator) for operator in every}
-    assert not [operator for operator, (_, _, wrong) in counts.items() if wrong]
+    counts = {operator: in_a_child(examined, operator) for operator in every}
+    ended = [operator for operator, count in counts.items() if count is None]
+    assert len(ended) < 10, ended
+    assert not [operator for operator, count in counts.items() if count and count[2]]
     assert sum(bounded > 0 for _, bounded, _ in counts.values()) > 60
 
 

@@ -785,7 +785,7 @@ def test_divergence_is_one_line_and_keeps_the_last_good_checkpoint(validate_ever
     status, _, errors = unstable.train(f"training.validate_every={validate_every}", prepare=without_figures)
     assert status == 1
     assert errors.count("\n") == 1, errors
-    for text in ("Expected a finite", "Iteration", "step", "x0", "last.ckpt"):
+    for text in ("Expected a", "Iteration", "returns did not help", "last.ckpt"):
         assert text in errors
     weights = lyapnet.load(unstable.last).V.state_dict().values()
     assert all(tensor.isfinite().all() for tensor in weights)

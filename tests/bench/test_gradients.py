@@ -117,6 +117,7 @@ def test_memory_of_backprop_grows_with_the_steps_and_exceeds_that_of_discrete():
 
 
 @pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+@pytest.mark.slow
 def test_compiled_rows_come_after_the_eager_ones_unless_compilation_fails(monkeypatch):
     # machine code takes a minute to make: the traces stand in for it
     monkeypatch.setattr("lyapnet.rollout.discrete_adjoint.DiscreteAdjoint.compile", lambda self, x0: None)

@@ -177,6 +177,7 @@ def test_a_small_frontier_gives_up_the_highest_boxes(P):
     assert small.level < kept.level
 
 
+@pytest.mark.slow
 def test_a_set_that_is_too_small_holds_a_lower_funnel(P):
     """V on its boundary bounds ρ + δT."""
     small = Box(torch.tensor([-1.1, -0.8]), torch.tensor([1.1, 0.8]))

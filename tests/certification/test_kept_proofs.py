@@ -259,6 +259,7 @@ def test_resuming_refuses_what_does_not_fit_together(change, P, kept):
         go_on(dipped(P), kept)
 
 
+@pytest.mark.slow
 def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
     path, condition = tmp_path / "proof.pt", violated(P)
     whole = go_on(condition, path, wanted=6.0)
@@ -334,6 +335,7 @@ def test_leaves_cover_their_box_exactly():
 # Threads
 
 
+@pytest.mark.slow
 def test_threads_come_to_the_same_verdict_and_level(P):
     true = dipped(P)
     one, two = (go_on(true, None, workers=workers) for workers in (1, 2))

@@ -92,6 +92,7 @@ def compare(smoke, monkeypatch, capsys):
     return run
 
 
+@pytest.mark.slow
 def test_the_same_command_again_trains_nothing(smoke, compare):
     before = {path: path.stat().st_mtime_ns for path in (smoke[0] / "logs").rglob("result.json")}
     status, out, err = compare(*SOME)

@@ -88,7 +88,9 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
     assert len(list((tmp_path / "checkpoints").iterdir())) <= 2
 
 
-@pytest.mark.parametrize("method", SETTINGS)
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=pytest.mark.slow) if m.endswith("paper") else m for m in SETTINGS]
+)
 def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
     baseline = baseline_of(method, 2400)
     whole = trained(tmp_path / "whole", baseline)

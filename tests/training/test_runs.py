@@ -575,6 +575,7 @@ def test_run_in_progress_is_not_resumed_by_another_process(desk, ask):
     assert (status, errors) == (0, "")
 
 
+@pytest.mark.slow
 def test_of_two_that_resume_at_the_same_time_one_is_refused(finished, tmp_path):
     (tmp_path / "other").mkdir()
     desks = [finished, Desk(tmp_path / "other")]

@@ -30,7 +30,7 @@ STANDARD: dict[str, Any] = {
     "program": {"name": "value", "constraint": 0, "cost_to_go": 10, "trajectory_cost": 1},
     "network": {"name": "expansion"},
     "rollout": {"policy": "sampled", "gradient": "discrete"},
-    "training": {"iterations": 400, "batch_size": 32, "learning_rate": 0.003, "validate_every": 20},
+    "training": {"iterations": 400, "batch_size": 32, "learning_rate": 0.003, "warmup": 40, "validate_every": 20},
     "trainer": {"gradient_clip_val": 3},
 }
 
@@ -154,6 +154,7 @@ class TrainingConfig:
     optimizer: str = option("adam", "adam, or adamw with decoupled weight decay.", choices=("adam", "adamw"))
     learning_rate: float = option(1e-2, "Step size at the start.", above=0)
     final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
+    warmup: int = option(0, "Steps in which the learning rate rises to that of the start, linearly.", at_least=0)
     beta1: float = option(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
     beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
     weight_decay: float = option(0.0, "AdamW weight decay.", at_least=0)

@@ -1,5 +1,6 @@
 """Traced functions as machine code, kept on disk from run to run (torch.export and AOTInductor)."""
 
+import copy
 import hashlib
 import logging
 import os
@@ -91,12 +92,30 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's, about itself
-            program = torch.export.export(module, tuple(arguments))
+            program = torch.export.export(_without_assigned_numbers(module), tuple(arguments))
             package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
         Path(package).chmod(0o600)
         write_atomically(digest, digest_of_file(Path(package)).encode())
         Path(package).replace(path)
     return aoti_load_package(str(path))
+
+
+def _without_assigned_numbers(module: nn.Module) -> nn.Module:
+    """A copy with torch.where for g[2, 0] = 1, which the compiler refuses for a single number."""
+    module, aten = copy.deepcopy(module), torch.ops.aten
+    for graph_module in (each for each in module.modules() if isinstance(each, GraphModule)):
+        graph = graph_module.graph
+        for node in graph.find_nodes(op="call_function", target=aten.select_scatter.default):
+            into, number, _, index = node.args
+            row = into.meta["val"]
+            if row.ndim == 1:
+                with graph.inserting_before(node):
+                    places = graph.call_function(aten.arange.default, (len(row),), {"device": row.device})
+                    chosen = graph.call_function(aten.eq.Scalar, (places, index % len(row)))
+                    node.replace_all_uses_with(graph.call_function(aten.where.self, (chosen, number, into)))
+                graph.erase_node(node)
+        graph_module.recompile()
+    return module
 
 
 def _require_own(path: Path) -> None:

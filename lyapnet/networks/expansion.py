@@ -13,6 +13,7 @@ from lyapnet.networks.base import Scaling
 from lyapnet.networks.fcn import FCN
 from lyapnet.types import PerState, State, Time
 
+FEW = 4  # states for which a narrower network is enough
 NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
 
 
@@ -25,15 +26,16 @@ class ExpansionNetwork(ValueFunction):
 
     Args:
         scaling: of the task, for what starts without an expansion.
-        hidden, activation: of N, an FCN.
+        hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
     """
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
 
-    def __init__(self, scaling: Scaling, hidden: Sequence[int] = (64, 64), activation: str = "tanh"):
+    def __init__(self, scaling: Scaling, hidden: Sequence[int] | None = None, activation: str = "tanh"):
         super().__init__()
         n = self.n = len(scaling.state)
+        hidden = [64 if n <= FEW else 128] * 2 if hidden is None else hidden
         self.network = FCN(Scaling([1.0] * n, scaling.duration, 1.0), hidden, activation)
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)

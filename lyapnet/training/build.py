@@ -62,7 +62,7 @@ def build_learner(config: Config, problem: Problem, parts: Parts | None = None, 
 def _optimizer_options(training: TrainingConfig) -> OptimizerOptions:
     return OptimizerOptions(
         training.optimizer, training.learning_rate, training.final_learning_rate, (training.beta1, training.beta2),
-        training.weight_decay, training.iterations,
+        training.weight_decay, training.warmup, training.iterations,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
@@ -16,7 +17,7 @@ from lyapnet.training.runs import Run
 
 
 class Checkpoints(Checkpoint):
-    """last.ckpt after every validation, best.ckpt where loss/val is least, and last.ckpt on Ctrl-C and SIGTERM.
+    """last.ckpt after every validation, best.ckpt where its loss is least, and last.ckpt on Ctrl-C and SIGTERM.
 
     What was logged is written first, so that it is never behind the checkpoint. (Lightning's ModelCheckpoint writes
     its last checkpoint only together with a best one, remembers absolute paths, and its position within an interval.)
@@ -48,6 +49,8 @@ class Checkpoints(Checkpoint):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._install_handlers()  # again: Lightning sets one for SIGTERM in between
+        if trainer.global_step == 0:  # what training starts from may stay the best
+            self._save_best(trainer, pl_module)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._begun = True
@@ -76,7 +79,7 @@ class Checkpoints(Checkpoint):
     def _save_best(self, trainer: Trainer, module: Any) -> None:
         _flush(trainer)
         for member in module.members:
-            loss = float(trainer.callback_metrics[labelled("loss/val", member.label)])
+            loss = float(trainer.strategy.reduce(torch.tensor(member.validation_loss), reduce_op="mean"))
             if loss < self.best_loss[member.label]:
                 self.best_loss[member.label] = loss
                 module.save_member(member, self.best[member.label])

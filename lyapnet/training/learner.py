@@ -47,6 +47,7 @@ class Learner(nn.Module):
         self.gradient_norm = self.steps_per_second = math.nan
         self.output: ProgramOutput | None = None
         self.validation: StateTable | None = None
+        self.validation_loss = math.nan
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
 
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
@@ -63,9 +64,11 @@ class Learner(nn.Module):
         return output.loss
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
-        """The loss of the validation states and points; the states' table is kept in `validation`."""
+        """The loss of the validation states and points, kept in `validation_loss`, and their table in `validation`."""
         self.validation = measure(self.problem, self.program, trajectory, self.validation_optimum)
-        return self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+        loss = self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+        self.validation_loss = float(loss)
+        return loss
 
     def _with_pointwise(self, output: ProgramOutput, trajectory: Trajectory, draw: Sequence[int]) -> ProgramOutput:
         """The program with its condition off the closed loops, where that has a weight."""

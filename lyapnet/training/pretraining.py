@@ -20,8 +20,9 @@ from lyapnet.expansions import (
     optimal_trajectories,
     path_under,
 )
+from lyapnet.linear_algebra import apply
 from lyapnet.problem import Problem
-from lyapnet.types import PerState, State
+from lyapnet.types import PerState, State, StatePath
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
@@ -31,7 +32,7 @@ VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative 
 
 
 class Examples(NamedTuple):
-    """What is known along optimal trajectories, a row for each of their nodes but the last."""
+    """What is known along optimal trajectories and near them."""
 
     t: Tensor  # t_n (k,)
     x: State
@@ -138,22 +139,46 @@ def _affordable(problem: Problem) -> int:
     return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * (n + m) ** 2)))
 
 
-def examples_of(problem: Problem, optimum: Optimum) -> Examples:
-    """The examples of those trajectories that are finite, in float64."""
+def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) -> Examples:
+    """The examples of those trajectories that are finite, in float64: a row at each node, and one at a state near it.
+
+    The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
+    V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
+    """
     problem, finite = in_float64(problem), optimum.path.cost.isfinite()
-    (x, value, gradient, hessian), dt = (part[:, finite] for part in optimum.expansion), problem.horizon.dt
-    now, H = x[:-1], hessian[1:]
-    drifted = now + dt * problem.system.f(now)
-    g = problem.system.g(now)
-    values, vectors = torch.linalg.eigh(2 * problem.cost.R(now) + dt * g.mT @ H @ g)
-    floor = 2 * FLOOR * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1]
-    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
-    target = gradient[1:] + (H @ (drifted - x[1:])[..., None])[..., 0]
-    t = problem.horizon.times(now)[:, None].expand(value.shape)
-    flat = [y.flatten(0, 1).detach() for y in (t[:-1], now, value[:-1], t[1:], drifted, target, weight)]
-    t, now, value, after, drifted, target, weight = flat
+    expansion = Expansion(*(part[:, finite] for part in optimum.expansion))
+    deviations = torch.zeros_like(expansion.x[:-1]), _towards_neighbours(expansion.x, generator)
+    parts = zip(*(_examples_at(problem, expansion, each) for each in deviations), strict=True)
     mean_cost = float(optimum.path.cost[finite].mean())
-    return Examples(t, now, value, after, drifted, target, weight, mean_cost, problem.horizon.duration)
+    return Examples(*(torch.cat(columns) for columns in parts), mean_cost, problem.horizon.duration)  # pyright: ignore
+
+
+def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
+    """A deviation (N, b, n) at each node but the last: the difference from a neighbour, then or before, times ±½."""
+    nodes, b = len(x) - 1, x.shape[1]
+    if b == 1:
+        return torch.zeros_like(x[:-1])
+    every, node = torch.arange(b), torch.arange(nodes)[:, None]
+    near = _nearest(x[0], x[0], itself=False)
+    neighbour = near[every, torch.randint(near.shape[1], (nodes, b), generator=generator)]
+    before = (node * torch.rand(nodes, b, generator=generator)).long()
+    share = torch.rand(nodes, b, 1, generator=generator, dtype=x.dtype) - 0.5
+    return share * (x[before, neighbour] - x[before, every])
+
+
+def _examples_at(problem: Problem, expansion: Expansion, deviation: Tensor) -> list[Tensor]:
+    """The columns of the examples at the nodes of some expansions, each a deviation away from them."""
+    (x, value, gradient, hessian), dt = expansion, problem.horizon.dt
+    now, H = x[:-1] + deviation, hessian[1:]
+    here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
+    drifted = now + dt * problem.system.f(now)
+    g, R = problem.system.g(now), problem.cost.R(now)
+    values, vectors = torch.linalg.eigh(2 * R + dt * g.mT @ H @ g)
+    floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
+    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
+    target = gradient[1:] + apply(H, drifted - x[1:])
+    t = problem.horizon.times(now)[:, None].expand(value.shape)
+    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], drifted, target, weight)]
 
 
 def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:

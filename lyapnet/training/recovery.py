@@ -43,6 +43,10 @@ class RisingCost(Callback):
     def load_state_dict(self, state_dict: Mapping[str, float]) -> None:
         self.least = dict(state_dict)
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.global_step == 0:
+            self.on_validation_end(trainer, pl_module)  # of what training starts from
+
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for member in members_of(pl_module):
             assert member.validation is not None

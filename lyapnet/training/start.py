@@ -101,7 +101,7 @@ def _fitted(
     now = _costs(learners[0], states[: len(best)]).to(best)
     if not found or bool((now <= (1 + CLOSE) * best).all()):
         return []
-    examples = examples_of(problem, optimum)
+    examples = examples_of(problem, optimum, stream(0, START, 4))
     for learner in learners:
         fit(learner.V, examples, stream(learner.seed, START, 3))
     fitted = _tried(f"{found} optima from states of X₀", learners[0], x0)

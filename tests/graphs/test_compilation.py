@@ -69,10 +69,17 @@ def test_a_scan_as_machine_code_computes_the_same(cache):
     assert "only you can write" in found["folder"]
 
 
+def assigned(w):
+    """As in g of many systems: one number written into zeros."""
+    numbers = torch.zeros_like(w)
+    numbers[-1] = 0.25
+    return numbers
+
+
 def measure_scan():
     """What the test above needs to know."""
     w, t, dt, x = (torch.tensor(y).double() for y in ([1.5, 0.5], [0.0, 1.0, 2.0], [1.0] * 3, [1.0] * 2))
-    prepare = trace(lambda w: (2 * w,), (w,))
+    prepare = trace(lambda w: (2 * w + assigned(w),), (w,))
     step = trace(lambda w, t, dt, x, shared: (torch.sin(shared * x) + t * dt, 2 * x, w + x), (w, t[0], dt[0], x, w))
     scan, arguments = compilation.Scan(prepare, step, 1), [w, t, dt, x]
     before = compilation.is_on_disk(scan, arguments)

@@ -165,10 +165,10 @@ def test_a_process_that_ends_is_noticed():
 def test_each_operator_is_refused_or_bounded():
     every = list(operators())
     assert len(every) > 400
-    counts = {operator: in_a_child(examined, operator) for operator in every}
-    ended = [operator for operator, count in counts.items() if count is None]
-    assert len(ended) < 10, ended
-    assert not [operator for operator, count in counts.items() if count and count[2]]
+    examined_ones = {operator: in_a_child(examined, operator) for operator in every}
+    counts = {operator: count for operator, count in examined_ones.items() if count is not None}
+    assert len(every) - len(counts) < 10, sorted(map(str, set(every) - set(counts)))
+    assert not [operator for operator, (_, _, wrong) in counts.items() if wrong]
     assert sum(bounded > 0 for _, bounded, _ in counts.values()) > 60
 
 

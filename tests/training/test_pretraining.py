@@ -17,6 +17,8 @@ from lyapnet.training.pretraining import errors, examples_of, fit, optima_for
 from tests.problems import Formula, problem_of
 from tests.test_expansions import hanging
 
+GENERATOR = torch.Generator().manual_seed(0)
+
 
 @pytest.fixture
 def problem():
@@ -36,8 +38,11 @@ def shifted(problem, by):
 
 def test_examples_are_the_value_function_of_a_linear_problem(problem):
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
-    examples = examples_of(problem, optimum)
-    assert len(examples.t) == 6 * problem.horizon.steps
+    examples = examples_of(problem, optimum, GENERATOR)
+    along, near = examples.x.reshape(2, problem.horizon.steps, 6, problem.system.n)
+    assert torch.equal(along, optimum.path.x[:-1])
+    apart = (along[:, :, None] - along[:, None]).abs().max()
+    assert 0.1 * apart < (near - along).abs().max() <= apart / 2
     value_error, excess = errors(shifted(problem, 0.0), examples)
     assert float(value_error.detach()) < 1e-20
     assert float(excess.detach()) < 1e-20
@@ -49,7 +54,9 @@ def test_the_excess_is_what_wrong_controls_cost(problem):
     policy, times = SampledPolicy(problem, V), problem.horizon.times(torch.zeros(()))
     path = path_under(problem, lambda n, x: policy(times[n], x).detach(), x0)
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 1, 1))
-    along = examples_of(problem, optimum._replace(path=optimum.path._replace(x=path.x), expansion=at(path.x, problem)))
+    along = examples_of(
+        problem, optimum._replace(path=optimum.path._replace(x=path.x), expansion=at(path.x, problem)), GENERATOR
+    )
     _, excess = errors(V, along)
     expected = float(path.cost - optimum.path.cost)
     assert expected > 0.01
@@ -70,7 +77,7 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(monkeypatch):
     problem = hanging(steps=40)
     expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
     seen, unseen = (
-        examples_of(problem, optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)))
+        examples_of(problem, optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)), GENERATOR)
         for _ in range(2)
     )
     V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, seen.mean_cost), (32, 32))
@@ -86,8 +93,8 @@ def test_only_finite_trajectories_are_examples(problem):
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
     broken = optimum.path.cost.clone()
     broken[1] = torch.inf
-    examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)))
-    assert len(examples.t) == 2 * problem.horizon.steps
+    examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)), GENERATOR)
+    assert len(examples.t) == 2 * 2 * problem.horizon.steps
     assert_close(examples.mean_cost, float(optimum.path.cost[[0, 2]].mean()))
 
 

@@ -1,5 +1,6 @@
 """The start of a training: chosen by trying, of all that is known before the first step."""
 
+import dataclasses
 import json
 import math
 
@@ -8,10 +9,12 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet import load, train
+from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.training.build import build_module
+from lyapnet.training.modules import OptimizerOptions
 from lyapnet.training.start import CALM, choose_start
 
 LINEAR = {
@@ -49,6 +52,24 @@ def test_a_linear_task_is_solved_before_the_first_step():
     exact = discrete_riccati(problem.system, problem.cost, problem.horizon)
     assert_close(learner.rollout(x).cost, exact.value(0, x), rtol=1e-5, atol=0)
     assert_close(learner.V(torch.zeros(()), x), exact.value(0, x), rtol=1e-9, atol=0)
+
+
+def test_what_training_starts_from_stays_the_best_where_nothing_is_better(tmp_path):
+    run = train(
+        {**LINEAR, "logs": str(tmp_path)},
+        ["training.iterations=4", "training.validate_every=2", "evaluation.figures_every=100", "rollout.compile=off"],
+    )
+    assert read_checkpoint(run.best)["global_step"] == 0
+    assert read_checkpoint(run.last)["global_step"] == 4
+    assert run.evaluation["cost_ratio"] == pytest.approx(1, abs=1e-4)
+
+
+def test_the_learning_rate_rises_before_it_falls():
+    options = OptimizerOptions(learning_rate=0.1, final_learning_rate=0.01, warmup=4)
+    without = dataclasses.replace(options, warmup=0)
+    shares = [options.rate(step, 20) / without.rate(step, 20) for step in range(21)]
+    assert shares == pytest.approx([0.2, 0.4, 0.6, 0.8] + 17 * [1.0])
+    assert config_from_plain(LINEAR).training.warmup > 0
 
 
 def test_far_from_the_goal_optima_are_the_best_start():

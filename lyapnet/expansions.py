@@ -12,13 +12,13 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 "Control-limited differential dynamic programming", ICRA 2014.
 """
 
-import copy
 from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lyapnet.contracts import copied
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
@@ -143,7 +143,7 @@ def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
 
 def in_float64(problem: Problem) -> Problem:
     """A copy of a problem for what is computed before training: on the CPU, without gradients of its parameters."""
-    return copy.deepcopy(problem).double().cpu().requires_grad_(False)
+    return copied(problem).requires_grad_(False)
 
 
 def _step(problem: Problem, x: State, u: Tensor) -> tuple[State, PerState]:

@@ -2,13 +2,17 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
 from lyapnet.errors import UsageError
+
+if TYPE_CHECKING:
+    from lyapnet.controller import Controller
+    from lyapnet.evaluation.measurement import Evaluation
 
 
 def evaluate(
@@ -65,16 +69,21 @@ def evaluate(
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
-        notes.print(_write_optimality(figures, measured), soft_wrap=True)
+        notes.print(_write_figures(figures, controller, measured), soft_wrap=True)
 
 
-def _write_optimality(folder: Path, measured: Any) -> str:
-    """Draw cost and V(0, x₀) against the optimum; what there is to say about it."""
+def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation") -> str:
+    """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
 
-    if measured.result()["cost_ratio"] is None:
-        return "No figure optimality.png: there is no optimum to draw against."
+    drawn = {
+        "trajectories": figures.trajectories(controller.rollout(measured.table.x0[:12]), controller.system),
+        "value_slices": figures.value_slices(controller.value, controller.problem),
+    }
+    if measured.result()["cost_ratio"] is not None:
+        drawn["optimality"] = figures.optimality(measured.table)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "optimality.png"
-    figures.optimality(measured.table).savefig(path, dpi=150)
-    return f"wrote {path}"
+    for name, figure in drawn.items():
+        figure.savefig(folder / f"{name}.png", dpi=150)
+    missing = "" if "optimality" in drawn else "; no optimality.png, for want of an optimum to draw against"
+    return f"wrote {', '.join(f'{name}.png' for name in drawn)} into {folder}{missing}"

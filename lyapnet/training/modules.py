@@ -112,10 +112,11 @@ class TrainingModule(L.LightningModule):
             try:
                 results.append(evaluate(member, next(trajectories)))
             except DivergenceError as error:
-                raise DivergenceError(f"{self._place(member.label)}: {error}") from error
+                raise DivergenceError(f"{self.place(member.label)}: {error}") from error
         return results
 
-    def _place(self, label: str) -> str:
+    def place(self, label: str) -> str:
+        """Where a member's training is, for messages."""
         return f"Iteration {self.global_step}" + (f", {label.replace('_', ' ')}" if label else "")
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
@@ -126,7 +127,7 @@ class TrainingModule(L.LightningModule):
             if self.members[0].rollout.method not in ADAPTIVE_METHODS:
                 raise
             raise DivergenceError(
-                f"{self._place('')}: Expected the adjoint to reach t = 0, got {error}; lower "
+                f"{self.place('')}: Expected the adjoint to reach t = 0, got {error}; lower "
                 "training.learning_rate, or take rollout.gradient=backprop."
             ) from error
 
@@ -137,7 +138,7 @@ class TrainingModule(L.LightningModule):
             member.gradient_norm = float(torch.stack(norms).norm())
             if not math.isfinite(member.gradient_norm):
                 raise DivergenceError(
-                    f"{self._place(member.label)}: Expected a finite gradient, got norm {member.gradient_norm}; lower "
+                    f"{self.place(member.label)}: Expected a finite gradient, got norm {member.gradient_norm}; lower "
                     "training.learning_rate or set trainer.gradient_clip_val."
                 )
 

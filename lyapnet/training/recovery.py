@@ -54,10 +54,10 @@ class RisingCost(Callback):
             assert cost is not None
             least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
             if cost > RISE * least > 0:
-                place = f"Iteration {trainer.global_step}" + (f", {member.label}" if member.label else "")
+                module: Any = pl_module
                 raise DivergenceError(
-                    f"{place}: Expected a cost on the validation states of at most {RISE:g} times the least so far, "
-                    f"{least:.4g}, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
+                    f"{module.place(member.label)}: Expected a cost on the validation states of at most {RISE:g} times "
+                    f"the least so far, {least:.4g}, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
                 )
 
 
@@ -96,7 +96,7 @@ class Returns:
         module.rate_share /= SLOWER
         self.count += 1
         entry = {"to": plan.step, "rate_share": module.rate_share, "because": str(error)}
-        plan.run.note(returns=[*plan.run.record().get("returns", []), entry])
+        plan.run.note(returns=[*plan.run.record()["returns"], entry])
         self.console.print(
             f"{error} Going back to step {plan.step}, with {module.rate_share:.2g} of the scheduled learning rate "
             f"(return {self.count} of at most {RETURNS}).",
@@ -113,10 +113,11 @@ class Returns:
             return ""
         share = f"{self.plan.module.rate_share:.2g}"
         tried = f" {self.count} returns did not help, the last with {share} of the learning rate."
-        with suppress(RuntimeError):  # of a problem whose linearisation is singular
-            stiff = stiffness(in_float64(member.problem))
-            if isinstance(member.rollout.closed_loop.policy, HJBPolicy) and stiff.advice:
-                return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
+        if isinstance(member.rollout.closed_loop.policy, HJBPolicy):
+            with suppress(RuntimeError):  # of a problem whose linearisation is singular
+                stiff = stiffness(in_float64(member.problem))
+                if stiff.advice:
+                    return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
         if self.start is not None and self.start.chosen.finite < 1:
             known = f"{self.start.chosen.finite:.0%}"
             return f"{tried} The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."

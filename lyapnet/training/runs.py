@@ -19,7 +19,7 @@ CONFIG = "config.yaml"
 EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
 RECORDED = {  # what is read of run.json: its types, and what version 0.1 leaves out
     "finetuned_from": (str | None, ...), "compiled": (bool, False), "saved": (bool | None, None),
-    "training_seconds": (float | int, 0.0), "peak_bytes": (int, 0),
+    "training_seconds": (float | int, 0.0), "peak_bytes": (int, 0), "returns": (list, []),
 }  # fmt: skip
 REPAIR = "restore it, or start a new run with --finetune"
 

@@ -82,7 +82,8 @@ def test_evaluation_reports_the_optimum_of_a_nonlinear_task(run, capsys, tmp_pat
     rows = list(csv.DictReader((tmp_path / "states.csv").read_text(encoding="utf-8").splitlines()))
     assert [float(row["optimal_cost"]) for row in rows] == pytest.approx(optimal.tolist())
     assert [float(row["elbow angle (rad)"]) for row in rows] == pytest.approx(measured.table.x0[:, 1].tolist())
-    assert (tmp_path / "figures" / "optimality.png").stat().st_size > 10_000
+    for name in ("optimality", "trajectories", "value_slices"):
+        assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
 
 
 def test_failed_optima_are_left_out_and_counted(run, capsys, monkeypatch, tmp_path):
@@ -106,8 +107,10 @@ def test_failed_optima_are_left_out_and_counted(run, capsys, monkeypatch, tmp_pa
 
 
 @pytest.mark.usefixtures("without_casadi")
-def test_without_casadi_the_rest_is_reported(run, capsys):
-    assert json.loads(evaluated(run, capsys, "--json"))["optimal_cost_mean"] is None
+def test_without_casadi_the_rest_is_reported(run, capsys, tmp_path):
+    result = evaluated(run, capsys, "--json", "--figures", str(tmp_path))
+    assert json.loads(result)["optimal_cost_mean"] is None
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"trajectories", "value_slices"}
     printed = " ".join(evaluated(run, capsys).split())
     assert "pip install 'lyapnet[oracle]'" in printed
     assert "cost J, mean" in printed

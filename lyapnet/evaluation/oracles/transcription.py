@@ -3,7 +3,6 @@
 Ground truth for tests and tables, never used in training. The model is the torch system itself, read by `symbolic`.
 """
 
-import copy
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -12,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lyapnet.contracts import copied
 from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
@@ -43,7 +43,7 @@ class Transcription(Oracle):
     """
 
     def __init__(self, problem: Problem, iterations: int = 500):
-        self.problem = copy.deepcopy(problem).double().cpu()
+        self.problem = copied(problem)
         system, horizon = self.problem.system, self.problem.horizon
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         graphs = traced(self.step, (x, u)), traced(self.end, (x,))

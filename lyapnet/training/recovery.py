@@ -57,7 +57,8 @@ class RisingCost(Callback):
                 module: Any = pl_module
                 raise DivergenceError(
                     f"{module.place(member.label)}: Expected a cost on the validation states of at most {RISE:g} times "
-                    f"the least so far, {least:.4g}, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
+                    f"the least so far, {least:.4g}, got {cost:.4g}; lower training.learning_rate or set "
+                    "trainer.gradient_clip_val."
                 )
 
 

@@ -19,6 +19,7 @@ from lyapnet.sets import Box, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem
 
 CONF = Path(__file__).parents[1] / "conf"
+KINDS = ("double_integrator", "cartpole", "reacher", "satellite")  # systems, one of each kind of f, g and R
 
 
 def problem_of(

@@ -147,7 +147,7 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
     t = numpy_of(trajectory.t)
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
-    columns = 1 if len(curves) < 4 else 2 if len(curves) < 12 else 3
+    columns = 1 if len(curves) < 4 else 2 if len(curves) < 8 else 3
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)

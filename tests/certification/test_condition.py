@@ -60,7 +60,7 @@ DISHONEST = {  # V, and the axis along which its gradient is wrong first
 
 def claim(V):
     return sound_claim(
-        hjb_loop(loop(P).system, loop(P).cost, V), problem(), 0.9, 0.5, budget=Budget(10, boxes=2000),
+        hjb_loop(loop(P).system, loop(P).cost, V), problem(), 0.9, 0.5, budget=Budget(60, boxes=2000),
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip
 

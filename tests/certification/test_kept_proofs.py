@@ -82,11 +82,11 @@ OTHERS = {  # proofs of something else
 }
 
 
-@pytest.mark.parametrize("other", OTHERS)
-def test_the_proof_of_something_else_is_refused(other, P, kept):
+def test_the_proof_of_something_else_is_refused(P, kept):
     before = kept.read_bytes()
-    with pytest.raises(UsageError, match=r"got another; take a new file\.$"):
-        OTHERS[other](P, kept)
+    for other in OTHERS.values():
+        with pytest.raises(UsageError, match=r"got another; take a new file\.$"):
+            other(P, kept)
     assert kept.read_bytes() == before
     assert go_on(dipped(P), kept).verdict == "certified"
 

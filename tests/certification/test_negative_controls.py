@@ -106,7 +106,7 @@ def test_what_nothing_is_planted_in_is_certified():
 
 
 def test_planted_violations_are_never_certified():
-    assert "certified" not in controls(range(5))
+    assert "certified" not in controls(range(3))
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_what_cannot_be_certified_is_refused_in_one_line(V, options, message):
 
 
 def test_kinks_are_certified():
-    found = claim(loop(Bent()), 0.5, 0.05, budget=Budget(20, boxes=20_000))
+    found = claim(loop(Bent()), 0.5, 0.05, budget=Budget(120, boxes=20_000))
     assert found.verdict == "certified"
 
 
@@ -194,5 +194,5 @@ def test_a_law_with_branches_is_certified_off_the_goal():
     """At the goal itself the gain of Sontag's law is 0/0, and has no bound."""
     condition = DecreaseCondition(loop(Bowl(), law=SontagPolicy), 0.5, 0.05)
     off = torch.tensor([0.0, 0.2, -0.5]).double(), torch.tensor([DURATION, 0.8, 0.5]).double()
-    assert prove(condition, off, budget=Budget(20, boxes=20_000)).verdict == "certified"
+    assert prove(condition, off, budget=Budget(120, boxes=20_000)).verdict == "certified"
     assert proof_of(condition, 0).verdict == "unknown"

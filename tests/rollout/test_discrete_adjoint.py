@@ -23,7 +23,7 @@ from lyapnet.programs import LyapunovProgram, ValueProgram
 from lyapnet.rollout import FIXED_STEP_METHODS, Rollout, discrete_adjoint
 from lyapnet.rollout.runge_kutta import Linearise
 from lyapnet.systems import SYSTEMS, ControlAffineSystem
-from tests.problems import problem_of, with_expansion
+from tests.problems import KINDS, problem_of, with_expansion
 
 EXACT = 1e-10  # relative, of what differs by rounding alone
 HORIZON = Horizon(6, 0.05)
@@ -73,7 +73,14 @@ def is_exact(rollouts, x0, of=weighted):
 # Every output, system, method, program, control law and network
 
 
-@pytest.mark.parametrize(("method", "traced"), [*((method, False) for method in FIXED_STEP_METHODS), ("euler", True)])
+@pytest.mark.parametrize(
+    ("system", "method", "traced"),
+    [
+        *((system, "euler", traced) for system in SYSTEMS for traced in (False, True)),
+        *((system, method, False) for system in KINDS for method in FIXED_STEP_METHODS if method != "euler"),
+    ],
+    indirect=["system"],
+)
 def test_gradient_of_every_output_is_that_of_backpropagation(system, cost, policy, x0, method):
     discrete, backprop = routes(system, cost, policy, method)
     expected = slopes(backprop, x0)

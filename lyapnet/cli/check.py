@@ -31,8 +31,8 @@ def check(
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
     learner = build_learner(resolved, build_problem(resolved, parts), parts)
-    with Console(stderr=True).status("trying what is known of V …"):
-        facts = facts_of(learner)
+    with Console(stderr=True).status("start …") as status:
+        facts = facts_of(learner, lambda stage: status.update(f"start: {stage} …"))
     console = Console(highlight=False, markup=False)
     if as_json:
         rows = [{"fact": fact.name, "found": fact.found, "advice": fact.advice or None} for fact in facts]

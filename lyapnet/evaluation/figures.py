@@ -147,7 +147,7 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
     t = numpy_of(trajectory.t)
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
-    columns = 1 if len(curves) < 4 else 2 if len(curves) < 8 else 3
+    columns = _columns(len(curves) + 1)
     rows = -(-(len(curves) + 1) // columns)
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
@@ -174,6 +174,11 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
         lowest.set_xlabel("time (s)", fontsize=8)
         lowest.tick_params(labelbottom=True)
     return figure
+
+
+def _columns(panels: int) -> int:
+    """One for a few panels; else two or three, of which fewer places stay empty, three for many panels."""
+    return 1 if panels < 5 else min((2, 3), key=lambda columns: (-panels % columns, abs(columns - panels / 4)))
 
 
 def value_slices(V: Value, problem: Problem) -> Figure:

@@ -19,6 +19,7 @@ from lyapnet.types import InputMatrix, State
 
 ATTITUDE = ("roll", "pitch", "yaw")
 RATES = ("roll rate", "pitch rate", "yaw rate")
+UPWARD = (0.0, 0.0, 1.0)
 
 
 def to_body_frame(attitude: Tensor) -> Tensor:
@@ -127,17 +128,15 @@ class BodyFrameQuadrotor(ControlAffineSystem):
     def f(self, x: State) -> State:
         v, attitude, w = x[..., 3:6], x[..., 6:9], x[..., 9:]
         R = to_body_frame(attitude)
-        upward = torch.zeros_like(v)
-        upward[..., 2] = 1
-        falling = self.gravity * (upward - R[..., 2]) - cross(w, v)
+        falling = self.gravity * (torch.tensor(UPWARD).to(v) - R[..., 2]) - cross(w, v)
         turning = -cross(w, self.inertia * w) / self.inertia
         return torch.cat([(R * v[..., None]).sum(-2), falling, attitude_rates(attitude, w), turning], -1)
 
     def g(self, x: State) -> InputMatrix:
-        g = torch.zeros(12, 4, dtype=x.dtype, device=x.device)
-        g[5, 0] = 1 / self.mass
-        g[9:, 1:] = torch.diag(1 / self.inertia)
-        return g.expand(*x.shape[:-1], 12, 4)
+        pushing = torch.tensor([[0.0]] * 5 + [[1 / self.mass]] + [[0.0]] * 6).to(x)
+        turning = torch.diag(1 / self.inertia).to(x)
+        turning = torch.cat([torch.zeros_like(turning)] * 3 + [turning])
+        return torch.cat([pushing, turning], 1).expand(*x.shape[:-1], 12, 4)
 
 
 class Quadrotor(ControlAffineSystem):
@@ -170,9 +169,7 @@ class Quadrotor(ControlAffineSystem):
 
     def f(self, x: State) -> State:
         direction = self._direction(x)
-        upward = torch.zeros_like(direction)
-        upward[..., 2] = 1
-        falling = self.gravity * (self.carried * direction - upward)
+        falling = self.gravity * (self.carried * direction - torch.tensor(UPWARD).to(x))
         return torch.cat([x[..., 6:], falling, torch.zeros_like(falling)], -1)
 
     def g(self, x: State) -> InputMatrix:

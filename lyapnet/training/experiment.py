@@ -26,7 +26,7 @@ from lyapnet.training.loggers import log_result, take_back_after
 from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.start import Start, choose_start
+from lyapnet.training.start import Start, choose_start, silent
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -128,8 +128,9 @@ def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None
 
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
-    with console.status("start: trying what is known of V …") if told else nullcontext():
-        start = choose_start(list(plan.module.members))
+    with console.status("start …") if told else nullcontext() as status:
+        report = silent if status is None else lambda stage: status.update(f"start: {stage} …")
+        start = choose_start(list(plan.module.members), report)
     if told and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)

@@ -10,7 +10,7 @@ from lyapnet.policy import SampledPolicy
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
-from lyapnet.training.start import CALM, choose_start
+from lyapnet.training.start import CALM, Report, choose_start, silent
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 
@@ -23,12 +23,12 @@ class Fact(NamedTuple):
     advice: str = ""
 
 
-def facts_of(learner: Learner) -> list[Fact]:
-    """The facts of a learner's problem; its V is left at the best start."""
+def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
+    """The facts of a learner's problem; its V is left at the best start. `report` is told what is being done."""
     problem = learner.problem
     exact = in_float64(problem)
     facts = [_task(exact), _goal(exact), *_linearisation(exact), stiffness(exact, learner.rollout)]
-    start = choose_start([learner])
+    start = choose_start([learner], report)
     if start is None:
         return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
     for candidate in start.candidates:

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -30,6 +30,12 @@ GUESSES = 6  # random controls from which the optimum from the centre of X₀ is
 CLOSE = 1e-5  # relative excess over optima that leaves nothing to fit
 CALM = "V = 0"
 
+Report = Callable[[str], None]
+
+
+def silent(stage: str) -> None:
+    """Tell nobody."""
+
 
 class Candidate(NamedTuple):
     """A start that was tried."""
@@ -56,11 +62,14 @@ class Start(NamedTuple):
         }
 
 
-def choose_start(learners: Sequence[Learner]) -> Start | None:
+def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start | None:
     """Put the best of what is known into the networks of learners of one problem; None where there is no place.
 
     Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws: V = 0, each
     expansion, and the best expansion with its network fitted to optima from further states of X₀.
+
+    Args:
+        report: told what is being done.
     """
     networks = [_network_of(learner.V) for learner in learners]
     if any(network is None for network in networks):
@@ -68,6 +77,7 @@ def choose_start(learners: Sequence[Learner]) -> Start | None:
     problem, kept = learners[0].problem, _kept(learners[0].V)
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
+    report("the optimum from the centre of X₀")
     tried, expansions = [_tried(CALM, learners[0], x0)], dict(expansions_of(problem))
     for name, expansion in expansions.items():
         take(networks[0], problem, expansion, kept, x0)
@@ -77,7 +87,7 @@ def choose_start(learners: Sequence[Learner]) -> Start | None:
         base = _best(tried[1:])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
-        tried += _fitted(learners, list(expansions.values()), base, x0)
+        tried += _fitted(learners, list(expansions.values()), base, x0, report)
     chosen = _best(tried)
     if chosen.name == CALM:
         for network, state in zip(networks, calm, strict=True):
@@ -88,7 +98,7 @@ def choose_start(learners: Sequence[Learner]) -> Start | None:
 
 
 def _fitted(
-    learners: Sequence[Learner], expansions: Sequence[Expansion], base: Candidate, x0: State
+    learners: Sequence[Learner], expansions: Sequence[Expansion], base: Candidate, x0: State, report: Report
 ) -> list[Candidate]:
     """The candidate whose networks are fitted to optima; none where the base is as good as these, or there are none.
 
@@ -96,12 +106,14 @@ def _fitted(
     """
     problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
+    report(f"optima from {OPTIMA} states of X₀")
     optimum = optima_for(problem, expansions, states)
     best, found = optimum.path.cost, int(optimum.path.cost.isfinite().sum())
     now = _costs(learners[0], states[: len(best)]).to(best)
     if not found or bool((now <= (1 + CLOSE) * best).all()):
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
+    report(f"fitting V to {found} optima")
     for learner in learners:
         fit(learner.V, examples, stream(learner.seed, START, 3))
     fitted = _tried(f"{found} optima from states of X₀", learners[0], x0)

@@ -38,9 +38,9 @@ def _few_optima(monkeypatch):
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", 200)
 
 
-def started(content, *overrides):
+def started(content, *overrides, **options):
     module = build_module(config_from_plain(content, overrides))
-    return module.members, choose_start(list(module.members))
+    return module.members, choose_start(list(module.members), **options)
 
 
 def test_a_linear_task_is_solved_before_the_first_step():
@@ -73,7 +73,9 @@ def test_the_learning_rate_rises_before_it_falls():
 
 
 def test_far_from_the_goal_optima_are_the_best_start():
-    (learner,), start = started(SWING)
+    told = []
+    (learner,), start = started(SWING, report=told.append)
+    assert told == ["the optimum from the centre of X₀", "optima from 12 states of X₀", "fitting V to 12 optima"]
     assert "optim" in start.chosen.name
     costs = {candidate.name: candidate.cost for candidate in start.candidates}
     assert {"the optimum from the centre of X₀", "12 optima from states of X₀"} < costs.keys()

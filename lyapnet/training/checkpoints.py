@@ -12,6 +12,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from lyapnet.errors import Interrupted
+from lyapnet.training.learner import mean_over_processes
 from lyapnet.training.modules import labelled
 from lyapnet.training.runs import Run
 
@@ -79,7 +80,8 @@ class Checkpoints(Checkpoint):
     def _save_best(self, trainer: Trainer, module: Any) -> None:
         _flush(trainer)
         for member in module.members:
-            loss = float(trainer.strategy.reduce(torch.tensor(member.validation_loss), reduce_op="mean"))
+            own = torch.tensor(member.validation_loss, dtype=torch.float64, device=module.device)
+            loss = float(mean_over_processes(own))
             if loss < self.best_loss[member.label]:
                 self.best_loss[member.label] = loss
                 module.save_member(member, self.best[member.label])

@@ -26,6 +26,7 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath, Valu
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
 NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
+HOPELESS = 2.0  # times the cost of a settled rival
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
 
 
@@ -101,20 +102,27 @@ def riccati(problem: Problem) -> Expansion:
     return _backward(problem, x, u, curved=False).expansion
 
 
-def optimal_trajectories(problem: Problem, x0: State, u: ControlPath, iterations: int = 80) -> Optimum:
+def optimal_trajectories(
+    problem: Problem, x0: State, u: ControlPath, iterations: int = 80, rivals: bool = False
+) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
     First without the second derivatives of F, which far from an optimum point anywhere, then with them. Where the
     controls lead nowhere finite the cost is infinite.
+
+    Args:
+        iterations: of each of the two kinds, at the most.
+        rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
+            that still cost HOPELESS times as much are left as they are.
     """
     problem, given = in_float64(problem), u.double()
     now = path_under(problem, lambda n, _: given[n], x0.double())
-    now = _descended(problem, now, False, iterations, NEAR)
-    now = _descended(problem, now, True, iterations, SETTLED)
+    now = _descended(problem, now, False, iterations, NEAR, rivals)
+    now = _descended(problem, now, True, iterations, SETTLED, rivals)
     return Optimum(now, _backward(problem, now.x, now.u).expansion)
 
 
-def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float) -> Path:
+def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float, rivals: bool) -> Path:
     """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
     for _ in range(iterations):
@@ -129,6 +137,8 @@ def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enoug
         failures[rows] = torch.where(better, 0, failures[rows] + 1)
         damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
         settled[rows] = better & (was.cost - tried.cost <= enough * was.cost.abs()) | (failures[rows] > TRIES)
+        if rivals and settled.any():
+            settled |= now.cost > HOPELESS * now.cost[settled].min()
     return now
 
 

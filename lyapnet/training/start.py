@@ -2,6 +2,7 @@
 
 import copy
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -22,12 +23,13 @@ from lyapnet.networks import ExpansionNetwork, IgnoringStates
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
-from lyapnet.training.pretraining import OPTIMA, examples_of, fit, optima_for
-from lyapnet.types import PerState, State
+from lyapnet.training.optima import OPTIMA, optima_for
+from lyapnet.training.pretraining import examples_of, fit
+from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
-CLOSE = 1e-5  # relative excess over optima that leaves nothing to fit
+CLOSE, FEW = 1e-5, 16  # share of the cost by which no step may improve on a law that leaves nothing to fit, from FEW
 CALM = "V = 0"
 
 Report = Callable[[str], None]
@@ -43,6 +45,7 @@ class Candidate(NamedTuple):
     name: str
     cost: float  # mean J_N from states of X₀; infinite where a closed loop is not finite
     finite: float  # share of the closed loops
+    seconds: float  # from when starts began to be sought until it was rolled out
 
 
 class Start(NamedTuple):
@@ -59,6 +62,7 @@ class Start(NamedTuple):
         return {
             "chosen": self.chosen.name,
             "tried": {c.name: c.cost if c.finite == 1 else None for c in self.candidates},
+            "seconds": {c.name: round(c.seconds, 2) for c in self.candidates},
         }
 
 
@@ -78,16 +82,19 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
     report("the optimum from the centre of X₀")
-    tried, expansions = [_tried(CALM, learners[0], x0)], dict(expansions_of(problem))
-    for name, expansion in expansions.items():
+    began, expansions = time.perf_counter(), dict[str, Expansion]()
+    tried = [_tried(CALM, learners[0], x0, began)]
+    for name, expansion in expansions_of(problem):
+        expansions[name] = expansion
         take(networks[0], problem, expansion, kept, x0)
-        tried.append(_tried(name, learners[0], x0))
+        tried.append(_tried(name, learners[0], x0, began))
         networks[0].load_state_dict(calm[0])
     if expansions:
         base = _best(tried[1:])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
-        tried += _fitted(learners, list(expansions.values()), base, x0, report)
+        if _can_be_improved(problem, expansions[base.name], x0[:FEW]):
+            tried += _fitted(learners, list(expansions.values()), base, x0, began, report)
     chosen = _best(tried)
     if chosen.name == CALM:
         for network, state in zip(networks, calm, strict=True):
@@ -97,26 +104,37 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     return Start(chosen, tried)
 
 
+def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:
+    """Whether a step of differential dynamic programming gains on the law of an expansion, from any of some states."""
+    x0 = x0.double().cpu()
+    path = path_under(in_float64(problem), greedy_law(in_float64(problem), expansion), x0)
+    better = optimal_trajectories(problem, x0, path.u, iterations=1).path.cost
+    return not bool((path.cost - better <= CLOSE * better.abs()).all())
+
+
 def _fitted(
-    learners: Sequence[Learner], expansions: Sequence[Expansion], base: Candidate, x0: State, report: Report
+    learners: Sequence[Learner],
+    expansions: Sequence[Expansion],
+    base: Candidate,
+    x0: State,
+    began: float,
+    report: Report,
 ) -> list[Candidate]:
-    """The candidate whose networks are fitted to optima; none where the base is as good as these, or there are none.
+    """The candidate whose networks are fitted to optima; none where there are none.
 
     Where it is no better than the base, the networks are what they were before.
     """
     problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
-    states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
     report(f"optima from {OPTIMA} states of X₀")
-    optimum = optima_for(problem, expansions, states)
-    best, found = optimum.path.cost, int(optimum.path.cost.isfinite().sum())
-    now = _costs(learners[0], states[: len(best)]).to(best)
-    if not found or bool((now <= (1 + CLOSE) * best).all()):
+    optimum = optima_for(problem, expansions, problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0))
+    found = int(optimum.path.cost.isfinite().sum())
+    if not found:
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
     report(f"fitting V to {found} optima")
     for learner in learners:
-        fit(learner.V, examples, stream(learner.seed, START, 3))
-    fitted = _tried(f"{found} optima from states of X₀", learners[0], x0)
+        fit(learner, optimum, examples)
+    fitted = _tried(f"{found} optima from states of X₀", learners[0], x0, began)
     if _best([base, fitted]) == base:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
@@ -127,15 +145,12 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
     return min(candidates, key=lambda each: (-each.finite, each.cost))
 
 
-def _tried(name: str, learner: Learner, x0: State) -> Candidate:
+def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    cost = _costs(learner, x0)
-    return Candidate(name, float(cost.mean()), float(cost.isfinite().double().mean()))
-
-
-def _costs(learner: Learner, x0: State) -> PerState:
     policy, times = learner.rollout.closed_loop.policy, learner.problem.horizon.times(x0)
-    return path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
+    cost = path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
+    share = float(cost.isfinite().double().mean())
+    return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
@@ -149,7 +164,7 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
     if torch.equal(centre, problem.goal.double().cpu()):
         return
     guesses = _guesses(problem, centre, at_goal)
-    optimum = optimal_trajectories(problem, centre.expand(guesses.shape[1], -1), guesses)
+    optimum = optimal_trajectories(problem, centre.expand(guesses.shape[1], -1), guesses, rivals=True)
     best = optimum.expansion.member(int(optimum.path.cost.argmin()))
     if optimum.path.cost.isfinite().any() and all(part.isfinite().all() for part in best):
         yield "the optimum from the centre of X₀", best

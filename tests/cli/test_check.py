@@ -24,7 +24,7 @@ TASK = {
 @pytest.fixture(autouse=True)
 def _few_optima(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", 200)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
 
 
 def linear(A, B, **changes):

@@ -1,19 +1,20 @@
 """Fitting V to optima: what the examples say, against Riccati's solution and rollouts; and what fitting brings."""
 
-import math
-from types import SimpleNamespace
-
 import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.evaluation.oracles import Optima, discrete_riccati
+from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.expansions import no_control, optimal_trajectories, path_under, riccati
 from lyapnet.networks import FCN, Scaling
 from lyapnet.policy import SampledPolicy
+from lyapnet.programs import ValueProgram
+from lyapnet.rollout import Rollout
 from lyapnet.systems import Linear
 from lyapnet.training import pretraining
-from lyapnet.training.pretraining import errors, examples_of, fit, optima_for
+from lyapnet.training.learner import Learner
+from lyapnet.training.optima import optima_for
+from lyapnet.training.pretraining import errors, examples_of, examples_visited, fit
 from tests.problems import Formula, problem_of
 from tests.test_expansions import hanging
 
@@ -72,20 +73,54 @@ def at(x, problem):
     )
 
 
-def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(monkeypatch):
-    monkeypatch.setattr(pretraining, "STEPS", 300)
+@pytest.fixture
+def swing(monkeypatch):
+    """A pendulum that hangs, and optima of it: (problem, those that are fitted to, those that are not)."""
+    monkeypatch.setattr(pretraining, "STEPS", (200, 100))
     problem = hanging(steps=40)
     expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
-    seen, unseen = (
-        examples_of(problem, optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)), GENERATOR)
-        for _ in range(2)
-    )
-    V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, seen.mean_cost), (32, 32))
-    before = [float(error.detach()) for error in errors(V, unseen)]
-    fit(V, seen, torch.Generator().manual_seed(0))
-    after = [float(error.detach()) for error in errors(V, unseen)]
+    seen, unseen = (optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)) for _ in range(2))
+    return problem, seen, unseen
+
+
+def learner_of(problem, value_scale):
+    V = FCN(Scaling((3.0, 3.0), problem.horizon.duration, value_scale), (32, 32))
+    return Learner(problem, V, Rollout(problem, SampledPolicy(problem, V), gradient="discrete"), ValueProgram())
+
+
+def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
+    problem, seen, unseen = swing
+    examples, others = (examples_of(problem, optimum, GENERATOR) for optimum in (seen, unseen))
+    learner = learner_of(problem, examples.mean_cost)
+    before = [float(error.detach()) for error in errors(learner.V, others)]
+    fit(learner, seen, examples)
+    after = [float(error.detach()) for error in errors(learner.V, others)]
     assert after[0] < before[0] / 20
     assert after[1] < before[1] / 20
+
+
+def test_the_states_that_a_law_visits_are_examples(problem):
+    """Of a linear problem, whose expansions are exact wherever they are asked."""
+    optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
+    law = no_control(problem)
+    visited = examples_visited(problem, optimum, law)
+    x = visited.x.reshape(problem.horizon.steps, 6, problem.system.n)
+    led, best = path_under(problem, law, optimum.path.x[0]).x[:-1], optimum.path.x[:-1]
+    share = ((x - best) * (led - best)).sum(-1) / ((led - best) ** 2).sum(-1).clamp_min(1e-12)
+    assert_close(x - best, share[..., None] * (led - best))
+    assert bool((share[1:] > 0).all())
+    assert float(share.min()) < 0.9, "what lies far from the optimum is drawn nearer"
+    assert float(share[1].max()) == pytest.approx(1), "and what lies near it is not"
+    for error in errors(shifted(problem, 0.0), visited):
+        assert float(error.detach()) < 1e-20
+    assert float(errors(shifted(problem, 0.1), visited)[1].detach()) > 1e-6
+    assert len(examples_of(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
+
+
+def test_a_law_that_diverges_leaves_finite_examples(problem):
+    optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(4))
+    visited = examples_visited(problem, optimum, lambda _, x: 1e40 * x[..., :1] * x.norm())
+    assert all(column.isfinite().all() for column in visited[:7])
 
 
 def test_only_finite_trajectories_are_examples(problem):
@@ -96,85 +131,3 @@ def test_only_finite_trajectories_are_examples(problem):
     examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)), GENERATOR)
     assert len(examples.t) == 2 * 2 * problem.horizon.steps
     assert_close(examples.mean_cost, float(optimum.path.cost[[0, 2]].mean()))
-
-
-def test_as_many_trajectories_as_fit_into_memory(problem, monkeypatch):
-    monkeypatch.setattr(pretraining, "NUMBERS", 2 * problem.horizon.steps * 3**2)
-    assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
-
-
-@pytest.fixture
-def without_oracle(monkeypatch):
-    monkeypatch.setattr(pretraining, "optimal_cost", lambda _: None)
-
-
-def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
-    problem = hanging(steps=40)
-    x0, expansions, batches = problem.initial_states.sample(9), [riccati(problem)], []
-    expected = optima_for(problem, expansions, x0)
-
-    def counted(problem, x0, u):
-        batches.append(len(x0))
-        return optimal_trajectories(problem, x0, u)
-
-    monkeypatch.setattr(pretraining, "optimal_trajectories", counted)
-    monkeypatch.setattr(pretraining, "SOUGHT", 4)
-    optimum = optima_for(problem, expansions, x0)
-    assert batches[0] == 4
-    assert 5 in batches
-    assert_close(optimum.path.x[0], x0)
-    assert_close(optimum.path.cost, expected.path.cost, rtol=1e-6, atol=0)
-    assert_close(optimum.expansion.hessian, expected.expansion.hessian, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize(("share", "taken"), [(0.5, [5, 3]), (math.inf, [5])])
-def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without_oracle):
-    problem = hanging(steps=40)
-    x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
-    monkeypatch.setattr(pretraining, "ROUNDS", 0)
-    monkeypatch.setattr(pretraining, "FAR", 3)
-    good, idle = optima_for(problem, expansions, x0).path, path_under(problem, no_control(problem), x0)
-
-    def solve(states):
-        return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])
-
-    def spoiled(problem, x0, u):
-        batches.append(len(x0))
-        return optimal_trajectories(problem, x0, u) if batches[1:] else optimal_trajectories(problem, x0, 0 * u, 0)
-
-    monkeypatch.setattr(pretraining, "optimal_cost", lambda _: SimpleNamespace(solve=solve))
-    monkeypatch.setattr(pretraining, "optimal_trajectories", spoiled)
-    cost = optima_for(problem, expansions, x0).path.cost
-    assert batches == taken
-    assert_close(cost[3:], idle.cost[3:])
-    assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
-
-
-def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_oracle):
-    problem = hanging(steps=40)
-    x0, expansions = problem.initial_states.sample(8), [riccati(problem)]
-    expected = optima_for(problem, expansions, x0).path.cost
-    begun = []
-
-    def spoiled(problem, x0, u):
-        found = optimal_trajectories(problem, x0, u)
-        if begun:
-            return found
-        begun.append(x0)
-        bad = optimal_trajectories(problem, x0[:1], 0 * u[:, :1], iterations=0)
-        return pretraining._with(found, torch.tensor([0]), bad)
-
-    monkeypatch.setattr(pretraining, "optimal_trajectories", spoiled)
-    assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)
-    begun.clear()
-    monkeypatch.setattr(pretraining, "ROUNDS", 0)
-    assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
-
-
-def test_one_state_and_states_that_share_a_coordinate(without_oracle):
-    problem = hanging(steps=20)
-    x0 = problem.initial_states.sample(3)
-    x0[:, 1] = 0.25
-    whole = optima_for(problem, [riccati(problem)], x0)
-    assert whole.path.cost.isfinite().all()
-    assert_close(optima_for(problem, [riccati(problem)], x0[:1]).path.x[0], x0[:1])

@@ -1,0 +1,119 @@
+"""Optimal trajectories from many states of X₀, each sought where its neighbours were found."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lyapnet.evaluation.oracles import optimal_cost
+from lyapnet.expansions import (
+    Expansion,
+    Optimum,
+    Path,
+    exchanged,
+    greedy_law,
+    in_float64,
+    no_control,
+    optimal_trajectories,
+    path_under,
+)
+from lyapnet.problem import Problem
+from lyapnet.types import State
+
+OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
+NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
+NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
+
+
+def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> Optimum:
+    """Optimal trajectories from a batch of states.
+
+    The first few are sought: from the controls that expansions ask for, or none if cheaper, and some of them by the
+    oracle, where there is one, whose starts need not be trajectories. The others begin with the laws of the few that
+    are nearest. Which local minimum a start leads to is luck, but the least cost is continuous in x₀: at last, what was
+    found from one state is tried from the states around it.
+    """
+    exact = in_float64(problem)
+    x0 = x0.double().cpu()[: _affordable(problem)]
+    few, others = x0[:SOUGHT], x0[SOUGHT:]
+    laws = [*(greedy_law(exact, each) for each in expansions), no_control(exact)]
+    optimum = optimal_trajectories(problem, few, _cheapest([path_under(exact, law, few) for law in laws]).u)
+    optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR]))
+    if len(others):
+        columns = nearest(others, few).unbind(1)
+        u = _cheapest([_along(exact, optimum, column, others) for column in columns]).u
+        optimum = _joined(optimum, optimal_trajectories(problem, others, u))
+    return _followed(exact, optimum)
+
+
+def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:
+    """The first of some optima, exchanged for those of the oracle that cost less."""
+    oracle = optimal_cost(problem)
+    if oracle is None:
+        return optimum
+    found = oracle.solve(x0)
+    if found.u is None:
+        return optimum
+    better = torch.nonzero(found.cost < BETTER * optimum.path.cost[: len(x0)]).flatten()
+    if not len(better):
+        return optimum
+    return _with(optimum, better, optimal_trajectories(problem, x0[better], found.u[:, better]))
+
+
+def _followed(exact: Problem, optimum: Optimum) -> Optimum:
+    """Optima of which each has been tried from the states around it."""
+    x0 = optimum.path.x[0]
+    for _ in range(ROUNDS if len(x0) > 1 else 0):
+        paths = [_along(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
+        best = _cheapest(paths)
+        improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()
+        if not len(improved):
+            break
+        optimum = _with(optimum, improved, optimal_trajectories(exact, x0[improved], best.u[:, improved]))
+    return optimum
+
+
+def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
+    """From each of some states under the law of one of the optima."""
+    return path_under(exact, greedy_law(exact, optimum.expansion.member(which)), x0)
+
+
+def _cheapest(paths: Sequence[Path]) -> Path:
+    """Of each state, that of several trajectories which costs least."""
+    x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
+    best, each = cost.argmin(0), torch.arange(cost.shape[1])
+    return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
+
+
+def nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:
+    """The indices of the nearest other states of each (b, k), each component in units of its spread."""
+    spread = others.amax(0) - others.amin(0)
+    scale = spread.where(spread > 0, 1)
+    distance = torch.cdist(x0 / scale, others / scale)
+    if not itself:
+        distance.fill_diagonal_(torch.inf)
+    return distance.argsort(1)[:, : min(NEIGHBOURS, len(others) - (not itself))]
+
+
+def _joined(one: Optimum, other: Optimum) -> Optimum:
+    """Two batches of optima as one."""
+    path = Path(
+        torch.cat([one.path.x, other.path.x], 1),
+        torch.cat([one.path.u, other.path.u], 1),
+        torch.cat([one.path.cost, other.path.cost]),
+    )
+    parts = zip(one.expansion, other.expansion, strict=True)
+    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)))
+
+
+def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
+    """Some trajectories exchanged for others that cost less."""
+    parts = zip(optimum.expansion, others.expansion, strict=True)
+    expansion = Expansion(*(part.index_copy(1, rows, new) for part, new in parts))
+    return Optimum(exchanged(optimum.path, rows, others.path), expansion)
+
+
+def _affordable(problem: Problem) -> int:
+    """How many trajectories at a time have second derivatives that fit into memory."""
+    n, m = problem.system.n, problem.system.m
+    return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * (n + m) ** 2)))

@@ -1,0 +1,99 @@
+"""Optimal trajectories from many states: what each learns from its neighbours and the oracle."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.evaluation.oracles import Optima
+from lyapnet.expansions import no_control, optimal_trajectories, path_under, riccati
+from lyapnet.systems import Linear
+from lyapnet.training import optima
+from lyapnet.training.optima import optima_for
+from tests.problems import problem_of
+from tests.test_expansions import hanging
+
+
+def test_as_many_trajectories_as_fit_into_memory(monkeypatch):
+    problem = problem_of(Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]]), steps=20, dt=0.1)
+    monkeypatch.setattr(optima, "NUMBERS", 2 * problem.horizon.steps * 3**2)
+    assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
+
+
+@pytest.fixture
+def without_oracle(monkeypatch):
+    monkeypatch.setattr(optima, "optimal_cost", lambda _: None)
+
+
+def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
+    problem = hanging(steps=40)
+    x0, expansions, batches = problem.initial_states.sample(9), [riccati(problem)], []
+    expected = optima_for(problem, expansions, x0)
+
+    def counted(problem, x0, u):
+        batches.append(len(x0))
+        return optimal_trajectories(problem, x0, u)
+
+    monkeypatch.setattr(optima, "optimal_trajectories", counted)
+    monkeypatch.setattr(optima, "SOUGHT", 4)
+    optimum = optima_for(problem, expansions, x0)
+    assert batches[0] == 4
+    assert 5 in batches
+    assert_close(optimum.path.x[0], x0)
+    assert_close(optimum.path.cost, expected.path.cost, rtol=1e-6, atol=0)
+    assert_close(optimum.expansion.hessian, expected.expansion.hessian, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("share", "taken"), [(0.5, [5, 3]), (math.inf, [5])])
+def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without_oracle):
+    problem = hanging(steps=40)
+    x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
+    monkeypatch.setattr(optima, "ROUNDS", 0)
+    monkeypatch.setattr(optima, "FAR", 3)
+    good, idle = optima_for(problem, expansions, x0).path, path_under(problem, no_control(problem), x0)
+
+    def solve(states):
+        return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])
+
+    def spoiled(problem, x0, u):
+        batches.append(len(x0))
+        return optimal_trajectories(problem, x0, u) if batches[1:] else optimal_trajectories(problem, x0, 0 * u, 0)
+
+    monkeypatch.setattr(optima, "optimal_cost", lambda _: SimpleNamespace(solve=solve))
+    monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
+    cost = optima_for(problem, expansions, x0).path.cost
+    assert batches == taken
+    assert_close(cost[3:], idle.cost[3:])
+    assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
+
+
+def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_oracle):
+    problem = hanging(steps=40)
+    x0, expansions = problem.initial_states.sample(8), [riccati(problem)]
+    expected = optima_for(problem, expansions, x0).path.cost
+    begun = []
+
+    def spoiled(problem, x0, u):
+        found = optimal_trajectories(problem, x0, u)
+        if begun:
+            return found
+        begun.append(x0)
+        bad = optimal_trajectories(problem, x0[:1], 0 * u[:, :1], iterations=0)
+        return optima._with(found, torch.tensor([0]), bad)
+
+    monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
+    assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)
+    begun.clear()
+    monkeypatch.setattr(optima, "ROUNDS", 0)
+    assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
+
+
+def test_one_state_and_states_that_share_a_coordinate(without_oracle):
+    problem = hanging(steps=20)
+    x0 = problem.initial_states.sample(3)
+    x0[:, 1] = 0.25
+    whole = optima_for(problem, [riccati(problem)], x0)
+    assert whole.path.cost.isfinite().all()
+    assert_close(optima_for(problem, [riccati(problem)], x0[:1]).path.x[0], x0[:1])

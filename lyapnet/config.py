@@ -25,9 +25,10 @@ SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
 
 
-# What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top.
+# What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
+# and a registered program has the weights that it recommends.
 STANDARD: dict[str, Any] = {
-    "program": {"name": "value", "constraint": 0, "cost_to_go": 10, "trajectory_cost": 1},
+    "program": {"name": "value"},
     "network": {"name": "expansion"},
     "rollout": {"policy": "sampled", "gradient": "discrete"},
     "training": {"iterations": 400, "batch_size": 32, "learning_rate": 0.003, "warmup": 40, "validate_every": 20},
@@ -231,7 +232,7 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     Raises:
         UsageError: as load_config.
     """
-    config = checked(Config, _completed(content), overrides)
+    config = checked(Config, _completed(content, overrides), overrides)
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
@@ -239,15 +240,16 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     return config
 
 
-def _completed(content: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The content on top of the standard recipe, where it names no network; a program that it names is taken whole."""
+def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[str, Any]:
+    """The content on top of the standard recipe, where it names no network."""
     sections = {key: content[key] for key in STANDARD if isinstance(content.get(key), Mapping)}
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
     standard = {key: {**section, **sections.get(key, {})} for key, section in STANDARD.items()}
-    if "name" in sections.get("program", {}):
-        standard["program"] = sections["program"]
-    return {**content, **standard}
+    program = standard["program"]
+    name = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))][-1]
+    weights = PROGRAMS[name].recommended if name in PROGRAMS else {}
+    return {**content, **standard, "program": {**weights, **program}}
 
 
 def to_plain(config: Config) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
 
 CONF = Path(__file__).parents[1] / "conf"
+SCRATCH = CONF / "from_scratch"
 EXPERIMENTS = [path for path in CONF.rglob("*.yaml") if not path.stem.startswith("compare")]
 PLAIN = """
 experiment: small

@@ -37,8 +37,9 @@ def problem_of(
 
 
 def untrained(name: str, *overrides: str) -> Controller:
-    """The controller of conf/NAME.yaml with fresh weights."""
-    config = load_config(CONF / f"{name}.yaml", overrides)
+    """The controller of conf/from_scratch/NAME.yaml, or conf/NAME.yaml, with fresh weights."""
+    scratch = CONF / "from_scratch" / f"{name}.yaml"
+    config = load_config(scratch if scratch.exists() else CONF / f"{name}.yaml", overrides)
     problem = build_problem(config)
     V = build_value_function(config, problem)
     return Controller(problem, V, build_rollout(config, problem, V), build_program(config), config)

@@ -12,7 +12,7 @@ from lyapnet.config import config_from_plain, load_config, to_plain
 from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram, ValueProgram
 from lyapnet.systems import SYSTEMS, Cartpole, ControlAffineSystem, DoubleIntegrator, Reacher
-from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
+from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, SCRATCH, objects
 
 # The shipped configs against the task sheet
 
@@ -42,9 +42,6 @@ TASKS = {  # program; system, its parameters, N, Q, Q_T, centre and half-width o
 }  # fmt: skip
 
 
-PAPER = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # its literal programs
-
-
 OWN = (
     "acrobot",
     "landing",
@@ -56,17 +53,33 @@ OWN = (
 )  # of four sections, as a user writes them
 
 
-@pytest.mark.parametrize("name", OWN)
+REFERENCE = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # the paper's four tasks
+
+
+@pytest.mark.parametrize("name", [*OWN, *REFERENCE, "double_integrator_value"])
 def test_configs_of_four_sections_name_nothing_else(name):
-    assert set(yaml.safe_load((CONF / f"{name}.yaml").read_text())) == {"system", "cost", "initial_states", "horizon"}
+    content = yaml.safe_load((CONF / f"{name}.yaml").read_text())
+    lyapunov = {"program": {"name": "lyapunov"}} if name in REFERENCE[:2] else {}
+    assert {key: content.pop(key) for key in lyapunov} == lyapunov
+    assert set(content) == {"system", "cost", "initial_states", "horizon"}
 
 
 def test_every_shipped_config_is_a_task_of_the_sheet():
     assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain", *OWN}
-    assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(PAPER)
+    assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(REFERENCE)
+    assert {path.stem for path in SCRATCH.glob("*.yaml")} == {*REFERENCE, "double_integrator_value"}
 
 
-@pytest.mark.parametrize("name", PAPER)
+@pytest.mark.parametrize("name", [*REFERENCE, "double_integrator_value"])
+def test_what_begins_from_scratch_is_the_same_task(name):
+    ours, scratch = load_config(CONF / f"{name}.yaml"), load_config(SCRATCH / f"{name}.yaml")
+    for section in ("system", "cost", "initial_states", "horizon"):
+        assert to_plain(scratch)[section] == to_plain(ours)[section]
+    assert scratch.program.name == ours.program.name
+    assert (scratch.rollout.policy, scratch.experiment) == ("hjb", f"{name}_from_scratch")
+
+
+@pytest.mark.parametrize("name", REFERENCE)
 def test_the_papers_literal_program_has_the_task_of_ours(name):
     """And its loss: the mean sum, without normalisation, margin or a cost term."""
     ours, literal = load_config(CONF / f"{name}.yaml"), load_config(CONF / "paper" / f"{name}.yaml")
@@ -108,7 +121,7 @@ def test_shipped_config_is_its_task(name):
     assert_close(problem.system.g(x), expected.g(x))
     assert_close(problem.cost.R(x), expected.inverse_mass(x))
     assert V(torch.tensor(0.0), x).shape == (8,)
-    assert config.rollout.policy == "hjb"
+    assert config.rollout.policy == ("hjb" if name.endswith("certified") else "sampled")
     assert rollout.method == "euler"
 
 

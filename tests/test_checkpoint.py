@@ -37,7 +37,7 @@ def content_of(config):
 
 @pytest.fixture
 def content():
-    return content_of(load_config(CONF / "double_integrator.yaml", SMALL))
+    return content_of(load_config(CONF / "from_scratch" / "double_integrator.yaml", SMALL))
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_what_was_written_is_read(path, content):
     assert read[KEY] == content[KEY]
     for name, tensor in content["state_dict"].items():
         assert torch.equal(read["state_dict"][name], tensor)
-    assert lyapnet.load(path).config == load_config(CONF / "double_integrator.yaml", SMALL)
+    assert lyapnet.load(path).config == load_config(CONF / "from_scratch" / "double_integrator.yaml", SMALL)
 
 
 def test_missing_file_is_refused(tmp_path):
@@ -322,7 +322,7 @@ def test_class_that_a_checkpoint_names_is_not_imported(section, cls, trap, tmp_p
     assert f"{module}:{cls}" in str(raised.value)
     assert not marker.exists()
     # the twin: building what the config names does import it
-    config = load_config(CONF / "double_integrator.yaml", [*SMALL, f"{section}.name={module}:{cls}"])
+    config = load_config(CONF / "from_scratch" / "double_integrator.yaml", [*SMALL, f"{section}.name={module}:{cls}"])
     build_value_function(config, build_problem(config))
     assert marker.exists()
 
@@ -437,7 +437,7 @@ def test_kill_while_writing_keeps_the_previous_checkpoint_and_the_next_write_tid
 )
 def test_weights_that_do_not_fit_are_named(changes, named, tmp_path, content):
     path = tmp_path / "other.ckpt"
-    config = load_config(CONF / "double_integrator.yaml", [*SMALL, *changes])
+    config = load_config(CONF / "from_scratch" / "double_integrator.yaml", [*SMALL, *changes])
     write_checkpoint({**content, KEY: {"config": to_plain(config), "version": "0"}}, path)
     with pytest.raises(CheckpointError) as raised:
         lyapnet.load(path)
@@ -448,7 +448,7 @@ def test_weights_that_do_not_fit_are_named(changes, named, tmp_path, content):
 
 def test_states_that_are_ignored_are_so_after_loading(tmp_path):
     names = ["network.ignored_states=[cart position]", "network.name=anchored", *SMALL]
-    content = content_of(load_config(CONF / "cartpole_balancing.yaml", names))
+    content = content_of(load_config(CONF / "from_scratch" / "cartpole_balancing.yaml", names))
     path, x = tmp_path / "ignoring.ckpt", torch.randn(5, 4)
     write_checkpoint(content, path)
     V = lyapnet.load(path).V.double()

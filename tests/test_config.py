@@ -12,6 +12,7 @@ from omegaconf import MISSING
 
 from lyapnet.config import STANDARD, Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
+from lyapnet.programs import LyapunovProgram
 from lyapnet.training.build import build_module
 from lyapnet.training.plan import plan_run
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
@@ -331,8 +332,13 @@ def test_four_sections_in_a_file_are_enough(tmp_path, plain):
 
 def test_what_a_file_says_comes_on_top_of_the_standard_recipe(plain):
     task = {"experiment": "mine", **{section: plain[section] for section in FOUR}}
-    config = config_from_plain({**task, "program": {"name": "lyapunov"}, "training": {"batch_size": 7}})
+    config = config_from_plain({**task, "program": {"name": "lyapunov", "margin": 0.1}, "training": {"batch_size": 7}})
+    recommended = LyapunovProgram.recommended
     assert (config.program.name, config.program.cost_to_go) == ("lyapunov", None)
+    assert (config.program.constraint, config.program.margin) == (recommended["constraint"], 0.1)
+    assert config_from_plain(task, ["program.name=lyapunov"]).program.bound == recommended["bound"]
+    own = config_from_plain({**task, "program": {"name": "mine:Program"}}).program
+    assert (own.constraint, own.trajectory_cost, own.bound) == (1, 0, None)
     assert (config.training.batch_size, config.training.learning_rate) == (7, STANDARD["training"]["learning_rate"])
     assert config_from_plain({**task, "program": {"cost_to_go": 3}}).program.trajectory_cost == 1
 

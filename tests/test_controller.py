@@ -43,9 +43,9 @@ DESIGNED_KEYS = {
 def run(tmp_path_factory):
     """The folder of a short training of the Lyapunov program."""
     logs = tmp_path_factory.mktemp("logs")
-    config = CONF / "double_integrator.yaml"
+    config = CONF / "from_scratch" / "double_integrator.yaml"
     assert main(["train", "--config", str(config), f"logs={logs}", *SMALL]) == 0
-    return logs / "double_integrator" / "version_0"
+    return logs / "double_integrator_from_scratch" / "version_0"
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +238,7 @@ def counted(controller, samples, seed):
 
 
 def controller_of(V):
-    config = load_config(CONF / "double_integrator.yaml", [f"horizon.steps={N}"])
+    config = load_config(CONF / "from_scratch" / "double_integrator.yaml", [f"horizon.steps={N}"])
     return Controller(build_problem(config), V, program=build_program(config))
 
 
@@ -264,7 +264,7 @@ def test_trained_controller_is_measured_as_by_hand(controller):
 
 def riccati(quadratic, factor=1.0, steps=100):
     """A controller around factor · xᵀP_n x, where P solves the Riccati equation."""
-    config = load_config(CONF / "double_integrator.yaml", [f"horizon.steps={steps}"])
+    config = load_config(CONF / "from_scratch" / "double_integrator.yaml", [f"horizon.steps={steps}"])
     problem = build_problem(config)
     P = discrete_riccati(problem.system, problem.cost, problem.horizon).P
     V = quadratic(factor * P, dt=problem.horizon.dt)
@@ -293,7 +293,9 @@ def test_satisfied_share_follows_the_slack(quadratic):
 
 
 def test_task_without_an_oracle_has_no_gap_to_report():
-    config = load_config(CONF / "reacher.yaml", ["horizon.steps=3", "network.hidden=[4]", "rollout.method=rk4"])
+    config = load_config(
+        CONF / "from_scratch" / "reacher.yaml", ["horizon.steps=3", "network.hidden=[4]", "rollout.method=rk4"]
+    )
     problem = build_problem(config)
     V = build_value_function(config, problem)
     result = evaluate(Controller(problem, V, build_rollout(config, problem, V)), 4)

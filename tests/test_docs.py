@@ -14,6 +14,7 @@ from lyapnet.build import REGISTRIES
 from lyapnet.comparison.plan import ComparisonConfig
 from lyapnet.config import STANDARD, Config
 from lyapnet.networks import NETWORKS
+from lyapnet.programs import PROGRAMS
 from tests.pages import PAGES, README, REPORT, ROOT
 
 WIDTH = 120
@@ -182,3 +183,10 @@ def test_the_standard_recipe_is_what_the_page_says():
 def test_the_table_names_what_is_registered(part):
     (row,) = re.findall(rf"^\| `{part}\.name` .*$", PAGES[ROOT / "docs" / "config.md"], re.MULTILINE)
     assert "`lyapnet systems`" in row or set(re.findall(r"`(\w+)`", row)) >= {*REGISTRIES[part][0]}
+
+
+def test_the_weights_that_programs_recommend_are_what_the_page_says():
+    page = " ".join(PAGES[ROOT / "docs" / "config.md"].split())
+    for name, program in PROGRAMS.items():
+        weights = [f"`{key}: {value}`" for key, value in program.recommended.items()]
+        assert f"`{name}` {', '.join(weights[:-1])} and {weights[-1]}" in page

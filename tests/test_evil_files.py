@@ -19,7 +19,7 @@ from lyapnet.cli import main
 from tests.runs import TINY, tiny_checkpoint
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_seconds_for_levels")]
-CONFIG = str(Path("conf/double_integrator.yaml").absolute())
+CONFIG = str(Path("conf/from_scratch/double_integrator.yaml").absolute())
 BRIEF = ["--samples", "3"]
 VERBS = {  # a checkpoint ↦ the arguments that read it
     "evaluate": lambda file: ["evaluate", file, *BRIEF, "--no-optimum"],
@@ -162,7 +162,7 @@ def test_tags_in_configs(tag, marker, capsys):
 
 @pytest.mark.parametrize("name", RECORDS)
 def test_records_of_a_run(name, trained, marker, capsys):
-    run = marker.parent / "double_integrator/version_0"
+    run = marker.parent / "double_integrator_from_scratch/version_0"
     shutil.copytree(trained.parents[1], run)
     evil = TAGS["apply"].format(marker).encode() if name.endswith("yaml") else pickle.dumps(Malice(marker))
     (run / name).write_bytes(evil)

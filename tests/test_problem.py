@@ -487,7 +487,7 @@ class ForgottenBuffer(DoubleIntegrator):
 
 
 def test_a_forgotten_super_is_named():
-    config = load_config(CONF / "double_integrator.yaml")
+    config = load_config(CONF / "from_scratch" / "double_integrator.yaml")
     with pytest.raises(UsageError, match=r"Expected Forgotten\.__init__ to call super\(\)\.__init__\(\)"):
         build_problem(config, Parts(system=Forgotten()))
     for name in ("Forgotten", "ForgottenBuffer"):

@@ -21,7 +21,7 @@ HUGE_TO_TRAIN = ["seeds=10000000000000", "training.batch_size=10000000000000", "
 
 @pytest.mark.parametrize("override", [*HUGE, *HUGE_TO_TRAIN])
 def test_what_cannot_work_is_refused_before_a_folder_is_made(override, tmp_path, capsys):
-    line = ["train", "--config", "conf/double_integrator.yaml", f"logs={tmp_path}", override]
+    line = ["train", "--config", "conf/from_scratch/double_integrator.yaml", f"logs={tmp_path}", override]
     assert main(line) == 2
     key, (error,) = override.split("=")[0], capsys.readouterr().err.splitlines()
     assert error.startswith(f"error: Expected {key}")

@@ -18,11 +18,13 @@ NODES = 65  # of the curves in time; an expansion with more of them keeps those 
 
 
 class ExpansionNetwork(ValueFunction):
-    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s N(t, Cᵀδ), δ = x − x̄(t), where N is zero until it is trained.
+    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s ρ(ξ) N(t, ξ), ξ = Cᵀδ, δ = x − x̄(t); N is zero until it is trained.
 
-    C are the coordinates in which the expansion curves equally in every direction: H ≈ 2s CCᵀ. A correction that is
-    small in V is then small in u = −½R⁻¹gᵀV_x too; in units of X₀ it can be huge along a direction in which V is flat
-    and g is large. Without an expansion, all but N is zero and C = diag(1/scale).
+    Where c = 0, around a goal that is an equilibrium, ρ = ‖ξ‖²/(1 + ‖ξ‖²), so that V and V_x stay zero there, and what
+    costs little has a V that is off by little; elsewhere ρ = 1. C are the coordinates in which the expansion curves
+    equally in every direction: H ≈ 2s CCᵀ. A correction that is small in V is then small in u = −½R⁻¹gᵀV_x too; in
+    units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, all but N is
+    zero and C = diag(1/scale).
 
     Args:
         scaling: of the task, for what starts without an expansion.
@@ -31,6 +33,7 @@ class ExpansionNetwork(ValueFunction):
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
+    at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
 
     def __init__(self, scaling: Scaling, hidden: Sequence[int] | None = None, activation: str = "tanh"):
         super().__init__()
@@ -41,19 +44,30 @@ class ExpansionNetwork(ValueFunction):
         nn.init.zeros_(self.network.output.bias)
         self.register_buffer("scale", torch.tensor(scaling.value))
         self.register_buffer("coordinates", torch.diag(1 / torch.tensor(scaling.state)))
+        self.register_buffer("at_goal", torch.tensor(0.0))
         self.expansion = Curve(torch.linspace(0, scaling.duration, NODES), torch.zeros(NODES, 1 + 2 * n + 2 * n * n))
 
     def forward(self, t: Time, x: State) -> PerState:
         c, p, H, delta = self._around(t, x)
-        return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * self.network(t, delta @ self.coordinates)
+        xi = delta @ self.coordinates
+        rest = (1 - self.at_goal * self._near(xi)) * self.network(t, xi)
+        return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * rest
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
-        """V and V_x = p + Hδ + s C N_ξ."""
+        """V and V_x = p + Hδ + s C (ρ N_ξ + N ρ_ξ)."""
         c, p, H, delta = self._around(t, x)
-        N, N_xi = self.network.value_and_state_gradient(t, delta @ self.coordinates)
-        curved = apply(H, delta)
-        value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * N
-        return value, p + curved + self.scale * (N_xi @ self.coordinates.mT)
+        xi = delta @ self.coordinates
+        N, N_xi = self.network.value_and_state_gradient(t, xi)
+        near, curved = self._near(xi), apply(H, delta)
+        share = 1 - self.at_goal * near
+        value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
+        rest_xi = share[..., None] * N_xi + (2 * self.at_goal * near**2 * N)[..., None] * xi
+        return value, p + curved + self.scale * (rest_xi @ self.coordinates.mT)
+
+    @staticmethod
+    def _near(xi: State) -> PerState:
+        """1 / (1 + ‖ξ‖²)."""
+        return 1 / (1 + (xi**2).sum(-1))
 
     def curvature(self, t: Time) -> Tensor:
         return self.expansion(t)[..., -self.n * self.n :].unflatten(-1, (self.n, self.n))
@@ -77,6 +91,7 @@ class ExpansionNetwork(ValueFunction):
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
         self.expansion.take(t, torch.cat(parts, 1))
+        self.at_goal.fill_(float(not value.any()))
         early = curvature[: max(1, 3 * len(curvature) // 4)].mean(0) / 2
         values, vectors = torch.linalg.eigh(early)
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))

@@ -1,7 +1,7 @@
 """What a program is: named, weighted terms of V along the closed loop."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
@@ -38,6 +38,7 @@ class Program(ABC):
 
     degree: ClassVar[int]  # all terms but J are of this degree in units of cost
     weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
+    recommended: ClassVar[Mapping[str, float]] = {}  # arguments in the standard recipe
 
     constraint: float = 1.0
     terminal: float = 0.0

@@ -1,6 +1,7 @@
 """The Lyapunov program: V falls along its own closed loop at least as fast as the cost accrues."""
 
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -29,6 +30,7 @@ class LyapunovProgram(Program):
 
     degree = 1
     weighted = (*Program.weighted, "bound")
+    recommended = MappingProxyType({"constraint": 50, "terminal": 50, "trajectory_cost": 1, "margin": 0.02, "bound": 1})
 
     margin: float = 0.0
     bound: float = 0.0

@@ -1,6 +1,7 @@
 """The value program: V is the cost-to-go of its own greedy policy."""
 
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from torch import Tensor
 
@@ -20,6 +21,7 @@ class ValueProgram(Program):
 
     degree = 2
     weighted = (*Program.weighted, "cost_to_go")
+    recommended = MappingProxyType({"constraint": 0, "cost_to_go": 10, "trajectory_cost": 1})
 
     cost_to_go: float = 0.0
 

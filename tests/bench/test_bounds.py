@@ -228,7 +228,7 @@ def test_json_and_figure(run, enclosed, monkeypatch, tmp_path):
 def test_a_checkpoint_and_its_tables(run, tmp_path):
     tiny = ["training.iterations=2", "horizon.steps=8", "rollout.gradient=backprop", "loggers=[csv]"]
     tiny += ["evaluation.validation_states=4", "evaluation.test_states=4"]
-    config = ["--config", "conf/double_integrator.yaml", "network.hidden=[8]", f"logs={tmp_path}"]
+    config = ["--config", "conf/from_scratch/double_integrator.yaml", "network.hidden=[8]", f"logs={tmp_path}"]
     assert cli.main(["train", *config, *tiny]) == 0
     checkpoint = tmp_path / "double_integrator/version_0/checkpoints/best.ckpt"
     status, out, err = run(str(checkpoint))

@@ -32,7 +32,9 @@ configs = pytest.mark.parametrize("name", OTHER)
 
 
 def build(name, *changes):
-    config = load_config(CONF / f"{name}.yaml", ["horizon.steps=15", "rollout.gradient=backprop", *changes])
+    config = load_config(
+        CONF / "from_scratch" / f"{name}.yaml", ["horizon.steps=15", "rollout.gradient=backprop", *changes]
+    )
     problem = build_problem(config)
     V = build_value_function(config, problem)
     case = Case(problem, V, build_program(config), build_rollout(config, problem, V))

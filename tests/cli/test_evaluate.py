@@ -33,7 +33,9 @@ SMALL = ["horizon.steps=6", "network.hidden=[4]", "training.iterations=2", "trai
 
 
 def train(folder, *arguments):
-    return main(["train", "--config", str(CONF / "reacher.yaml"), *SMALL, f"logs={folder}", *arguments])
+    return main(
+        ["train", "--config", str(CONF / "from_scratch" / "reacher.yaml"), *SMALL, f"logs={folder}", *arguments]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
         patch.setenv("LYAPNET_CACHE", str(folder / "cache"))
         assert train(folder / "logs") == 0
-    return folder / "logs" / "reacher" / "version_0", printed.getvalue()
+    return folder / "logs" / "reacher_from_scratch" / "version_0", printed.getvalue()
 
 
 @pytest.fixture
@@ -122,7 +124,9 @@ def test_without_casadi_a_training_goes_on(tmp_path, capsys):
     printed = " ".join(capsys.readouterr().out.split())
     assert "no optimum to compare with: Expected CasADi" in printed
     assert printed.count("pip install 'lyapnet[oracle]'") == 2  # at the start, and below the table
-    assert json.loads((tmp_path / "logs/reacher/version_0/evaluation.json").read_text())["cost_ratio"] is None
+    assert (
+        json.loads((tmp_path / "logs/reacher_from_scratch/version_0/evaluation.json").read_text())["cost_ratio"] is None
+    )
 
 
 def test_a_training_is_compared_with_the_same_optimum_to_its_end(run, trained, capsys, tmp_path):
@@ -132,7 +136,7 @@ def test_a_training_is_compared_with_the_same_optimum_to_its_end(run, trained, c
 
     assert "optimum of 4 validation states: mean" in trained[1]
     assert "cost/optimum" in trained[1]
-    copy = tmp_path / "logs" / "reacher" / "version_0"
+    copy = tmp_path / "logs" / "reacher_from_scratch" / "version_0"
     shutil.copytree(run, copy)
     assert train(tmp_path / "logs", "training.iterations=3", "--resume", "last") == 0
     assert torch.equal(kept(copy), kept(run))
@@ -147,8 +151,8 @@ def test_the_optimum_is_not_sought_where_it_is_not_wanted(tmp_path, capsys):
 
 def test_disturbances_are_reported(tmp_path, capsys):
     arguments = [*SMALL, "training.iterations=1", "training.batch_size=2", "rollout.compile=off", f"logs={tmp_path}"]
-    assert main(["train", "--config", str(CONF / "double_integrator.yaml"), *arguments]) == 0
-    path = str(tmp_path / "double_integrator" / "version_0" / "checkpoints" / "best.ckpt")
+    assert main(["train", "--config", str(CONF / "from_scratch" / "double_integrator.yaml"), *arguments]) == 0
+    path = str(tmp_path / "double_integrator_from_scratch" / "version_0" / "checkpoints" / "best.ckpt")
     capsys.readouterr()
     assert main(["evaluate", path, "--samples", "3", "--robustness", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)

@@ -97,8 +97,8 @@ def test_a_stopped_run_goes_on(swept, commands):
 
 
 def test_without_a_key_the_configs_keep_their_own_folders(tmp_path):
-    point, other = points_of([CHAIN, CONF / "double_integrator.yaml"], None, [f"logs={tmp_path}"])
-    assert (point.config.experiment, other.config.experiment) == ("integrator_chain", "double_integrator")
+    point, other = points_of([CHAIN, CONF / "from_scratch" / "double_integrator.yaml"], None, [f"logs={tmp_path}"])
+    assert (point.config.experiment, other.config.experiment) == ("integrator_chain", "double_integrator_from_scratch")
     assert point.run() is None
 
 

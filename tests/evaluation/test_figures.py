@@ -30,7 +30,7 @@ def drawing(request):
 
 
 def build(name, V=None):
-    config = load_config(CONF / f"{name}.yaml", ["horizon.steps=6", "network.hidden=[8, 8]"])
+    config = load_config(CONF / "from_scratch" / f"{name}.yaml", ["horizon.steps=6", "network.hidden=[8, 8]"])
     problem = build_problem(config)
     V = V or build_value_function(config, problem)
     return name, problem, V, build_rollout(config, problem, V)

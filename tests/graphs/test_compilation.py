@@ -16,7 +16,7 @@ from lyapnet.graphs import compilation
 from lyapnet.graphs.tracing import trace
 from lyapnet.rollout import discrete_adjoint
 
-CONFIG = Path(__file__).parents[2] / "conf" / "double_integrator.yaml"
+CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
 
 

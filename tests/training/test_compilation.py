@@ -13,7 +13,7 @@ from lyapnet.graphs import compilation
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.training.compilation import earns_compilation
 
-CONFIG = Path(__file__).parents[2] / "conf" / "double_integrator.yaml"
+CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
 SHORT = [*SMALL, "evaluation.validation_states=2", "evaluation.test_states=2"]
 LONG = "training.iterations=10000000"

@@ -14,7 +14,8 @@ from lyapnet.rollout import GRADIENTS
 from lyapnet.training.build import build_module
 from lyapnet.training.data import InitialStateDataModule
 
-CONF = Path(__file__).parents[2] / "conf"
+ROOT = Path(__file__).parents[2]
+SCRATCH = ROOT / "conf" / "from_scratch"
 SMALL = [
     "horizon.steps=5", "network.hidden=[8,8]", "training.batch_size=3", "training.beta1=0", "training.validate_every=1",
     "evaluation.validation_states=2", "evaluation.test_states=2", "evaluation.figures_every=99",
@@ -25,15 +26,23 @@ TWO = ("trainer.devices=2", "trainer.strategy=ddp")
 
 def train(folder, name, *arguments):
     """One run from the command line; the content of its last checkpoint."""
-    command = [sys.executable, "train.py", "--config", str(CONF / f"{name}.yaml"), *SMALL, f"logs={folder}", *arguments]
-    done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=180)
+    command = [
+        sys.executable,
+        "train.py",
+        "--config",
+        str(SCRATCH / f"{name}.yaml"),
+        *SMALL,
+        f"logs={folder}",
+        *arguments,
+    ]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=180)
     assert done.returncode == 0, done.stderr
-    return read_checkpoint(folder / name / "version_0" / "checkpoints" / "last.ckpt")
+    return read_checkpoint(folder / f"{name}_from_scratch" / "version_0" / "checkpoints" / "last.ckpt")
 
 
 def gradient_on(name, *overrides, processes):
     """The gradient of the first step on the joint batch of these processes, in one process."""
-    config = load_config(CONF / f"{name}.yaml", [*SMALL, *overrides])
+    config = load_config(SCRATCH / f"{name}.yaml", [*SMALL, *overrides])
     module = build_module(config)
     data = InitialStateDataModule(module.problem, config.training.batch_size, 1, config.seed)
     x0 = torch.cat([data.batch(0, process) for process in range(processes)])
@@ -59,6 +68,6 @@ def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, grad
 @pytest.mark.slow
 def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     name, options = "double_integrator", ["rollout.gradient=adjoint", f"logs={tmp_path}", "training.iterations=1"]
-    lyapnet.train(CONF / f"{name}.yaml", [*SMALL, *options])
+    lyapnet.train(SCRATCH / f"{name}.yaml", [*SMALL, *options])
     resumed = train(tmp_path, name, options[0], "training.iterations=2", *TWO, "--resume", "last")
     assert resumed["global_step"] == 2

@@ -39,8 +39,8 @@ ALPHA, DELTA = 0.9, 0.01
 
 def train(logs, *changes):
     """The folder of a run whose condition fails."""
-    assert main(["train", "--config", "conf/double_integrator.yaml", f"logs={logs}", *TINY, *changes]) == 0
-    return logs / "double_integrator/version_0"
+    assert main(["train", "--config", "conf/from_scratch/double_integrator.yaml", f"logs={logs}", *TINY, *changes]) == 0
+    return logs / "double_integrator_from_scratch/version_0"
 
 
 @pytest.fixture(scope="module")
@@ -189,7 +189,7 @@ def test_where_nothing_fails_it_still_trains(run):
 
 def test_single_precision_is_refined(tmp_path):
     refine(train(tmp_path, "training.precision=float32"))
-    assert runs(tmp_path / "double_integrator/version_0/refine_1") == ["version_0"]
+    assert runs(tmp_path / "double_integrator_from_scratch/version_0/refine_1") == ["version_0"]
 
 
 def test_the_command(run, capsys, monkeypatch):

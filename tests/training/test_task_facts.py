@@ -15,14 +15,15 @@ from lyapnet.errors import CheckpointError, DivergenceError
 from lyapnet.systems import Cartpole
 from lyapnet.training.build import build_module
 
-CONF = Path(__file__).parents[2] / "conf"
+ROOT = Path(__file__).parents[2]
+SCRATCH = ROOT / "conf" / "from_scratch"
 SHORT = ["training.iterations=1", "horizon.steps=4", "evaluation.validation_states=2", "evaluation.test_states=2"]
 
 
 def trained(name, folder, *overrides):
     """The best checkpoint of a run of one step."""
-    assert main(["train", "--config", str(CONF / f"{name}.yaml"), *SHORT, f"logs={folder}", *overrides]) == 0
-    return max((folder / name).glob("version_*")) / "checkpoints" / "best.ckpt"
+    assert main(["train", "--config", str(SCRATCH / f"{name}.yaml"), *SHORT, f"logs={folder}", *overrides]) == 0
+    return max((folder / f"{name}_from_scratch").glob("version_*")) / "checkpoints" / "best.ckpt"
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def without_figures(monkeypatch):
 
 
 def module_of(name):
-    return build_module(load_config(CONF / f"{name}.yaml"))
+    return build_module(load_config(SCRATCH / f"{name}.yaml"))
 
 
 def test_finetuning_keeps_the_new_cost_and_system(without_figures, tmp_path):
@@ -82,14 +83,14 @@ def test_interpolation_in_a_checkpoint_is_refused_unresolved(key, without_figure
 
 
 def test_numbers_with_exponents_mean_the_same_in_file_and_command(tmp_path):
-    text = (CONF / "double_integrator.yaml").read_text(encoding="utf-8").replace("Q: [10, 0.1]", "Q: [1e1, 1e-1]")
+    text = (SCRATCH / "double_integrator.yaml").read_text(encoding="utf-8").replace("Q: [10, 0.1]", "Q: [1e1, 1e-1]")
     (tmp_path / "exponents.yaml").write_text(text, encoding="utf-8")
-    assert load_config(tmp_path / "exponents.yaml").cost.Q == load_config(CONF / "double_integrator.yaml").cost.Q
+    assert load_config(tmp_path / "exponents.yaml").cost.Q == load_config(SCRATCH / "double_integrator.yaml").cost.Q
 
 
 @pytest.mark.parametrize("option", ["accelerator=banana", "devices=0", "gradient_clip_val=much"])
 def test_trainer_values_are_refused_before_there_is_a_folder(option, tmp_path, capsys):
-    arguments = ["train", "--config", str(CONF / "reacher.yaml"), f"logs={tmp_path / 'logs'}", f"trainer.{option}"]
+    arguments = ["train", "--config", str(SCRATCH / "reacher.yaml"), f"logs={tmp_path / 'logs'}", f"trainer.{option}"]
     assert main(arguments) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "logs").exists()
@@ -100,7 +101,7 @@ def test_copy_of_a_checkpoint_is_not_resumed_where_it_lies(without_figures, tmp_
     copied = tmp_path / "backup" / "deep" / "mine.ckpt"
     copied.parent.mkdir(parents=True)
     copied.write_bytes(source.read_bytes())
-    config = str(CONF / "double_integrator.yaml")
+    config = str(SCRATCH / "double_integrator.yaml")
     assert main(["train", "--config", config, *SHORT, f"logs={tmp_path / 'logs'}", "--resume", str(copied)]) == 2
     assert "--finetune" in capsys.readouterr().err
     assert sorted(p.name for p in (tmp_path / "backup").rglob("*")) == ["deep", "mine.ckpt"]
@@ -119,13 +120,13 @@ def test_figure_that_cannot_be_drawn_does_not_stop_a_run(tmp_path, monkeypatch):
 def test_two_processes_draw_different_batches_and_agree(without_figures, tmp_path):
     """Distributed data parallel on the CPU; a process of its own, since it forks."""
     arguments = [*SHORT, "trainer.devices=2", "trainer.strategy=ddp_fork", f"logs={tmp_path}", "network.hidden=[8,8]"]
-    command = [sys.executable, "train.py", "--config", str(CONF / "double_integrator.yaml"), *arguments]
-    done = subprocess.run(command, cwd=CONF.parent, capture_output=True, text=True, timeout=120)
+    command = [sys.executable, "train.py", "--config", str(SCRATCH / "double_integrator.yaml"), *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     weights = [
         read_checkpoint(path)["state_dict"]["V.network.time.weight"]
         for path in (
-            tmp_path / "double_integrator" / "version_0" / "checkpoints" / "last.ckpt",
+            tmp_path / "double_integrator_from_scratch" / "version_0" / "checkpoints" / "last.ckpt",
             trained("double_integrator", tmp_path, "network.hidden=[8,8]").with_name("last.ckpt"),
         )
     ]

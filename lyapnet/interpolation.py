@@ -115,10 +115,10 @@ class Curve(nn.Module):
 
 
 def _furthest_from(nodes: Tensor, values: Tensor, kept: list[int]) -> int:
-    """The index of the point furthest from the curve through some of them, relative to what values are around it."""
+    """The index of the other point furthest from the curve through some, relative to what values are around it."""
     share = _share_behind(nodes, nodes[kept])
     error = (values - values[kept][0] - share @ values[kept].diff(dim=0)).abs() / (values.abs() + 1e-3)
-    return int(error.amax(1).argmax())
+    return int(error.amax(1).index_fill(0, torch.tensor(kept, device=error.device), -1).argmax())
 
 
 def _share_behind(x: Tensor, nodes: Tensor) -> Tensor:

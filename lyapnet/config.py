@@ -247,8 +247,9 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
         return content
     standard = {key: {**section, **sections.get(key, {})} for key, section in STANDARD.items()}
     program = standard["program"]
-    name = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))][-1]
-    weights = PROGRAMS[name].recommended if name in PROGRAMS else {}
+    named = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))]
+    known = PROGRAMS.get(str(named[-1]))
+    weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **program}}
 
 

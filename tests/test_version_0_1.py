@@ -56,6 +56,8 @@ def test_checkpoint_is_certified_as_by_version_0_1(kind, capsys):
     for new in ("draws", "confidence_over_draws", "caveat"):  # of the draws that a claim may be chosen from
         found.pop(new, None)
     expected.pop("seconds", None)
+    for each in (found, expected):
+        each.pop("boxes", None)  # of a proof: another bound since, which divides the same set into more of them
     assert found == approximately(expected, 1e-9 if kind != "sound" else 1e-6)
 
 

@@ -42,7 +42,7 @@ def _columns(x: TaylorForm, columns: slice) -> TaylorForm:
 
 
 def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) -> list[Any]:
-    """A⁻¹B beside what torch gives with it: no factors are known, and no error is reported."""
+    """A⁻¹B; of what torch gives with it nothing is known, neither factors nor whether it found A singular."""
     if not left:
         raise UsageError("Expected linear systems A y = b, got y A = b; transpose it.")
     A, B = _forms(A, B)
@@ -51,13 +51,13 @@ def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) ->
         solution = solution.with_parts(solution.terms[..., 0], solution.radius[..., 0])
     else:
         solution = solve(A, B)
-    return [solution, None, None, NO_ERROR]
+    return [solution, None, None, None]
 
 
 def inverse_rule(A: TaylorForm, check_errors: bool = False) -> list[Any]:
-    """A⁻¹."""
+    """A⁻¹; whether torch finds A singular is not known."""
     identity = taylor.constant_form(torch.eye(A.shape[0]).to(A.radius), A)
-    return [solve(A, identity), NO_ERROR]
+    return [solve(A, identity), None]
 
 
 def _forms(A: Any, B: Any) -> tuple[TaylorForm, TaylorForm]:
@@ -66,5 +66,4 @@ def _forms(A: Any, B: Any) -> tuple[TaylorForm, TaylorForm]:
     return A, B
 
 
-NO_ERROR = torch.zeros((), dtype=torch.int32)
 LINEAR_SYSTEMS = {aten._linalg_solve_ex.default: solve_rule, aten.linalg_inv_ex.default: inverse_rule}

@@ -34,7 +34,7 @@ def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
     for candidate in start.candidates:
         cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
         chosen = " ← training starts here" if candidate == start.chosen else ""
-        facts.append(Fact(f"start from {candidate.name}", f"{cost}{chosen}"))
+        facts.append(Fact(f"start from {candidate.name}", f"{cost}, known after {candidate.seconds:.2g} s{chosen}"))
     if start.chosen.finite < 1:
         facts.append(Fact("start", "no candidate is finite on all of X₀", "choose a smaller X₀, or a shorter horizon"))
     elif start.chosen.name == CALM:

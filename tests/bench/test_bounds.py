@@ -230,7 +230,7 @@ def test_a_checkpoint_and_its_tables(run, tmp_path):
     tiny += ["evaluation.validation_states=4", "evaluation.test_states=4"]
     config = ["--config", "conf/from_scratch/double_integrator.yaml", "network.hidden=[8]", f"logs={tmp_path}"]
     assert cli.main(["train", *config, *tiny]) == 0
-    checkpoint = tmp_path / "double_integrator/version_0/checkpoints/best.ckpt"
+    checkpoint = tmp_path / "double_integrator_from_scratch/version_0/checkpoints/best.ckpt"
     status, out, err = run(str(checkpoint))
     assert status == 0, err
     assert "double_integrator" in out

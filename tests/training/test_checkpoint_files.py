@@ -13,6 +13,7 @@ from lyapnet.build import build_problem, build_value_function
 from lyapnet.checkpoint import DIGEST, read_checkpoint
 from lyapnet.config import config_from_plain
 from lyapnet.errors import CheckpointError
+from lyapnet.training.checkpoint_files import CheckpointFiles
 from tests.runs import SMALL
 
 
@@ -102,3 +103,9 @@ def test_loading_a_module_executes_nothing(parts, tmp_path):
     assert not marker.exists()
     torch.load(path, weights_only=False)  # the twin
     assert marker.exists()
+
+
+def test_weights_alone_as_a_forked_process_hands_them_over(tmp_path):
+    files, weights = CheckpointFiles(), {"V.scale": torch.tensor(2.0)}
+    files.save_checkpoint(weights, tmp_path / "weights.ckpt")
+    assert files.load_checkpoint(tmp_path / "weights.ckpt") == weights

@@ -58,7 +58,7 @@ def train(tmp_path, capsys, *overrides, resume=()):
     assert main(arguments) == 0, capsys.readouterr().err
     shown = [line for line in capsys.readouterr().out.splitlines() if str(tmp_path) not in line]
     lines = [line for line in shown if "compilation" in line or "machine code" in line]
-    (record,) = tmp_path.glob("double_integrator/*/run.json")
+    (record,) = tmp_path.glob("double_integrator_from_scratch/*/run.json")
     return json.loads(record.read_text())["compiled"], lines
 
 

@@ -22,7 +22,7 @@ from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
 from lyapnet.training.build import build_data
 from lyapnet.training.curves import loggers_of_each
-from lyapnet.training.loggers import log_result, take_back_after
+from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
 from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
@@ -76,7 +76,7 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
         LyapnetError: a file of the run cannot be read or written.
     """
-    with plan.lock or nullcontext():
+    with plan.lock or nullcontext(), quiet_writers():
         try:
             return _fit(plan, console, again)
         except Exception as error:

@@ -2,7 +2,9 @@
 
 import importlib
 import os
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,22 @@ def require_libraries(names: Sequence[str]) -> None:
         except ImportError as error:
             line = f"Expected {name} for loggers=[{name}], got none ({error}); pip install {name}."
             raise UsageError(line) from error
+
+
+@contextmanager
+def quiet_writers() -> Iterator[None]:
+    """No traceback of TensorBoard's thread where its file cannot be written: the next step meets the same error."""
+    before = threading.excepthook
+
+    def without_writers(raised: Any) -> None:
+        if not (type(raised.thread).__module__.startswith("tensorboard") and issubclass(raised.exc_type, OSError)):
+            before(raised)
+
+    threading.excepthook = without_writers
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Logger]:

@@ -63,7 +63,7 @@ def test_a_report_names_what_was_certified(kind, reported, checkpoint):
     assert report["horizon"] == {"steps": 8, "dt": 0.01, "duration": 0.08}
     assert report["versions"]["torch"] == torch.__version__
     assert report["versions"]["python"] == platform.python_version()
-    assert report["experiment"] == "double_integrator"
+    assert report["experiment"] == "double_integrator_from_scratch"
     assert {path.name for path in (reported / kind).iterdir()} == {"report.json", "report.md", report["figure"]}
 
 

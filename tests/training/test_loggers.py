@@ -2,13 +2,19 @@
 
 import csv
 import shutil
+import threading
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 import lyapnet
 from lyapnet.files import write_atomically
 from lyapnet.training import figure_logger
+from lyapnet.training.loggers import quiet_writers
 from lyapnet.training.metrics_file import MetricsFile, read_curves
 from tests.runs import SMALL, logged
 
@@ -141,3 +147,31 @@ def test_finished_run_is_left_as_it_is(resumed):
     again = lyapnet.train(CONFIG, [f"logs={resumed.folder.parents[1]}", "training.iterations=10"], resume="last")
     assert again.evaluation == resumed.evaluation
     assert times() == before
+
+
+@pytest.mark.parametrize(("quiet", "told"), [(True, 0), (False, 1)])
+def test_a_writer_whose_folder_is_gone_tells_the_training_alone(quiet, told, tmp_path, monkeypatch):
+    seen, folder = [], tmp_path / "run"
+    monkeypatch.setattr(threading, "excepthook", seen.append)
+    with quiet_writers() if quiet else nullcontext():
+        writer = EventFileWriter(str(folder))
+        writer.flush()
+        shutil.rmtree(folder)
+        writer.add_event(Event(step=1))
+        writer._async_writer._worker.join(timeout=10)
+        with pytest.raises(OSError, match="run"):
+            writer.add_event(Event(step=2))
+    assert len(seen) == told
+
+
+def test_other_threads_are_heard():
+    raised = []
+    before, threading.excepthook = threading.excepthook, raised.append
+    try:
+        with quiet_writers():
+            thread = threading.Thread(target=Path("/nowhere/at/all").stat)
+            thread.start()
+            thread.join()
+    finally:
+        threading.excepthook = before
+    assert len(raised) == 1

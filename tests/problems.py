@@ -76,20 +76,6 @@ class Formula(ValueFunction):
         return self.f(t, x)
 
 
-def planted(condition: nn.Module, point: Tensor, side: float, height: float) -> nn.Module:
-    """A function of (t, x) with a bump of width `side` that lifts it to `height` at one point."""
-    forward = condition.forward
-    with torch.no_grad():
-        lift = height - float(forward(point[0], point[1:]))
-
-    def lifted(t, x):
-        distance = (t - point[0]) ** 2 + ((x - point[1:]) ** 2).sum(-1)
-        return forward(t, x) + lift * torch.exp(-distance / side**2)
-
-    condition.forward = lifted
-    return condition
-
-
 def with_expansion(V: ValueFunction) -> ValueFunction:
     """An ExpansionNetwork around a random path, with random weights for its zeros; any other V as it is."""
     if isinstance(V, ExpansionNetwork):

@@ -35,6 +35,14 @@ def workplace(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A folder with the run that examples load."""
+    folder = tmp_path_factory.mktemp("trained")
+    assert train(["--config", "conf/double_integrator.yaml", f"logs={folder / 'logs'}"]) == 0
+    return folder
+
+
 def train(arguments: list[str]) -> int:
     return main(["train", *[a for a in arguments if not a.startswith(("training.iter", "horizon.steps"))], *SHORT])
 
@@ -89,14 +97,14 @@ def test_every_command_runs(workplace, capsys):
 
 
 def test_every_command_of_the_readme_runs(workplace, capsys):
-    """But for the proof, which takes longer than the others together: see test_certify."""
+    """But for the proof and the comparison, which take longer than the others together: see cli/."""
     of_readme = blocks("bash", README)
     for arguments in filter(trains, commands("python train.py", of_readme)):
         assert train(arguments) == 0, capsys.readouterr().err
     others = commands("lyapnet", of_readme)
     assert len(others) >= 3
     for arguments in others:
-        if arguments[:2] != ["certify", "sound"]:
+        if arguments[:2] != ["certify", "sound"] and arguments[0] != "compare":
             assert main(brief(arguments)) == 0, (arguments, capsys.readouterr().err)
 
 
@@ -127,8 +135,8 @@ def test_every_command_is_understood(workplace):
         understood(["evaluate", "last.ckpt", "--samplez", "3"])
 
 
-def test_the_python_example_runs(workplace):
-    assert train(["--config", "conf/double_integrator.yaml"]) == 0
+def test_the_python_example_runs(trained, monkeypatch):
+    monkeypatch.chdir(trained)
     (example,) = [block for block in blocks("python") if "lyapnet.load" in block and "controller.rollout" in block]
     names: dict = {}
     exec(example, names)
@@ -136,8 +144,8 @@ def test_the_python_example_runs(workplace):
     assert names["trajectory"].x.shape == (9, 2)
 
 
-def test_the_oracle_example_runs(workplace):
-    assert train(["--config", "conf/double_integrator.yaml"]) == 0
+def test_the_oracle_example_runs(trained, monkeypatch):
+    monkeypatch.chdir(trained)
     names: dict = {"controller": lyapnet.load("logs/double_integrator/version_0/checkpoints/best.ckpt")}
     (example,) = [block for block in blocks("python") if "oracle_of" in block]
     exec(example, names)
@@ -164,11 +172,11 @@ def test_the_examples_from_python_train(workplace):
         assert len(rows) > 1
 
 
-def test_the_environment_example_runs(workplace):
-    assert train(["--config", "conf/double_integrator.yaml"]) == 0
+def test_the_environment_example_runs(trained, monkeypatch):
+    monkeypatch.chdir(trained)
     (example,) = [block for block in blocks("python") if "gymnasium.make" in block]
     names: dict = {}
-    exec(example, names)
+    exec(example.replace("n_eval_episodes=20", "n_eval_episodes=1"), names)
     assert names["mean_return"] < 0
 
 

@@ -22,7 +22,7 @@ def told_after(seconds, number):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, monkeypatch, capsys):
+def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, few_seconds_for_levels):
     kept, reports = tmp_path / "proof", []
 
     def progress(state):  # the search has begun
@@ -30,7 +30,7 @@ def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, monkeypatch, 
         if len(reports) == 1:
             os.kill(os.getpid(), number)
 
-    controller = untrained("double_integrator")
+    controller = untrained("double_integrator", "network.hidden=[8]")
     with pytest.raises(Interrupted, match=f"the proof so far is kept in {kept}") as stop:
         funnel.sound_claim(controller.closed_loop, controller.problem, budget=Budget(60), report=progress, keep=kept)
     assert stop.value.exit_status == 130

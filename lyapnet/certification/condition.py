@@ -30,13 +30,13 @@ class DecreaseCondition(nn.Module):
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
 
     def forward(self, t: Time, x: State) -> PerState:
-        loop, u = self.closed_loop, self.closed_loop.policy(t, x)
-        return time_derivative(self.V, loop.system, t, x, u) + self.alpha * loop.cost.running(x, u) - self.delta
+        return self.parts(t, x)[0]
 
-    def rise(self, t: Time, x: State) -> PerState:
-        """Ẇ = V_t + V_xᵀ(f + g u) − δ: below 0 where c is, unless the cost is negative."""
+    def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
+        """(c, W, Ẇ), where Ẇ = V_t + V_xᵀ(f + g u) − δ is below 0 where c is, unless the cost is negative."""
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
-        return time_derivative(self.V, loop.system, t, x, u) - self.delta
+        fall = time_derivative(self.V, loop.system, t, x, u)
+        return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
 
     def height(self, t: Time, x: State) -> PerState:
         """W(t, x) = V(t, x) − δt: where Ẇ ≤ 0, sublevel sets of W hold what starts in them."""
@@ -78,7 +78,7 @@ def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner
     declared = condition.V
     try:
         condition.V = own_operations(declared, domain)
-        return BoundedFunction(lambda t, x: (condition(t, x), condition.height(t, x), condition.rise(t, x)), domain)
+        return BoundedFunction(lambda t, x: condition.parts(t, x), domain)
     finally:
         condition.V = declared
 

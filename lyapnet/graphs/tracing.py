@@ -46,6 +46,9 @@ def trace(
     options = {"decomposition_table": decompositions, "tracing_mode": "fake", "_allow_non_fake_inputs": True}
     with _reading_values(), _Watch():
         graph_module = make_fx(function, **options)(*arguments)
+    for node in graph_module.graph.nodes:  # what a product with a vector is to torch; to be traced again takes as long
+        if node.target is torch.ops.aten.squeeze_.dim and len(node.args[0].users) == 1:
+            node.target = torch.ops.aten.squeeze.dim
     if any(_mutates(node) for node in graph_module.graph.nodes):  # a cut would separate a tensor from its assignments
         graph_module = make_fx(functionalize(graph_module), **options)(*arguments)
     if any(_depends_on_values(node) for node in graph_module.graph.nodes):

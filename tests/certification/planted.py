@@ -19,12 +19,13 @@ class Planted(DecreaseCondition):
     def plant(self, point, side, height):
         self.point, self.side = point, side
         with torch.no_grad():
-            self.lift = height - float(super().forward(point[0], point[1:]))
+            self.lift = height - float(super().parts(point[0], point[1:])[0])
         return self
 
-    def forward(self, t, x):
+    def parts(self, t, x):
+        c, W, rise = super().parts(t, x)
         distance = (t - self.point[0]) ** 2 + ((x - self.point[1:]) ** 2).sum(-1)
-        return super().forward(t, x) + self.lift * torch.exp(-distance / self.side**2)
+        return c + self.lift * torch.exp(-distance / self.side**2), W, rise
 
 
 def riccati():

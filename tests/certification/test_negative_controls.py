@@ -12,7 +12,8 @@ from lyapnet.policy import HJBPolicy, SontagPolicy
 from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.systems import Linear
-from tests.problems import planted, problem_of
+from tests.certification.planted import Planted
+from tests.problems import problem_of
 
 DURATION = 2.0
 LOWER, UPPER = torch.tensor([0.0, -1.0, -1.0]).double(), torch.tensor([DURATION, 1.0, 1.0]).double()
@@ -64,7 +65,7 @@ def planted_at_random(seed):
     point = LOWER + (UPPER - LOWER) * torch.rand(3, generator=generator).double()
     side = 0.3 * (0.01 / 0.3) ** ((seed % 10) / 9)
     if seed % 2:
-        return planted(DecreaseCondition(loop(Bowl()), 0.5, 0.02), point, side, 0.01), point, side
+        return Planted(loop(Bowl()), 0.5, 0.02).plant(point, side, 0.01), point, side
     return DecreaseCondition(loop(Bowl(bump=(point, side, 20 * side))), 0.5, 0.02), point, side
 
 
@@ -131,7 +132,8 @@ def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
 
 
 @pytest.mark.parametrize("V", [Bowl(-2.0), Bowl(0.05)], ids=["wrong sign", "too small"])
-def test_a_wrong_value_function_is_falsified(V):
+def test_a_wrong_value_function_is_falsified(V, monkeypatch):
+    monkeypatch.setattr(funnel, "LEVELS", 0.5)
     found = claim(loop(V), 0.5, 0.02, Box(LOWER[1:], UPPER[1:]), Budget(20, boxes=2000))
     assert found.verdict == "falsified"
 

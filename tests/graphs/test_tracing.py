@@ -51,6 +51,32 @@ def test_nothing_is_computed_twice():
     agree(graph(x), (torch.sin(x) + 1, torch.sin(x) + 2))
 
 
+def test_shapes_that_are_changed_in_place():
+    """A product with a vector has such a change within torch; what only changes shapes is traced once."""
+    calls = []
+
+    def shaped(x):
+        calls.append(None)
+        column = x[:, None] * 2
+        wide = column + 1
+        column.squeeze_(1)
+        return (torch.ones(3, 3).to(x) @ x, column, wide)
+
+    x, other = torch.randn(2, 3)
+    graph = trace(shaped, (x,))
+    assert len(calls) == 1
+    assert not any(node.target is torch.ops.aten.squeeze_.dim for node in graph.graph.nodes)
+    agree(graph(other), shaped(other))
+
+    def aliased(x):
+        column = x[:, None] * 2
+        alias = column.detach()
+        column.squeeze_(1)
+        return alias * x, column
+
+    agree(trace(aliased, (x,))(other), aliased(other))
+
+
 def test_tensors_that_are_filled_in_place_stay_apart():
     def fill(x):
         first, second = torch.zeros_like(x), torch.zeros_like(x)

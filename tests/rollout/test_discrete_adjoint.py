@@ -76,7 +76,8 @@ def is_exact(rollouts, x0, of=weighted):
 @pytest.mark.parametrize(
     ("system", "method", "traced"),
     [
-        *((system, "euler", traced) for system in SYSTEMS for traced in (False, True)),
+        *((system, "euler", False) for system in SYSTEMS),
+        *(pytest.param(system, "euler", True, marks=() if system in KINDS else pytest.mark.slow) for system in SYSTEMS),
         *((system, method, False) for system in KINDS for method in FIXED_STEP_METHODS if method != "euler"),
     ],
     indirect=["system"],

@@ -22,6 +22,7 @@ SMALL = [
     "trainer.gradient_clip_val=null", "loggers=[csv]", "evaluation.optimum=false",
 ]  # fmt: skip
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
+FORKED = ("trainer.devices=2", "trainer.strategy=ddp_fork")  # which does not import everything once more
 
 
 def train(folder, name, *arguments):
@@ -51,14 +52,18 @@ def gradient_on(name, *overrides, processes):
 
 
 @pytest.mark.parametrize(
-    ("name", "gradient"),
-    [("double_integrator", "discrete"), pytest.param("double_integrator_value", "adjoint", marks=pytest.mark.slow)],
+    ("name", "gradient", "two"),
+    [
+        ("double_integrator", "discrete", FORKED),
+        pytest.param("double_integrator", "discrete", TWO, marks=pytest.mark.slow),
+        pytest.param("double_integrator_value", "adjoint", TWO, marks=pytest.mark.slow),
+    ],
 )
-def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, gradient):
+def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, gradient, two):
     """Normalised by the mean cost of the whole batch. With β₁ = 0, Adam keeps the gradient itself."""
     assert gradient in GRADIENTS
     route = f"rollout.gradient={gradient}"
-    state = train(tmp_path, name, route, "training.iterations=1", *TWO)["optimizer_states"][0]["state"]
+    state = train(tmp_path, name, route, "training.iterations=1", *two)["optimizer_states"][0]["state"]
     taken = torch.cat([parameter["exp_avg"].flatten() for _, parameter in sorted(state.items())])
     joint, alone = (gradient_on(name, route, processes=n) for n in (2, 1))
     assert (taken - joint).norm() / joint.norm() < 1e-6

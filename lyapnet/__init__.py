@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from lyapnet.problem import Horizon, Problem
     from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
     from lyapnet.rollout import Rollout, Trajectory
-    from lyapnet.sets import Box, ControlSet, Unbounded
+    from lyapnet.sets import Box, ControlBox, ControlSet, Unbounded
     from lyapnet.systems import SYSTEMS, ControlAffineSystem
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
@@ -35,7 +35,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "problem": ["Horizon", "Problem"],
     "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
     "rollout": ["Rollout", "Trajectory"],
-    "sets": ["Box", "ControlSet", "Unbounded"],
+    "sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
     "systems": ["SYSTEMS", "ControlAffineSystem"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
@@ -46,6 +46,7 @@ __all__ = [
     "SYSTEMS",
     "Box",
     "ControlAffineSystem",
+    "ControlBox",
     "ControlSet",
     "Controller",
     "Cost",

@@ -3,6 +3,7 @@
 import copy
 import importlib
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.config import Config, CostConfig, SystemConfig
+from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised, remedy
 from lyapnet.cost import COSTS, Cost, QuadraticCost
 from lyapnet.errors import LyapnetError, UsageError, did_you_mean, raised
@@ -23,7 +24,7 @@ from lyapnet.policy import POLICIES
 from lyapnet.problem import Horizon, Problem
 from lyapnet.programs import PROGRAMS, Program
 from lyapnet.rollout import Rollout
-from lyapnet.sets import CONTROL_SETS, Box, ControlSet
+from lyapnet.sets import CONTROL_SETS, Box, ControlBox, ControlSet
 from lyapnet.systems import SYSTEMS, ControlAffineSystem, Linear
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -72,7 +73,7 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
     builders: dict[str, Callable[[], Any]] = {
         "system": lambda: build_system(config.system),
         "cost": lambda: _build_cost(config.cost),
-        "controls": lambda: _with_parameters(config.controls, "controls"),
+        "controls": lambda: build_controls(config.controls, build_system(config.system)),
         "network": lambda: _class_of(config, "network"),
         "program": lambda: build_program(config),
     }
@@ -103,7 +104,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with _section("cost"):
             cost = _build_cost(config.cost, system) if cost is None else cost.double()
         with _section("controls"):
-            controls = _with_parameters(config.controls, "controls") if controls is None else controls.double()
+            controls = build_controls(config.controls, system) if controls is None else controls.double()
         problem = Problem(system, cost, controls, initial_states, horizon)
         problem.check()
         return problem.to(dtype)
@@ -114,29 +115,25 @@ def build_system(config: SystemConfig) -> ControlAffineSystem:
     return _with_parameters(config, "system")
 
 
-def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
-    """The constructor's arguments, defaults included, of the system of a config; none where they do not fit it."""
-    try:
-        bound = inspect.signature(type(system)).bind(**config.parameters)
-    except TypeError:  # a system of the user's own that was passed in the place of the config's
-        return {}
-    bound.apply_defaults()
-    return dict(bound.arguments)
+def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> ControlSet:
+    """The control set of a config: a box where it has limits, else a registered one or the user's own."""
+    if config.lower is None and config.upper is None:
+        return _with_parameters(config, "controls")
+    if config.name != "unbounded" or config.parameters:
+        raise UsageError(f"Expected limits or a controls.name, got both ({config.name}); leave one of them out.")
+    with _float64_defaults(), _section("controls"):
+        lower = _limits("controls.lower", config.lower, -math.inf, system)
+        return ControlBox(lower, _limits("controls.upper", config.upper, math.inf, system))
 
 
-def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """The positive real numbers among a constructor's arguments; gravity is no property of a system.
-
-    An integer counts where the constructor asks for a float: 1 kg, but not 3 links.
-    """
-    arguments = inspect.signature(type(system)).parameters
-    return {
-        name: float(value)
-        for name, value in parameters.items()
-        if name != "gravity"
-        and (type(value) is float or (type(value) is int and arguments[name].annotation in (float, "float")))
-        and value > 0
-    }
+def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> list[float]:
+    """A limit for each control, from a number, one for all, or a list in which null is none."""
+    entries = [none if entry is None else entry for entry in (given if isinstance(given, list) else [given])]
+    if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):
+        raise UsageError(f"Expected {key} as a number or a list of them, got {given!r}; write null where is no limit.")
+    entries = _repeated(entries, system.m)
+    _require_length(key, len(entries), system, system.m)
+    return entries
 
 
 def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:

@@ -88,8 +88,10 @@ class CostConfig:
 
 @dataclass
 class ControlsConfig:
-    """U, the controls that are admitted."""
+    """U, the controls that are admitted: all, those between limits, or a set of the user's own."""
 
+    lower: Any = option(None, "Least controls: a number, or one for each; null: no limit.")
+    upper: Any = option(None, "Greatest controls, likewise.")
     name: str = option(
         "unbounded", "A registered control set, or module:Class of your own.", choices=tuple(CONTROL_SETS),
         user_class=True,

@@ -1,5 +1,6 @@
 """What training leaves behind: V, the control law, and the closed loop of a checkpoint."""
 
+import inspect
 import json
 import logging
 from collections.abc import Callable
@@ -18,11 +19,10 @@ from lyapnet.build import (
     build_program,
     build_rollout,
     build_value_function,
-    parameters_of,
 )
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
-from lyapnet.config import Config, config_from_plain
+from lyapnet.config import Config, SystemConfig, config_from_plain
 from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
 from lyapnet.policy import HJBPolicy
@@ -31,6 +31,16 @@ from lyapnet.programs import Program, ValueProgram
 from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
+
+
+def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
+    """The constructor's arguments, defaults included, of the system of a config; none where they do not fit it."""
+    try:
+        bound = inspect.signature(type(system)).bind(**config.parameters)
+    except TypeError:  # a system of the user's own that was passed in the place of the config's
+        return {}
+    bound.apply_defaults()
+    return dict(bound.arguments)
 
 
 class Controller:

@@ -21,6 +21,7 @@ from torch import Tensor
 from lyapnet.contracts import copied
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem
+from lyapnet.sets import Unbounded
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
 
 STEP_SIZES = tuple(0.5**k for k in range(10))
@@ -67,10 +68,12 @@ class Optimum(NamedTuple):
 def held_control(problem: Problem, x: State, V_x: State, H: Tensor) -> Control:
     """u held for Δt: the minimiser of Δt ℓ(x, u) + V(x + Δt(f + gu)) for V of gradient V_x at x + Δt f and curvature H.
 
-    u = −(2R + Δt gᵀHg)⁻¹ gᵀV_x.
+    It is the minimiser of ½ uᵀ(2R + Δt gᵀHg)u + V_xᵀgu over U: without limits, −(2R + Δt gᵀHg)⁻¹ gᵀV_x.
     """
     g = problem.system.g(x)
     weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(g.mT, multiply(H, g))
+    if problem.controls.limited:
+        return problem.controls.minimise(weight / 2, apply(g.mT, V_x))
     return -solve(weight, apply(g.mT, V_x)[..., None])[..., 0]
 
 
@@ -85,8 +88,8 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
 
 
 def no_control(problem: Problem) -> Callable[[int, State], Control]:
-    """(n, x_n) ↦ 0."""
-    return lambda _, x: x.new_zeros(*x.shape[:-1], problem.system.m)
+    """(n, x_n) ↦ 0, or the control of U that is closest to it."""
+    return lambda _, x: problem.controls.project(x.new_zeros(*x.shape[:-1], problem.system.m))
 
 
 class _Backward(NamedTuple):
@@ -96,8 +99,11 @@ class _Backward(NamedTuple):
 
 
 def riccati(problem: Problem) -> Expansion:
-    """The value function of the problem linearised at its goal, x̄ = x*: F to first order, q, R and φ to second."""
-    problem, N = in_float64(problem), problem.horizon.steps
+    """The value function of the problem linearised at its goal, x̄ = x*: F to first order, q, R and φ to second.
+
+    Limits of the controls are left out: near a goal that needs no control none is active.
+    """
+    problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), torch.zeros(N, problem.system.m, dtype=torch.float64)
     return _backward(problem, x, u, curved=False).expansion
 
@@ -115,7 +121,8 @@ def optimal_trajectories(
         rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
             that still cost HOPELESS times as much are left as they are.
     """
-    problem, given = in_float64(problem), u.double()
+    problem = in_float64(problem)
+    given = problem.controls.project(u.double())
     now = path_under(problem, lambda n, _: given[n], x0.double())
     now = _descended(problem, now, False, iterations, NEAR, rivals)
     now = _descended(problem, now, True, iterations, SETTLED, rivals)
@@ -180,7 +187,8 @@ def _line_search(problem: Problem, now: Path, backward: _Backward) -> Path:
     alpha = torch.tensor(STEP_SIZES, dtype=torch.float64)[:, None, None]
 
     def law(n: int, x: State) -> Control:
-        return now.u[n] + alpha * backward.k[n] + (backward.K[n] @ (x - now.x[n])[..., None])[..., 0]
+        u = now.u[n] + alpha * backward.k[n] + (backward.K[n] @ (x - now.x[n])[..., None])[..., 0]
+        return problem.controls.project(u)
 
     tried = path_under(problem, law, now.x[0].expand(len(STEP_SIZES), *now.x.shape[1:]))
     best, each = tried.cost.argmin(0), torch.arange(now.x.shape[1])
@@ -200,13 +208,13 @@ def _backward(
         curved: with the second derivatives of F.
     """
     steps = _derivatives(problem, x, u)
-    backward = _recursion(problem, x, steps, damping)
+    backward = _recursion(problem, x, u, steps, damping)
     if not curved:
         return backward
     with torch.enable_grad():
         slopes = _rows((backward.expansion.gradient[1:] * steps.F).sum(-1, keepdim=True), steps.z)[..., 0, :]
         bent = steps.l_zz + _rows(slopes, steps.z).detach()
-    return _recursion(problem, x, steps._replace(l_zz=bent), damping)
+    return _recursion(problem, x, u, steps._replace(l_zz=bent), damping)
 
 
 class _Steps(NamedTuple):
@@ -220,7 +228,7 @@ class _Steps(NamedTuple):
     l_zz: Tensor  # what the second derivatives of Q have besides F_zᵀHF_z
 
 
-def _recursion(problem: Problem, x: StatePath, steps: _Steps, damping: Tensor | None) -> _Backward:
+def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: _Steps, damping: Tensor | None) -> _Backward:
     n, F_z = x.shape[-1], steps.F_z
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
     jumps = steps.F.detach() - x[1:]
@@ -234,8 +242,7 @@ def _recursion(problem: Problem, x: StatePath, steps: _Steps, damping: Tensor | 
         Q_zz = steps.l_zz[k] + F_z[k].mT @ H @ F_z[k]
         Q_u, Q_uu, Q_ux = Q_z[..., n:], Q_zz[..., n:, n:], Q_zz[..., n:, :n]
         raised = _raised(Q_uu, FLOOR * least[k], 0 if damping is None else damping * least[k])
-        gain = -torch.linalg.solve(raised, torch.cat([Q_u[..., None], Q_ux], -1))
-        ff, K = gain[..., 0], gain[..., 1:]
+        ff, K = _gains(problem, u[k], raised, Q_u, Q_ux)
         uff = (Q_uu @ ff[..., None])[..., 0]
         c = c + (Q_u * ff).sum(-1) + (ff * uff).sum(-1) / 2
         p = Q_z[..., :n] + (K.mT @ (Q_u + uff)[..., None])[..., 0] + (Q_ux.mT @ ff[..., None])[..., 0]
@@ -247,6 +254,23 @@ def _recursion(problem: Problem, x: StatePath, steps: _Steps, damping: Tensor | 
         [torch.stack(column[::-1]) for column in zip(*rows, strict=True)] for rows in (nodes, gains)
     )
     return _Backward(ff, K, Expansion(x, value, gradient, hessian))
+
+
+def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_u: Control, Q_ux: Tensor) -> tuple[Control, Tensor]:
+    """k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U, and K, in which controls that a limit holds have no part.
+
+    Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
+    """
+    if not problem.controls.limited:
+        gain = -torch.linalg.solve(Q_uu, torch.cat([Q_u[..., None], Q_ux], -1))
+        return gain[..., 0], gain[..., 1:]
+    to = problem.controls.minimise(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
+    k = to - u
+    slope = Q_u + (Q_uu @ k[..., None])[..., 0]
+    further = problem.controls.project(to - slope.sign() * (1 + to.abs()))
+    share = ((further != to) | (slope == 0)).to(Q_uu)  # 1 for a control that is free, 0 for one that a limit holds
+    A = share[..., :, None] * Q_uu * share[..., None, :] + torch.diag_embed(1 - share)
+    return k, -torch.linalg.solve(A, share[..., None] * Q_ux)
 
 
 def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:

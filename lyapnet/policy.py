@@ -71,7 +71,11 @@ class SontagPolicy(ValuePolicy):
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
-        _require_unlimited(problem, "Sontag's formula")
+        if problem.controls.limited:
+            raise ValueError(
+                f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
+                "rollout.policy=hjb or sampled."
+            )
         super().__init__(problem, V)
 
     def forward(self, t: Time, x: State) -> Control:
@@ -92,20 +96,17 @@ class SontagPolicy(ValuePolicy):
 
 
 class SampledPolicy(ValuePolicy):
-    """The law of a controller that holds u for Δt: the minimiser of Δt ℓ(x, u) + V(t + Δt, x + Δt(f + gu)) over u ∈ ℝᵐ,
+    """The law of a controller that holds u for Δt: the minimiser of Δt ℓ(x, u) + V(t + Δt, x + Δt(f + gu)) over u ∈ U,
 
-        u = −(2R + Δt gᵀHg)⁻¹ gᵀV_x(t + Δt, x + Δt f),
+        u = argmin over u ∈ U of ½ uᵀ(2R + Δt gᵀHg)u + V_x(t + Δt, x + Δt f)ᵀgu,
 
-    for V of curvature H along g. With Euler steps of Δt and V = xᵀP_n x it is the optimal law of a linear problem,
-    and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. As
-    Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the goal.
-
-    Raises:
-        ValueError: the problem limits its controls.
+    for V of curvature H along g; with U = ℝᵐ it is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With Euler steps of Δt and V = xᵀP_n x it
+    is the optimal law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where
+    Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the
+    Riccati solution at the goal.
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
-        _require_unlimited(problem, "the sampled law")
         super().__init__(problem, V)
         self.problem = problem
         self.riccati: Curve | None = None
@@ -118,14 +119,6 @@ class SampledPolicy(ValuePolicy):
         assert H is not None
         V_x = self.V.value_and_state_gradient(after, x + self.problem.horizon.dt * self.system.f(x))[1]
         return held_control(self.problem, x, V_x, H)
-
-
-def _require_unlimited(problem: Problem, law: str) -> None:
-    if problem.controls.limited:
-        raise ValueError(
-            f"Expected controls without limits for {law}, got {type(problem.controls).__name__}; take "
-            "rollout.policy=hjb."
-        )
 
 
 POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy}

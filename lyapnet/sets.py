@@ -1,5 +1,7 @@
 """Sets of states and of controls."""
 
+import itertools
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
@@ -7,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lyapnet.linear_algebra import solve
+from lyapnet.linear_algebra import apply, solve
 from lyapnet.types import Control, ControlMatrix, State
 
 
@@ -94,6 +96,11 @@ class ControlSet(nn.Module, ABC):
         """Whether some control of ℝᵐ is left out."""
         return True
 
+    @property
+    def limits(self) -> tuple[Tensor, Tensor] | None:
+        """(lower, upper), each () or (m,), where U is a box: what oracles and starts need to know; else None."""
+        return None
+
     @abstractmethod
     def minimise(self, R: ControlMatrix, b: Control) -> Control:
         """argmin over u ∈ U of uᵀRu + bᵀu, (*batch, m): the control law, with b = gᵀV_x.
@@ -119,6 +126,10 @@ class Unbounded(ControlSet):
     def limited(self) -> bool:
         return type(self) is not Unbounded  # a set derived from it may leave something out
 
+    @property
+    def limits(self) -> tuple[Tensor, Tensor] | None:
+        return None if self.limited else (torch.tensor(-math.inf), torch.tensor(math.inf))
+
     def minimise(self, R: ControlMatrix, b: Control) -> Control:
         return -0.5 * solve(R, b[..., None])[..., 0]
 
@@ -129,4 +140,77 @@ class Unbounded(ControlSet):
         return u
 
 
-CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}
+class ControlBox(ControlSet):
+    """U = {u : lower ≤ u ≤ upper}, componentwise: limits of actuators.
+
+    The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with more, each way to
+    hold some of them at a limit leaves a linear system for the others, and of those that end within the limits the one
+    of least cost counts. All 3ᵐ are solved as one batch.
+
+    Args:
+        lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none.
+
+    Raises:
+        ValueError: limits of different lengths, reversed, not numbers, or of more than 4 controls.
+
+    Source: Boyd, Vandenberghe, Convex Optimization, 2004, § 5.5.3 (what holds at the minimum).
+    """
+
+    lower: Float[Tensor, "*m"]
+    upper: Float[Tensor, "*m"]
+
+    def __init__(self, lower: float | Sequence[float] | Tensor, upper: float | Sequence[float] | Tensor):
+        super().__init__()
+        low, high = (torch.as_tensor(side, dtype=torch.get_default_dtype()) for side in (lower, upper))
+        if low.ndim > 1 or low.shape != high.shape:
+            raise ValueError(
+                f"Expected lower and upper as two numbers, or one for each control, got {low.tolist()} and "
+                f"{high.tolist()}; write ∓inf where there is no limit."
+            )
+        if not bool((low <= high).all()) or bool(((low == high) & low.isinf()).any()):
+            raise ValueError(f"Expected lower ≤ upper, got {low.tolist()} and {high.tolist()}; swap the two.")
+        if low.numel() > MOST:
+            raise ValueError(
+                f"Expected limits of at most {MOST} controls, got {low.numel()}; derive a lyapnet.ControlSet."
+            )
+        self.register_buffer("lower", low, persistent=False)
+        self.register_buffer("upper", high, persistent=False)
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        return self.lower, self.upper
+
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        m = b.shape[-1]
+        if m > MOST or self.lower.numel() not in (1, m):
+            raise ValueError(
+                f"Expected limits of {m} controls, and of no more than {MOST}, got {self.lower.numel()}; give one for "
+                "each, or derive a lyapnet.ControlSet."
+            )
+        if m == 1:
+            return self.project(-b / (2 * R[..., 0]))
+        held = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=m))).to(b)  # at lower, free, at upper
+        low, high = self.lower.expand(m), self.upper.expand(m)
+        sides = torch.where(held < 0, low, torch.where(held > 0, high, 0.0))
+        exists = sides.isfinite().all(-1)
+        u_held, free = sides.where(sides.isfinite(), 0), (held == 0).to(b)
+        each = (slice(None), *(None,) * (b.ndim - 1))  # the ways come first
+        u_held, free = u_held[each], free[each]
+        A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
+        rest = free * (-b / 2 - apply(R, u_held)) + u_held
+        u = solve(A, rest[..., None])[..., 0]
+        fits = exists[each] & ((u >= low) & (u <= high) | (free == 0)).all(-1)
+        cost = ((apply(R, u) + b) * u).sum(-1)
+        best = cost.where(fits | cost.isnan(), torch.inf).argmin(0)  # what is no number stays none
+        return self.project(u.gather(0, best[None, ..., None].expand(1, *b.shape))[0])
+
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        return ((self.lower <= u) & (u <= self.upper)).all(-1)
+
+    def project(self, u: Control) -> Control:
+        return u.clamp(self.lower, self.upper)
+
+
+MOST = 4  # controls under limits: 3⁴ = 81 linear systems
+
+CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}  # limits are controls.lower and upper

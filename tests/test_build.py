@@ -1,5 +1,6 @@
 """From a config to objects: the shipped files against the task sheet, and classes of the user's own."""
 
+import math
 import sys
 
 import pytest
@@ -64,8 +65,15 @@ def test_configs_of_four_sections_name_nothing_else(name):
     assert set(content) == {"system", "cost", "initial_states", "horizon"}
 
 
+def test_the_limited_pendulum_has_limits_besides():
+    content = yaml.safe_load((CONF / "pendulum_limited.yaml").read_text())
+    assert set(content) == {"system", "cost", "controls", "initial_states", "horizon"}
+    assert objects(load_config(CONF / "pendulum_limited.yaml"))[0].controls.limits == (-8, 8)
+
+
 def test_every_shipped_config_is_a_task_of_the_sheet():
-    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, "integrator_chain", *OWN}
+    alone = {"integrator_chain", "pendulum_limited"}
+    assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, *OWN, *alone}
     assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(REFERENCE)
     assert {path.stem for path in SCRATCH.glob("*.yaml")} == {*REFERENCE, "double_integrator_value"}
 
@@ -101,6 +109,38 @@ def test_one_number_stands_for_every_state():
     assert_close(problem.initial_states.widths, torch.full((3,), 2.0, dtype=torch.float64))
     assert_close(V.inputs.state_scale, torch.full((3,), 2.0, dtype=torch.float64))
     assert_close(problem.system.f(torch.tensor([1.0, 2.0, 3.0])), torch.tensor([2.0, 3.0, 0.0]).double())
+
+
+@pytest.mark.parametrize(
+    ("limits", "lower", "upper"),
+    [
+        ({"lower": -8, "upper": 8}, [-8, -8], [8, 8]),
+        ({"lower": [-8], "upper": [2, None]}, [-8, -8], [2, math.inf]),
+        ({"upper": 3.5}, [-math.inf, -math.inf], [3.5, 3.5]),
+    ],
+)
+def test_limits_of_the_controls(limits, lower, upper):
+    config = load_config(CONF / "from_scratch" / "reacher.yaml")
+    config.controls.lower, config.controls.upper = limits.get("lower"), limits.get("upper")
+    controls = objects(config)[0].controls
+    assert_close(torch.stack(controls.limits), torch.tensor([lower, upper], dtype=torch.float64))
+    again = objects(config_from_plain(to_plain(config)))[0].controls
+    assert_close(torch.stack(again.limits), torch.stack(controls.limits))
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("controls.lower=[-1,-1,-1]", "controls.lower with 2 entries .*got 3"),
+        ("controls.upper=fast", "controls.upper as a number or a list of them, got 'fast'"),
+        ("controls={lower: 2, upper: 1}", "lower ≤ upper"),
+        ("controls={lower: 1, name: 'mine:Mine'}", "limits or a controls.name, got both"),
+    ],
+)
+def test_limits_that_do_not_fit_are_refused(override, reason):
+    config = load_config(CONF / "from_scratch" / "reacher.yaml", [override])
+    with pytest.raises(UsageError, match=f"Expected .*{reason}"):
+        objects(config)
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -7,9 +7,9 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
-from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.evaluation.oracles import discrete_riccati, oracle_of
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati
-from lyapnet.sets import Box
+from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import ControlAffineSystem, Linear, Pendulum
 from tests.problems import problem_of
 
@@ -95,6 +95,47 @@ def test_the_expansion_is_of_second_order(swings):
     (first_linear, first), (second_linear, second) = errors(0.2), errors(0.1)
     assert math.log2(abs(first / second)) > 2.6
     assert math.log2(abs(first_linear / second_linear)) == pytest.approx(2, abs=0.3)
+
+
+@pytest.fixture(scope="module")
+def limited():
+    """Optima of the pendulum from some states with |u| ≤ 8, from a swing that pays no heed to the limits."""
+    torch.set_default_dtype(torch.float64)
+    problem = hanging().replaced(controls=ControlBox(-8.0, 8.0))
+    x0 = problem.initial_states.sample(5, torch.Generator().manual_seed(0))
+    return problem, x0, optimal_trajectories(problem, x0, still(problem, 5))
+
+
+def test_optima_within_limits_against_ipopt(limited, swings):
+    pytest.importorskip("casadi")
+    problem, x0, optimum = limited
+    expected = oracle_of(problem).solve(x0).cost
+    assert_close(optimum.path.cost, expected, rtol=1e-6, atol=0)
+    assert problem.controls.contains(optimum.path.u).all()
+    assert (optimum.path.u.abs() == 8).any(0).all(), "each meets a limit"
+    free = oracle_of(swings[0]).solve(x0).cost
+    assert (expected > 1.001 * free).all(), "which costs something"
+
+
+def test_within_limits_the_expansion_is_of_second_order_too(limited):
+    """Also while a limit holds the control, which then does not answer to the state."""
+    problem, x0, optimum = limited
+    expansion = optimum.expansion.member(0)
+    assert_close(expansion.value[0], optimum.path.cost[0], rtol=1e-9, atol=0)
+
+    def error(length):
+        delta = length * torch.tensor([[0.6, -0.8]])
+        exact = optimal_trajectories(problem, x0[:1] + delta, optimum.path.u[:, :1]).path.cost[0]
+        return float(exact - expansion.value[0] - delta[0] @ expansion.gradient[0])
+
+    assert math.log2(abs(error(0.02) / error(0.01))) == pytest.approx(2, abs=0.4)
+
+
+def test_limits_that_are_never_met_change_nothing(swings):
+    problem, x0, optimum = swings
+    wide = optimal_trajectories(problem.replaced(controls=ControlBox(-500.0, 500.0)), x0, still(problem, 9))
+    assert_close(wide.path.cost, optimum.path.cost, rtol=1e-9, atol=0)
+    assert_close(wide.expansion.hessian, optimum.expansion.hessian, rtol=1e-6, atol=1e-6)
 
 
 class Escaping(ControlAffineSystem):

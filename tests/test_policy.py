@@ -11,8 +11,8 @@ from lyapnet.calculus import gradients, time_derivative
 from lyapnet.cost import QuadraticCost
 from lyapnet.networks import PartiallyConvexNetwork, Scaling
 from lyapnet.networks.anchored import GoalAnchor
-from lyapnet.policy import POLICIES, HJBPolicy, SontagPolicy
-from lyapnet.sets import ControlSet
+from lyapnet.policy import POLICIES, HJBPolicy, SampledPolicy, SontagPolicy
+from lyapnet.sets import ControlBox, ControlSet
 from lyapnet.systems import DoubleIntegrator, Linear
 from tests.problems import Formula, problem_of
 
@@ -216,6 +216,31 @@ def test_the_hjb_policy_keeps_within_the_control_set():
         assert (hamiltonian(u) <= hamiltonian(other.expand(30, 1)) + 1e-12).all()
     assert_close(u, Small().project(free(t, x)))
     assert_close(limited.with_value(t, x).u, u)
+
+
+def test_the_sampled_law_within_limits_is_the_best_held_control():
+    """Of one step by brute force, at states where V is quadratic; two controls, with a coupled R."""
+    system = Linear([[0.0, 1.0], [-1.0, 0.3]], [[1.0, 0.2], [0.0, 1.0]])
+    cost = QuadraticCost(torch.eye(2), [[1.0, 0.4], [0.4, 0.5]], torch.eye(2))
+    P = torch.tensor([[3.0, 1.0], [1.0, 2.0]])
+    problem = problem_of(system, cost, dt=0.3, controls=ControlBox([-0.2, -0.1], [0.3, 0.1]))
+
+    class Known(Formula):
+        def curvature(self, t):
+            return 2 * P
+
+    policy = SampledPolicy(problem, Known(lambda t, x: ((x @ P) * x).sum(-1)))
+    x = torch.randn(20, 2)
+    u = policy(torch.tensor(0.0), x)
+    grid = torch.cartesian_prod(torch.linspace(-0.2, 0.3, 51), torch.linspace(-0.1, 0.1, 21))
+
+    def paid(u):
+        after = x[:, None] + 0.3 * (x[:, None] @ system.A.mT + u @ system.B.mT)
+        return 0.3 * ((u @ cost.R(x[0])) * u).sum(-1) + ((after @ P) * after).sum(-1)
+
+    assert problem.controls.contains(u).all()
+    assert (paid(u[:, None])[:, 0] <= paid(grid[None]).amin(1) + 1e-12).all()
+    assert (paid(0.9 * u[:, None])[:, 0] > paid(u[:, None])[:, 0]).all(), "another control costs more"
 
 
 def test_sontags_formula_is_refused_where_controls_are_limited(V):

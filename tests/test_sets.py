@@ -2,14 +2,16 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import lsq_linear
 from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
-from lyapnet.sets import CONTROL_SETS, Box, Unbounded
+from lyapnet.sets import CONTROL_SETS, Box, ControlBox, Unbounded
 
 
 def seeded(seed=0):
@@ -123,7 +125,10 @@ def test_only_the_unbounded_set_itself_has_no_limits():
     assert Halved().limited, "else its own law would be passed over, and an optimum without limits be its own"
 
 
-@pytest.mark.parametrize("controls", CONTROL_SETS.values(), ids=CONTROL_SETS)
+SETS = {**CONTROL_SETS, "box": lambda: ControlBox([-0.3, -0.1], [0.1, 0.4])}
+
+
+@pytest.mark.parametrize("controls", SETS.values(), ids=SETS)
 def test_every_registered_set_keeps_its_contract(controls):
     """The minimum and every projection lie in the set; no admitted control is better than the minimum."""
     controls, b, others = controls(), torch.randn(50, 2), torch.randn(50, 200, 2)
@@ -140,3 +145,75 @@ def test_every_registered_set_keeps_its_contract(controls):
     assert (objective(u)[:, None] <= objective(controls.project(others)) + 1e-12).all()
     assert not (objective(0.9 * u)[:, None] <= objective(u[:, None])).any(), "a control that is not the minimum"
     assert not controls.contains(torch.tensor([0.0, math.nan]))
+
+
+def cheapest(R, b, lower, upper):
+    """argmin of uᵀRu + bᵀu within limits, by scipy's solver of bounded least squares."""
+    root = np.linalg.cholesky(R).T
+    return lsq_linear(root, -np.linalg.solve(root.T, b) / 2, (lower, upper), method="bvls", tol=1e-14).x
+
+
+@pytest.mark.parametrize("m", range(1, 5))
+def test_within_limits_the_minimum_is_that_of_another_solver(m):
+    """Some controls are held at a limit, in some states; the clipped minimum of all is another."""
+    factor, b = torch.randn(400, m, m), 4 * torch.randn(400, m)
+    R = factor @ factor.mT + 0.05 * torch.eye(m)
+    lower, upper = -torch.rand(m), torch.rand(m)
+    controls = ControlBox(lower, upper)
+    u = controls.minimise(R, b)
+    expected = np.stack([cheapest(*map(np.asarray, (*one, lower, upper))) for one in zip(R, b, strict=True)])
+    assert_close(u, torch.from_numpy(expected), rtol=0, atol=1e-9)
+    held = ((u == lower) | (u == upper)).double().mean()
+    assert 0.2 < float(held) < 0.9
+    assert controls.contains(u).all(), "to the last bit"
+    clipped = controls.project(Unbounded().minimise(R, b))
+    assert torch.allclose(u, clipped) == (m == 1)
+    assert_close(controls.minimise(R[7], b[7]), u[7])
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_limits_on_one_side_or_none(m):
+    factor, b = torch.randn(50, m, m), torch.randn(50, m)
+    R = factor @ factor.mT + torch.eye(m)
+    free = Unbounded().minimise(R, b)
+    assert_close(ControlBox(-math.inf, math.inf).minimise(R, b), free)
+    above = ControlBox(0.0, math.inf).minimise(R, b)
+    assert (above >= 0).all()
+    assert (above == 0).any()
+    assert above.isfinite().all()
+    assert_close(above[(free > 0).all(-1)], free[(free > 0).all(-1)])
+    assert_close(ControlBox([0.2] * m, [0.2] * m).minimise(R, b), torch.full((50, m), 0.2))
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_within_limits_what_is_no_number_stays_none(m):
+    """A law that hid it behind a limit would look as if V were known."""
+    u = ControlBox(-1.0, 1.0).minimise(torch.eye(m).expand(2, m, m), torch.tensor([[math.nan] * m, [1.0] * m]))
+    assert u[0].isnan().all()
+    assert_close(u[1], torch.full((m,), -0.5))
+
+
+def test_the_minimum_within_limits_has_a_gradient_where_controls_are_free():
+    R, b = torch.tensor([[2.0, 0.5], [0.5, 1.0]]), torch.tensor([1.0, -10.0], requires_grad=True)
+    u = ControlBox(-1.0, 1.0).minimise(R, b)
+    assert u[1] == 1
+    (slope,) = torch.autograd.grad(u[0], b)
+    assert_close(slope, torch.tensor([-0.25, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "reason"),
+    [
+        (1.0, -1.0, "lower ≤ upper"), (math.nan, 1.0, "lower ≤ upper"), (math.inf, math.inf, "lower ≤ upper"),
+        ([-1.0], [1.0, 2.0], "one for each control"), ([-1.0] * 5, [1.0] * 5, "at most 4 controls"),
+    ],
+)  # fmt: skip
+def test_limits_without_meaning_are_refused(lower, upper, reason):
+    with pytest.raises(ValueError, match=f"Expected .*{reason}"):
+        ControlBox(lower, upper)
+
+
+@pytest.mark.parametrize("m", [1, 3, 5])
+def test_limits_of_another_number_of_controls_are_refused(m):
+    with pytest.raises(ValueError, match=f"Expected limits of {m} controls, and of no more than 4, got 2"):
+        ControlBox([-1.0, -1.0], [1.0, 1.0]).minimise(torch.eye(m), torch.ones(m))

@@ -95,7 +95,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
         "states": controller.system.state_labels,
         "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
         "cost": _cost(controller, config),
-        "controls": {"name": config.controls.name, **config.controls.parameters},
+        "controls": {name: value for name, value in vars(config.controls).items() if value not in (None, {})},
         "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
         "horizon": {"steps": horizon.steps, "dt": horizon.dt, "duration": horizon.duration},
         "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},

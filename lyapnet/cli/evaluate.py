@@ -77,7 +77,7 @@ def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation
     from lyapnet.evaluation import figures
 
     drawn = {
-        "trajectories": figures.trajectories(controller.rollout(measured.table.x0[:12]), controller.system),
+        "trajectories": figures.trajectories(controller.rollout(measured.table.x0[:12]), controller.problem),
         "value_slices": figures.value_slices(controller.value, controller.problem),
     }
     if measured.result()["cost_ratio"] is not None:

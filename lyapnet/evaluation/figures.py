@@ -1,5 +1,6 @@
 """Tables drawn as matplotlib figures: what a controller does, and where its condition holds."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -141,9 +142,9 @@ def _draw_line_region(
     legend_below(figure, [*axes.get_legend_handles_labels()[0], *twin.get_legend_handles_labels()[0]], columns=3)
 
 
-def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
-    """States, controls, and V with the cost still to come, over time, of a batch (b,) of closed loops."""
-    to_go = trajectory.cost - trajectory.running_cost
+def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
+    """States, controls and their limits, and V with the cost still to come, over time, of a batch (b,) of loops."""
+    system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
@@ -156,6 +157,10 @@ def trajectories(trajectory: Trajectory, system: ControlAffineSystem) -> Figure:
         panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
         panel.axhline(0, color=GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
+    for limit in problem.controls.limits or ():
+        for panel, height in zip(panels[system.n : len(curves)], limit.expand(system.m).tolist(), strict=True):
+            if math.isfinite(height):
+                panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
     last = panels[len(curves)]
     for name, paths, style in (
         ("cost to go", to_go, {"color": ORANGE}),

@@ -37,7 +37,9 @@ class Evaluation(NamedTuple):
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
         terminal = dict(zip(self.system.state_labels, self.table.terminal_state.abs().mean(0).tolist(), strict=True))
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
-        return {**self.table.summary(), **paper, "terminal_errors": terminal, **counts, **self._note()}
+        limits = self.table.use_of_limits(self.system.control_names)
+        used = {"at_limits": limits} if limits else {}
+        return {**self.table.summary(), **paper, "terminal_errors": terminal, **used, **counts, **self._note()}
 
     def write(self, path: Path) -> None:
         """The table as comma-separated values with a line of names and units.

@@ -1,12 +1,13 @@
 """What a controller costs where its assumptions fail: other initial states, another plant, noise, a finer grid."""
 
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from lyapnet.build import physical_parameters, with_parameters
+from lyapnet.build import with_parameters
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
@@ -15,10 +16,26 @@ from lyapnet.problem import Horizon, Problem
 from lyapnet.random_streams import TEST, stream
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
+from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
 
 BEYOND = 0.2  # relative to X₀'s extent, and to each physical parameter
 NOISE = 0.01  # standard deviation at each evaluation of the policy, relative to the undisturbed loop's largest |x_i|
+
+
+def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """The positive real numbers among a constructor's arguments; gravity is no property of a system.
+
+    An integer counts where the constructor asks for a float: 1 kg, but not 3 links.
+    """
+    arguments = inspect.signature(type(system)).parameters
+    return {
+        name: float(value)
+        for name, value in parameters.items()
+        if name != "gravity"
+        and (type(value) is float or (type(value) is int and arguments[name].annotation in (float, "float")))
+        and value > 0
+    }
 
 
 class Disturbance(NamedTuple):

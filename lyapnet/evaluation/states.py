@@ -1,5 +1,6 @@
 """A row for each initial state of a batch of closed loops, and what the rows add up to."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,8 @@ from lyapnet.problem import Problem
 from lyapnet.programs import Program
 from lyapnet.programs.terms import hinge, satisfied
 from lyapnet.rollout import Trajectory
-from lyapnet.types import PerState, State
+from lyapnet.sets import ControlSet
+from lyapnet.types import ControlPath, PerState, State
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,7 @@ class StateTable:
     decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
     terminal_state: State  # x_N
     terminal_error: PerState  # ‖x_N − goal‖
+    at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
 
     def rows(self, chosen: slice) -> "StateTable":
         """The table of some of the states."""
@@ -55,6 +58,15 @@ class StateTable:
             "satisfied_fraction_1e-3": _share(self.satisfied(1e-3)),
             "satisfied_fraction_1e-6": _share(self.satisfied(1e-6)),
         }
+
+    def use_of_limits(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Of each control: the share of all steps at its lower and upper limit, and of states that meet either."""
+        if self.at_limits is None:
+            return {}
+        met = self.at_limits.any(1).to(self.at_limits)
+        shares = torch.cat([self.at_limits.mean(0), met.mean(0, keepdim=True)]).mT.tolist()
+        keys = ("lower", "upper", "states")
+        return {name: dict(zip(keys, own, strict=True)) for name, own in zip(names, shares, strict=True)}
 
     def against_optimum(self) -> dict[str, float | None]:
         """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""
@@ -86,7 +98,14 @@ def measure(
         decreasing=(values.diff(dim=0) <= 0).all(0),
         terminal_state=trajectory.x[-1],
         terminal_error=torch.linalg.vector_norm(trajectory.x[-1] - problem.goal.to(trajectory.x), dim=-1),
+        at_limits=_at_limits(problem.controls, trajectory.u),
     )
+
+
+def _at_limits(controls: ControlSet, u: ControlPath) -> Tensor | None:
+    if controls.limits is None or not controls.limited:
+        return None
+    return torch.stack([(u == limit.to(u)).to(u).mean(0) for limit in controls.limits], 1)
 
 
 def _share(holds: Tensor) -> float:

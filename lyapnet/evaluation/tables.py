@@ -33,6 +33,11 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
             table.add_row(label, measured(key, result[key]))
     for name, error in result["terminal_errors"].items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
+    for name, share in result.get("at_limits", {}).items():
+        table.add_row(
+            f"{name} at its lower, upper limit: share of steps (of states that meet one)",
+            f"{share['lower']:.1%}, {share['upper']:.1%} ({share['states']:.0%})",
+        )
     table.caption = _caption([result])
     return table
 

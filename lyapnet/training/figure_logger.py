@@ -45,7 +45,7 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
         sample = learner.rollout(x0)
     return {
         "certified_region": figures.certified_region(learner.rollout, problem),
-        "trajectories": figures.trajectories(sample, problem.system),
+        "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),
     }
 

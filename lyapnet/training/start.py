@@ -154,8 +154,8 @@ def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
-    """What can be known of the value function before training, by name; finite, and for unlimited controls."""
-    if problem.controls.limited:
+    """What can be known of the value function before training, by name, and finite; for controls in a box, or all."""
+    if problem.controls.limits is None:
         return
     at_goal = riccati(problem)
     if all(part.isfinite().all() for part in at_goal):

@@ -82,7 +82,7 @@ def test_figures_are_drawn_with_units(drawing):
     name, problem, V, rollout = drawing
     with torch.no_grad():
         sample = rollout(problem.initial_states.sample(5))
-    paths = figures.trajectories(sample, problem.system)
+    paths = figures.trajectories(sample, problem)
     slices = figures.value_slices(V, problem)
     for figure in (region(problem, V, rollout), paths, slices):
         assert isinstance(figure, Figure)

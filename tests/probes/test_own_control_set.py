@@ -111,7 +111,7 @@ def test_the_command_measures_within_the_limits_and_refuses_without(checkpoint, 
 def test_the_oracles_say_that_they_know_no_limits(checkpoint, limits):
     problem = lyapnet.load(checkpoint, controls=limits(LIMIT)).problem
     for limited in (problem, problem.replaced(system=lyapnet.SYSTEMS["cartpole"](), initial_states=cube(4))):
-        with pytest.raises(OracleError, match="Expected controls without limits for an optimum, got Limits"):
+        with pytest.raises(OracleError, match=r"Expected controls without limits, or .*, got Limits"):
             oracle_of(limited)
     assert oracle_of(problem.replaced(controls=lyapnet.Unbounded()))(torch.ones(1, 2)).isfinite().all()
 

@@ -15,7 +15,7 @@ from lyapnet.files import read_json
 from lyapnet.training.build import build_module
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
-from lyapnet.training.recovery import RETURNS, RISE, SLOWER, RisingCost
+from lyapnet.training.recovery import MOST, RETURNS, RISE, SLOWER, RisingCost
 
 
 @pytest.fixture
@@ -123,7 +123,9 @@ def test_a_rising_cost_is_a_divergence(config, tmp_path):
     trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
 
     def validate(watch, cost):
-        module.members[0].validation = SimpleNamespace(summary=lambda: {"cost_mean": cost})
+        few = int((1 - MOST) * 64)  # that cost far more
+        costs = torch.cat([torch.full((64 - few,), cost), torch.full((few,), 1e6)])[torch.randperm(64)]
+        module.members[0].validation = SimpleNamespace(cost=costs)
         watch.on_validation_end(trainer, module)
 
     for cost in (3.0, 2.0, 0.99 * 2 * RISE, 2.0):

@@ -10,6 +10,7 @@ from torch.testing import assert_close
 
 from lyapnet import load, train
 from lyapnet.checkpoint import read_checkpoint
+from lyapnet.cli import main
 from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
@@ -87,6 +88,24 @@ def test_far_from_the_goal_optima_are_the_best_start():
     assert costs[CALM] > 10 * start.chosen.cost
     mean = learner.rollout(learner.problem.initial_states.sample(64)).cost.mean()
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
+
+
+def test_within_limits_optima_are_a_start_too(tmp_path, capsys):
+    """Without limits, the best start costs less, and its controls are larger."""
+    limited = {**SWING, "controls": {"lower": -9, "upper": 9}, "logs": str(tmp_path)}
+    brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
+             "rollout.compile=off"]  # fmt: skip
+    run = train(limited, brief)
+    used = run.evaluation["at_limits"]["torque"]
+    assert used["states"] == 1
+    assert 0 < used["lower"] + used["upper"] < 0.5
+    assert run.evaluation["cost_ratio"] < 1.2
+    assert main(["evaluate", str(run.best), "--samples", "3"]) == 0
+    assert "torque at its lower, upper limit" in " ".join(capsys.readouterr().out.split())
+    trajectory = load(run.best).rollout(torch.tensor([[math.pi, 0.2]]))
+    assert float(trajectory.u.abs().max()) == 9
+    (learner,), _ = started(SWING)
+    assert float(learner.rollout(torch.tensor([[math.pi, 0.2]])).u.detach().abs().max()) > 9
 
 
 @pytest.mark.parametrize("task", [LINEAR, SWING])

@@ -315,4 +315,4 @@ def _closed_loops(controller: Controller) -> dict[str, Figure]:
         region = certified_region(controller.rollout, controller.problem)
         figures["certified_region"] = region
     x0 = controller.initial_states.sample(12, stream(controller.config.seed, FIGURES))
-    return {**figures, "trajectories": trajectories(controller.rollout(x0), controller.system)}
+    return {**figures, "trajectories": trajectories(controller.rollout(x0), controller.problem)}

@@ -31,27 +31,27 @@ __all__ = [
 def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
 
-    With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear` and
-    R a matrix, else by direct transcription. With any other integrator it is that of the continuous task, by the
-    Riccati equation alone.
+    With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear`, R
+    a matrix and U = ℝᵐ, else by direct transcription, within the limits of U. With any other integrator it is that of
+    the continuous task, by the Riccati equation alone.
 
     Raises:
         OracleError: there is none; says why, and what to do.
         ValueError: a weight of the cost does not fit the system's dimensions.
     """
-    if problem.controls.limited:
+    if problem.controls.limits is None:
         raise OracleError(
-            f"Expected controls without limits for an optimum, got {type(problem.controls).__name__}; costs stand "
-            "alone."
+            f"Expected controls without limits, or a set that tells its `limits`, for an optimum, got "
+            f"{type(problem.controls).__name__}; costs stand alone."
         )
     system, cost, horizon = problem.system, problem.cost, problem.horizon
-    if is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
+    if not problem.controls.limited and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         return RiccatiOracle(solve(system, cost, horizon))
     if method != "euler":
         raise OracleError(
-            f"Expected rollout.method=euler for the optimum of a nonlinear task, got {method}; the transcription has "
-            "Euler's steps."
+            f"Expected rollout.method=euler for the optimum of a nonlinear or limited task, got {method}; the "
+            "transcription has Euler's steps."
         )
     if importlib.util.find_spec("casadi") is None:
         raise OracleError(

@@ -24,7 +24,7 @@ BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and ho
 
 
 class Transcription(Oracle):
-    """min over x₁ … x_N, u₀ … u_{N−1} of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu).
+    """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu).
 
     The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
     the goal, random curves, the controls that the caller knows, and the optima of its neighbours in the batch. The
@@ -53,6 +53,13 @@ class Transcription(Oracle):
         self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
         self._solver = _solver(step, end, horizon.steps, iterations)
+        limits = self.problem.controls.limits
+        assert limits is not None  # oracle_of asks before
+        free = np.full(system.n * horizon.steps, np.inf)
+        self._bounds = [
+            np.concatenate([np.tile(side.expand(system.m).numpy(), horizon.steps), sign * free])
+            for side, sign in zip(limits, (-1, 1), strict=True)
+        ]
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
@@ -141,14 +148,17 @@ class Transcription(Oracle):
 
     def minimise(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
         """The local minimum that IPOPT finds from a start, or its reason for none."""
-        result = self._solver(x0=np.concatenate([start.u.ravel(), start.x.ravel()]), p=x0, lbg=0, ubg=0)
+        lower, upper = self._bounds
+        guess = np.concatenate([start.u.ravel(), start.x.ravel()])
+        result = self._solver(x0=guess, p=x0, lbx=lower, ubx=upper, lbg=0, ubg=0)
         status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()
         if status != "Solve_Succeeded":
             return f"IPOPT: {status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
-        return Candidate(x.reshape(start.x.shape), u.reshape(start.u.shape), float(result["f"]))
+        u = self.problem.controls.project(torch.from_numpy(u.reshape(start.u.shape))).numpy()  # which IPOPT may pass
+        return Candidate(x.reshape(start.x.shape), u, float(result["f"]))
 
     def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
         """The costs of the best controls in a rollout, where that confirms them."""

@@ -12,7 +12,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
     from lyapnet.controller import Controller, load
-    from lyapnet.cost import Cost, QuadraticCost
+    from lyapnet.cost import Cost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
     from lyapnet.interpolation import Table
     from lyapnet.policy import HJBPolicy, SontagPolicy
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
     "controller": ["Controller", "load"],
-    "cost": ["Cost", "QuadraticCost"],
+    "cost": ["Cost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
     "policy": ["HJBPolicy", "SontagPolicy"],
@@ -62,6 +62,7 @@ __all__ = [
     "Rollout",
     "SontagPolicy",
     "Table",
+    "TargetCost",
     "Tolerances",
     "Trajectory",
     "Unbounded",

@@ -199,6 +199,8 @@ class Config:
     controls: ControlsConfig = field(default_factory=ControlsConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
+    target: list[float] | None = option(None, "x*, the state that the cost is about; null: its own goal.")
+    target_control: list[float] | None = option(None, "u*, likewise; null: what holds x*, f(x*) + g(x*)u* = 0.")
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
+from lyapnet.beyond import ContinuedPolicy
 from lyapnet.build import (
     REGISTRIES,
     Parts,
@@ -25,7 +26,7 @@ from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, SystemConfig, config_from_plain
 from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
-from lyapnet.policy import HJBPolicy
+from lyapnet.policy import HJBPolicy, ValuePolicy
 from lyapnet.problem import Horizon, Problem
 from lyapnet.programs import Program, ValueProgram
 from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
@@ -56,6 +57,7 @@ class Controller:
         rollout: Rollout | None = None,
         program: Program | None = None,
         config: Config | None = None,
+        beyond: str | None = None,
     ):
         """A controller of parts.
 
@@ -65,6 +67,7 @@ class Controller:
             rollout: the closed loop of V; None: that of the HJB policy under Euler.
             program: what V was trained for, and so what a certificate asks of it; None: the value program.
             config: of the run that trained it, where there was one.
+            beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load.
         """
         self.problem, self._config = problem, config
         self.program = ValueProgram() if program is None else program
@@ -72,6 +75,9 @@ class Controller:
         self._rollout = Rollout(problem, HJBPolicy(problem, V), gradient="backprop") if rollout is None else rollout
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
+        policy = self.closed_loop.policy
+        assert isinstance(policy, ValuePolicy)  # as it has a V
+        self._continued = ContinuedPolicy(problem, policy, beyond)
 
     @property
     def config(self) -> Config:
@@ -129,34 +135,41 @@ class Controller:
     @overload
     def value(self, t: ArrayLike, x: ArrayLike) -> np.ndarray: ...
     def value(self, t: Any, x: Any) -> Any:
-        """V(t, x): t scalar or (*batch,) in s, x (*batch, n); returns (*batch,).
+        """V(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch,).
 
         Raises:
-            ValueError: the shapes do not fit; names the expected ones.
+            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self.V, t, x)
+        return self._answer(self._continued.V, t, x)
 
     @overload
     def policy(self, t: Tensor | float, x: Tensor) -> Tensor: ...
     @overload
     def policy(self, t: ArrayLike, x: ArrayLike) -> np.ndarray: ...
     def policy(self, t: Any, x: Any) -> Any:
-        """u(t, x): t scalar or (*batch,) in s, x (*batch, n); returns (*batch, m).
+        """u(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch, m).
 
         Raises:
-            ValueError: the shapes do not fit; names the expected ones.
+            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self.closed_loop.policy, t, x)
+        return self._answer(self._continued, t, x)
 
-    def rollout(self, x0: Any) -> Trajectory:
-        """The closed loop from x₀ (*batch, n), over the whole horizon; a Trajectory of what x₀ is, tensors or arrays.
+    def rollout(self, x0: Any, steps: int | None = None) -> Trajectory:
+        """The closed loop from x₀ (*batch, n); a Trajectory of what x₀ is, tensors or arrays.
+
+        Args:
+            steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state.
 
         Raises:
             ValueError: the shape does not fit.
             DivergenceError: the closed loop leaves the finite numbers.
         """
+        rollout = self._rollout
+        if steps is not None and steps != self.horizon.steps:
+            problem = self.problem.replaced(horizon=Horizon(steps, self.horizon.dt))
+            rollout = Rollout(problem, self._continued, self.method, gradient="backprop")
         with torch.no_grad():
-            trajectory = self._rollout(self._state(x0))
+            trajectory = rollout(self._state(x0))
         return Trajectory(*(_like(x0, field) for field in trajectory))
 
     def _answer(self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any) -> Any:
@@ -170,6 +183,8 @@ class Controller:
         batch = tuple(state.shape[:-1])
         if time.ndim and tuple(time.shape) != batch:
             raise ValueError(f"Expected t scalar or of shape {batch}, got {tuple(time.shape)}; give a time per state.")
+        if bool((time < 0).any()):
+            raise ValueError(f"Expected t ≥ 0, got {float(time.min()):g}; the horizon begins at 0.")
         return time, state
 
     def _state(self, x: Any) -> Tensor:
@@ -197,6 +212,7 @@ def load(
     controls: ControlSet | None = None,
     program: Program | None = None,
     device: str | torch.device = "cpu",
+    beyond: str | None = None,
 ) -> Controller:
     """The controller of a checkpoint. Nothing that the file names is imported or run.
 
@@ -207,6 +223,8 @@ def load(
         system, cost, controls, program: each is needed where the run's own is not a registered one, and replaces it.
         network: likewise, the class of a network that is not one of NETWORKS.
         device: where the tensors go.
+        beyond: the law after T: hold, that of t = T; receding, that of t = 0; riccati, the linear-quadratic regulator
+            of the goal; or error. None: hold, with a note when it first counts.
 
     Raises:
         UsageError: no such file; or a part of the user's own that was not passed.
@@ -228,7 +246,7 @@ def load(
         )  # fmt: skip
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
-    return Controller(problem, V, build_rollout(config, problem, V), own, config)
+    return Controller(problem, V, build_rollout(config, problem, V), own, config, beyond)
 
 
 def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:

@@ -18,17 +18,19 @@ class Cost(nn.Module, ABC):
     """ℓ(x, u) = q(x) + uᵀR(x)u in cost per second along the way, and φ(x) at the end.
 
     q and φ are smooth and nonnegative, R(x) is symmetric positive definite. A subclass writes `state`, `R` and
-    `terminal` with torch operations on tensors of any leading shape.
+    `terminal` with torch operations on tensors of any leading shape. About a target, u is counted from what holds it
+    there (TargetCost).
     """
 
     goal: Float[Tensor, " n"] | None  # where q and φ vanish; None: the origin
+    rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing; None: zero
     R_constant: Matrix | None  # R and R⁻¹, where they are the same at every state
     R_inverse: Matrix | None
 
     # Not persistent, here and in sets and systems: facts of the problem come from its config, never from a checkpoint.
     def __init__(self):
         super().__init__()
-        for name in ("goal", "R_constant", "R_inverse"):
+        for name in ("goal", "rest", "R_constant", "R_inverse"):
             self.register_buffer(name, None, persistent=False)
 
     @abstractmethod
@@ -52,8 +54,12 @@ class Cost(nn.Module, ABC):
         return gradient
 
     def control(self, x: State, u: Control) -> PerState:
-        """uᵀR(x)u."""
-        return _quadratic(self.R(x), u)
+        """uᵀR(x)u, or (u − u*)ᵀR(x)(u − u*)."""
+        return _quadratic(self.R(x), u if self.rest is None else u - self.rest)
+
+    def about_rest(self, R: ControlMatrix, b: Control) -> Control:
+        """b − 2Ru*, with which uᵀRu + (b − 2Ru*)ᵀu is (u − u*)ᵀR(u − u*) + bᵀu, but for a constant."""
+        return b if self.rest is None else b - 2 * apply(R, self.rest)
 
     def running(self, x: State, u: Control) -> PerState:
         """ℓ(x, u) = q(x) + uᵀR(x)u, in cost per second."""
@@ -178,6 +184,40 @@ def is_quadratic(cost: Cost) -> TypeGuard[QuadraticCost]:
     """Whether a cost is what its matrices say: no class or object put another function in the place of one of it."""
     own = ("state", "R", "terminal", "control", "running", "ignores")
     return all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
+
+
+class TargetCost(Cost):
+    """Another cost about a target: q(x − d) + (u − u*)ᵀR(x)(u − u*) and φ(x − d), d = x* − the goal of that cost.
+
+    Args:
+        cost: q, R and φ.
+        target: x*, (n,).
+        rest: u*, (m,), the control that costs nothing; what holds x* where something does.
+    """
+
+    shift: Float[Tensor, " n"]
+
+    def __init__(self, cost: Cost, target: Sequence[float] | Tensor, rest: Sequence[float] | Tensor):
+        super().__init__()
+        self.cost = cost
+        goal, u = (torch.as_tensor(entries, dtype=torch.get_default_dtype()) for entries in (target, rest))
+        self.register_buffer("goal", goal, persistent=False)
+        self.register_buffer("rest", u, persistent=False)
+        self.register_buffer("shift", goal - (0 if cost.goal is None else cost.goal), persistent=False)
+        for name in ("R_constant", "R_inverse"):
+            self.register_buffer(name, getattr(cost, name), persistent=False)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(x - self.shift)
+
+    def R(self, x: State) -> ControlMatrix:
+        return self.cost.R(x)
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(x - self.shift)
+
+    def terminal_gradient(self, x: State) -> State:
+        return self.cost.terminal_gradient(x - self.shift)
 
 
 class _RestrictedCost(Cost):

@@ -68,28 +68,32 @@ class Optimum(NamedTuple):
 def held_control(problem: Problem, x: State, V_x: State, H: Tensor) -> Control:
     """u held for Δt: the minimiser of Δt ℓ(x, u) + V(x + Δt(f + gu)) for V of gradient V_x at x + Δt f and curvature H.
 
-    It is the minimiser of ½ uᵀ(2R + Δt gᵀHg)u + V_xᵀgu over U: without limits, −(2R + Δt gᵀHg)⁻¹ gᵀV_x.
+    It is the minimiser of ½ uᵀ(2R + Δt gᵀHg)u + V_xᵀgu over U: without limits, −(2R + Δt gᵀHg)⁻¹ gᵀV_x. About a
+    target, u is counted from u*, and f is f + gu*.
     """
     g = problem.system.g(x)
     weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(g.mT, multiply(H, g))
+    b = apply(g.mT, V_x)
     if problem.controls.limited:
-        return problem.controls.minimise(weight / 2, apply(g.mT, V_x))
-    return -solve(weight, apply(g.mT, V_x)[..., None])[..., 0]
+        return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
+    u = -solve(weight, b[..., None])[..., 0]
+    return u if problem.cost.rest is None else u + problem.cost.rest
 
 
 def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
     """(n, x_n) ↦ u_n: the held control for V as one expansion has it."""
 
     def law(n: int, x: State) -> Control:
-        H, after = expansion.hessian[n + 1], x + problem.horizon.dt * problem.system.f(x)
+        H, after = expansion.hessian[n + 1], problem.drifted(x)
         return held_control(problem, x, expansion.gradient[n + 1] + apply(H, after - expansion.x[n + 1]), H)
 
     return law
 
 
-def no_control(problem: Problem) -> Callable[[int, State], Control]:
-    """(n, x_n) ↦ 0, or the control of U that is closest to it."""
-    return lambda _, x: problem.controls.project(x.new_zeros(*x.shape[:-1], problem.system.m))
+def at_rest(problem: Problem) -> Callable[[int, State], Control]:
+    """(n, x_n) ↦ the control that costs nothing, or the one of U that is closest to it."""
+    u = problem.controls.project(problem.rest)
+    return lambda _, x: u.to(x).expand(*x.shape[:-1], -1)
 
 
 class _Backward(NamedTuple):
@@ -104,7 +108,7 @@ def riccati(problem: Problem) -> Expansion:
     Limits of the controls are left out: near a goal that needs no control none is active.
     """
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
-    x, u = problem.goal.expand(N + 1, -1), torch.zeros(N, problem.system.m, dtype=torch.float64)
+    x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
     return _backward(problem, x, u, curved=False).expansion
 
 

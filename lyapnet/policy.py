@@ -47,8 +47,10 @@ class HJBPolicy(ValuePolicy):
     def _minimise(self, x: State, V_x: State) -> Control:
         b = input_lie_derivative(self.system, x, V_x)
         if self.controls.limited:
-            return self.controls.minimise(self.cost.R(x), b)
-        return -0.5 * self.cost.solve_R(x, b)  # with the one inverse of a constant R
+            R = self.cost.R(x)
+            return self.controls.minimise(R, self.cost.about_rest(R, b))
+        u = -0.5 * self.cost.solve_R(x, b)  # with the one inverse of a constant R
+        return u if self.cost.rest is None else u + self.cost.rest
 
 
 class SontagPolicy(ValuePolicy):
@@ -60,7 +62,7 @@ class SontagPolicy(ValuePolicy):
     the value function. With the true value function it is the HJB policy. Close to the goal a and σ are small
     differences of rounded numbers: in float32, u chatters within about ‖x‖ = 1e-4.
 
-    It is made for U = ℝᵐ.
+    It is made for U = ℝᵐ. About a target u is counted from u*, and f is f + gu*.
 
     Raises:
         ValueError: the problem limits its controls.
@@ -83,6 +85,8 @@ class SontagPolicy(ValuePolicy):
         LgV = input_lie_derivative(self.system, x, V_x)
         direction = self.cost.solve_R(x, LgV)
         a = V_t + drift_lie_derivative(self.system, x, V_x)
+        if self.cost.rest is not None:
+            a = a + (LgV * self.cost.rest).sum(-1)
         q = self.cost.state(x)
         sigma = (LgV * direction).sum(-1)
         # √ has no derivative at 0, which the goal reaches: keep its argument positive
@@ -92,7 +96,8 @@ class SontagPolicy(ValuePolicy):
         gain_falling = q / torch.where(falling, root - a, 1.0)
         gain_rising = (a + root) / torch.where(falling | (sigma <= 0), 1.0, sigma)
         gain = torch.where(falling, gain_falling, torch.where(sigma > 0, gain_rising, 0.0))
-        return -gain[..., None] * direction
+        u = -gain[..., None] * direction
+        return u if self.cost.rest is None else u + self.cost.rest
 
 
 class SampledPolicy(ValuePolicy):
@@ -103,7 +108,7 @@ class SampledPolicy(ValuePolicy):
     for V of curvature H along g; with U = ℝᵐ it is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With Euler steps of Δt and V = xᵀP_n x it
     is the optimal law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where
     Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the
-    Riccati solution at the goal.
+    Riccati solution at the goal. About a target, u is counted from u*, and f is f + gu*.
     """
 
     def __init__(self, problem: Problem, V: ValueFunction):
@@ -117,7 +122,7 @@ class SampledPolicy(ValuePolicy):
         after = (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
         H = self.V.curvature(after) if self.riccati is None else self.riccati(after)
         assert H is not None
-        V_x = self.V.value_and_state_gradient(after, x + self.problem.horizon.dt * self.system.f(x))[1]
+        V_x = self.V.value_and_state_gradient(after, self.problem.drifted(x))[1]
         return held_control(self.problem, x, V_x, H)
 
 

@@ -1,5 +1,6 @@
 """The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,10 @@ from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import State, Times
+from lyapnet.types import Control, State, Times
 
 TRIED = 64  # states at which functions of others are tried
+LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
 
 
@@ -75,6 +77,18 @@ class Problem(nn.Module):
         """The state (n,) at which q and φ vanish."""
         like = self.initial_states.lower
         return torch.zeros_like(like) if self.cost.goal is None else self.cost.goal.to(like)
+
+    @property
+    def rest(self) -> Control:
+        """The control (m,) that costs nothing: u*, zero where there is no target."""
+        rest = self.cost.rest
+        return self.goal.new_zeros(self.system.m) if rest is None else rest.to(self.goal)
+
+    def drifted(self, x: State) -> State:
+        """x + Δt(f(x) + g(x)u*): where a step leads with the control that costs nothing."""
+        rest = self.cost.rest
+        rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
+        return x + self.horizon.dt * rate
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts exchanged."""
@@ -158,6 +172,11 @@ class Problem(nn.Module):
                 "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
                 "φ": cost.terminal(x), "U": own.controls.minimise(torch.eye(m, dtype=x.dtype).expand(3, m, m), b),
             }  # fmt: skip
+        if cost.rest is not None:
+            numbers["u*"] = cost.rest.expand(3, m)
+        if own.controls.limits is not None:
+            for side, limit in zip(LIMITS, own.controls.limits, strict=True):
+                numbers[side] = limit.to(x).expand(1, m)
         return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
 
     def differences(self, record: Any) -> list[str]:
@@ -165,7 +184,8 @@ class Problem(nn.Module):
         own = self.record()
         if not isinstance(record, dict) or not _alike(record.get("x"), own.pop("x")):
             return []
-        return [name for name, value in own.items() if not _alike(record.get(name), value)]
+        free = {side: [[sign * math.inf] * self.system.m] for side, sign in LIMITS.items()}
+        return [name for name, value in own.items() if not _alike(record.get(name, free.get(name)), value)]
 
 
 def _alike(recorded: Any, own: list[Any]) -> bool:

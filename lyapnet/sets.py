@@ -3,7 +3,7 @@
 import itertools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -175,6 +175,23 @@ class ControlBox(ControlSet):
             )
         self.register_buffer("lower", low, persistent=False)
         self.register_buffer("upper", high, persistent=False)
+        self._limited = bool(low.isfinite().any() | high.isfinite().any())
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ControlBox":
+        """In another precision, limits are rounded inwards, so that no control exceeds those that were given."""
+        given = self.lower, self.upper
+        super()._apply(fn, recurse)
+        for name, old, inwards, other in zip(("lower", "upper"), given, (1, -1), reversed(given), strict=True):
+            new = getattr(self, name)
+            outside = (inwards * (old - new.to(old)) > 0) & (old != other)
+            setattr(
+                self, name, torch.where(outside.to(new.device), new.nextafter(inwards * new.new_tensor(torch.inf)), new)
+            )
+        return self
+
+    @property
+    def limited(self) -> bool:
+        return self._limited
 
     @property
     def limits(self) -> tuple[Tensor, Tensor]:
@@ -189,8 +206,9 @@ class ControlBox(ControlSet):
             )
         if m == 1:
             return self.project(-b / (2 * R[..., 0]))
+        dtype, R, b = b.dtype, R.double(), b.double()  # costs of single precision do not tell the ways apart
         held = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=m))).to(b)  # at lower, free, at upper
-        low, high = self.lower.expand(m), self.upper.expand(m)
+        low, high = self.lower.double().expand(m), self.upper.double().expand(m)
         sides = torch.where(held < 0, low, torch.where(held > 0, high, 0.0))
         exists = sides.isfinite().all(-1)
         u_held, free = sides.where(sides.isfinite(), 0), (held == 0).to(b)
@@ -198,11 +216,13 @@ class ControlBox(ControlSet):
         u_held, free = u_held[each], free[each]
         A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
         rest = free * (-b / 2 - apply(R, u_held)) + u_held
-        u = solve(A, rest[..., None])[..., 0]
+        u = torch.where(free == 0, u_held, solve(A, rest[..., None])[..., 0])
         fits = exists[each] & ((u >= low) & (u <= high) | (free == 0)).all(-1)
         cost = ((apply(R, u) + b) * u).sum(-1)
-        best = cost.where(fits | cost.isnan(), torch.inf).argmin(0)  # what is no number stays none
-        return self.project(u.gather(0, best[None, ..., None].expand(1, *b.shape))[0])
+        best = cost.where(fits & cost.isfinite(), torch.inf).argmin(0)
+        u = self.project(u.gather(0, best[None, ..., None].expand(1, *b.shape))[0].to(dtype))
+        known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
+        return torch.where(known[..., None], u, torch.nan)  # what is no number stays none
 
     def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
         return ((self.lower <= u) & (u <= self.upper)).all(-1)

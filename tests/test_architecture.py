@@ -15,7 +15,7 @@ LEVELS = (
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "networks"},
     {"policy"},
-    {"rollout"},
+    {"beyond", "rollout"},
     {"programs"},
     {"config"},
     {"build"},
@@ -28,8 +28,9 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "calculus", "contracts", "cost", "errors", "expansions", "files", "graphs", "interpolation", "linear_algebra",
-    "networks", "policy", "problem", "programs", "random_streams", "rollout", "sets", "systems", "types",
+    "beyond", "calculus", "contracts", "cost", "errors", "expansions", "files", "graphs", "interpolation",
+    "linear_algebra", "networks", "policy", "problem", "programs", "random_streams", "rollout", "sets", "systems",
+    "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

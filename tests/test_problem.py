@@ -16,7 +16,7 @@ from lyapnet.cost import Cost, QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.networks import FCN, Scaling
 from lyapnet.problem import Horizon
-from lyapnet.sets import Box, ControlSet, Unbounded
+from lyapnet.sets import Box, ControlBox, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem, DoubleIntegrator
 from tests.problems import problem_of
 
@@ -388,6 +388,9 @@ OTHERS = {
     "the end": ({"cost": cost_of(end=1.01)}, ["φ"]),
     "limits": ({"controls": Between(2.0)}, ["U"]),
     "other limits": ({"controls": Between(2.01)}, ["U"]),
+    "a box": ({"controls": ControlBox(-2.0, 2.0)}, ["U", "lower limits", "upper limits"]),
+    "a box that no control meets": ({"controls": ControlBox(-2e4, 2e4)}, ["lower limits", "upper limits"]),
+    "a box on one side": ({"controls": ControlBox(-math.inf, 2e4)}, ["upper limits"]),
 }
 
 
@@ -400,6 +403,24 @@ def test_another_problem_is_noticed_by_its_record(other, at_rest):
     common = {"system": DoubleIntegrator(), "initial_states": box}
     record = problem_of(**common | own).record()
     assert problem_of(**common | changes).differences(record) == expected
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "expected"),
+    [
+        ((-2e4, 2e4), (-2e4, 6e3), ["upper limits"]),
+        ((-1000.0, 8.0), (-1000.0, 8.09), ["upper limits"]),
+        ((-math.inf, 8.0), (-math.inf, 8.4), ["upper limits"]),
+        ((-8.0, 8.0), (-8.0, 8.0), []),
+    ],
+)
+def test_limits_are_told_apart(own, other, expected):
+    one, two = (problem_of(DoubleIntegrator(), controls=ControlBox(*sides)) for sides in (own, other))
+    found = two.differences(one.record())
+    assert [part for part in found if part != "U"] == expected
+    assert not one.differences(one.float().record())
+    free = problem_of(DoubleIntegrator())
+    assert free.differences(one.record()), "without limits it is another problem too"
 
 
 def test_the_precision_is_no_difference():

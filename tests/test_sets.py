@@ -185,6 +185,45 @@ def test_limits_on_one_side_or_none(m):
     assert_close(ControlBox([0.2] * m, [0.2] * m).minimise(R, b), torch.full((50, m), 0.2))
 
 
+@pytest.mark.parametrize("m", range(1, 5))
+def test_a_control_that_is_held_has_exactly_its_limit(m):
+    """And not a rounding less: shares of steps at a limit, and which controls answer to the state, go by that."""
+    factor, b = torch.randn(400, m, m), 8 * torch.randn(400, m)
+    R = factor @ factor.mT + 0.05 * torch.eye(m)
+    controls = ControlBox([-1.03, -0.37, -0.7, -0.21][:m], [1.03, 0.37, 0.7, 0.21][:m])
+    u = controls.minimise(R, b)
+    near = torch.minimum((u - controls.lower).abs(), (controls.upper - u).abs()) < 1e-12
+    assert near.any()
+    assert ((u == controls.lower) | (u == controls.upper))[near].all()
+
+
+def test_the_minimum_within_limits_in_single_precision():
+    """Of total costs, a small component drowns in a large one; and a matrix may seem singular."""
+    controls = ControlBox([-0.7, -0.7], [0.9, 0.9])
+    R, b = torch.tensor([[0.5345, -0.0826], [-0.0826, 0.3963]]), torch.tensor([-14041.8, 0.6738])
+    exact = controls.minimise(R, b)
+    assert float(exact[1]) == pytest.approx(-0.6625, abs=1e-3)
+    assert_close(controls.float().minimise(R.float(), b.float()), exact.float(), rtol=0, atol=1e-5)
+    wide = ControlBox(-1.0, 1.0).float().minimise(torch.ones(2, 2).float(), torch.tensor([0.5, 0.6]).float())
+    assert_close(wide, torch.tensor([0.7, -1.0]).float(), rtol=0, atol=0.06)
+
+
+@given(st.floats(-1e3, 1e3), st.floats(0, 1e3))
+def test_in_single_precision_limits_are_no_wider(low, width):
+    box = ControlBox([low], [low + width])
+    single = ControlBox([low], [low + width]).float()
+    if box.lower < box.upper:
+        assert single.lower.double() >= box.lower
+        assert single.upper.double() <= box.upper
+    assert_close(single.lower.double(), box.lower, rtol=3e-7, atol=1e-30)
+    assert single.lower.dtype == torch.float32
+
+
+def test_limits_that_are_none_are_no_limits():
+    assert not ControlBox([-math.inf], [math.inf]).limited
+    assert ControlBox([-math.inf], [0.0]).limited
+
+
 @pytest.mark.parametrize("m", [1, 2])
 def test_within_limits_what_is_no_number_stays_none(m):
     """A law that hid it behind a limit would look as if V were known."""

@@ -17,7 +17,7 @@ from lyapnet.certification.tables import floored
 from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
 from lyapnet.evaluation.figures import widest_axes
 from lyapnet.sets import Box
-from lyapnet.types import Value
+from lyapnet.types import State, Value
 
 NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
 
@@ -89,14 +89,14 @@ def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
 # Funnels
 
 
-def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[str]) -> Figure:
+def funnel(claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str]) -> Figure:
     """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
 
     One state is drawn over time; two at five times; more at t = 0 and t = T in slices through the goal, along the pairs
-    of the four widest states of X₀, all other states 0. States that the claim leaves out are not shown.
+    of the four widest states of X₀, all other states as there. States that the claim leaves out are not shown.
 
     Args:
-        V, initial_states, labels: of the states that the claim is about.
+        V, initial_states, goal, labels: of the states that the claim is about.
     """
     seen = [k for k in range(claim.states.dimension) if k not in claim.left_out]
     dimension = len(seen)
@@ -110,7 +110,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
         if dimension == 1:
             _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
         else:
-            _draw_slice(panel, claim, V, initial_states, labels, pair, handles)
+            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, handles)
     legend_below(figure, [*handles.values()], columns=2 if len(pairs) == 1 else 4)
     amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
     share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
@@ -119,14 +119,14 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[st
 
 
 def _draw_slice(
-    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, labels: Sequence[str], pair: tuple[int, int],
-    handles: dict[str, Artist],
+    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    pair: tuple[int, int], handles: dict[str, Artist],
 ) -> None:  # fmt: skip
     """One slice; what is new in it is added to the handles of the legend."""
     i, j = pair
     others = [k for k in range(len(labels)) if k not in (*pair, *claim.left_out)]
     grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
-    states = initial_states.lower.new_zeros(201, 201, len(labels))
+    states = goal.repeat(201, 201, 1)
     states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
     axes = [numpy_of(axis) for axis in grid]
     for t, level, colour, name in _levels(claim, fine=not others):
@@ -135,7 +135,7 @@ def _draw_slice(
         proved = level <= claim.rho + claim.delta * t
         _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
         handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
-    through = bool(((initial_states.lower <= 0) & (initial_states.upper >= 0))[others].all())
+    through = bool(((initial_states.lower <= goal) & (initial_states.upper >= goal))[others].all())
     name = "X₀" if through else "X₀, projected"
     box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
     handles.setdefault(name, box)
@@ -145,12 +145,12 @@ def _draw_slice(
         (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
         handles.setdefault(name, points)
     if claim.counterexample is not None:
-        _mark(panel, claim.counterexample, claim.states, pair, handles)
-    goal = panel.plot(0, 0, "*", color=GREEN, markersize=6, label="goal", linestyle="none")
-    handles.setdefault("goal", goal[0])
+        _mark(panel, claim.counterexample, claim.states, goal, pair, handles)
+    (star,) = panel.plot(*goal[[i, j]].tolist(), "*", color=GREEN, markersize=6, label="goal", linestyle="none")
+    handles.setdefault("goal", star)
     panel.set(xlim=axes[0][[0, -1]], ylim=axes[1][[0, -1]], xlabel=labels[i], ylabel=labels[j])
     if others:
-        panel.set_title(f"slice: {' = '.join(_name(labels[k]) for k in others)} = 0", fontsize=8)
+        panel.set_title(f"slice: {_held([_name(labels[k]) for k in others], goal[others])}", fontsize=8)
 
 
 def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]]:
@@ -190,10 +190,19 @@ def _draw_over_time(
     panel.set(xlim=(0, claim.duration), ylim=(low, high), xlabel="time (s)", ylabel=label)
 
 
-def _mark(panel: Axes, found: Counterexample, states: Box, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
+def _held(names: Sequence[str], values: State) -> str:
+    """Where a slice holds the states that it does not show: a = b = 0, or a = 1, b = 2."""
+    if not values.any():
+        return f"{' = '.join(names)} = 0"
+    return ", ".join(f"{name} = {value:.3g}" for name, value in zip(names, values.tolist(), strict=True))
+
+
+def _mark(
+    panel: Axes, found: Counterexample, states: Box, goal: State, pair: tuple[int, int], handles: dict[str, Artist]
+) -> None:
     """The counterexample: filled near the slice, hollow where only its projection lies in it."""
-    widths = states.widths.tolist()
-    near = all(abs(x) <= NEAR * widths[k] for k, x in enumerate(found.x) if k not in pair)
+    widths, away = states.widths.tolist(), (torch.tensor(found.x).to(goal) - goal).abs().tolist()
+    near = all(x <= NEAR * widths[k] for k, x in enumerate(away) if k not in pair)
     name = f"condition fails, t = {found.t:.3g} s" + ("" if near else " (projected onto the slice)")
     style = {"markerfacecolor": VERMILION if near else "none", "color": VERMILION, "markersize": 6}
     (point,) = panel.plot(found.x[pair[0]], found.x[pair[1]], "X", label=name, linestyle="none", **style)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +14,7 @@ from lyapnet.certification.certificates import Certificate
 from lyapnet.certification.tables import certificate_rows
 from lyapnet.config import Config
 from lyapnet.controller import Controller
-from lyapnet.cost import QuadraticCost
+from lyapnet.cost import Cost, QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
 from lyapnet.files import digest_of_file, write_atomically
 from lyapnet.provenance import versions
@@ -95,7 +96,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
         "states": controller.system.state_labels,
         "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
         "cost": _cost(controller, config),
-        "controls": {name: value for name, value in vars(config.controls).items() if value not in (None, {})},
+        "controls": _controls(controller, config),
         "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
         "horizon": {"steps": horizon.steps, "dt": horizon.dt, "duration": horizon.duration},
         "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},
@@ -120,6 +121,7 @@ def markdown(report: dict[str, Any]) -> str:
         "experiment": report["experiment"],
         "system": f"{report['system']['name']}{f': {parameters}' if parameters else ''}",
         "cost": ", ".join(f"{name} = {value}" for name, value in report["cost"].items()),
+        "controls": ", ".join(f"{name} = {value}" for name, value in report["controls"].items()) or "without limits",
         "horizon": f"{horizon['steps']} steps of {horizon['dt']:g} s, T = {horizon['duration']:g} s",
         "closed loop": f"policy {report['rollout']['policy']}, integrator {report['rollout']['method']}",
         "network": f"{report['network']['name']}, {report['network']['parameters']} parameters",
@@ -170,9 +172,29 @@ def _name(system: ControlAffineSystem) -> str:
     return next((name for name, known in SYSTEMS.items() if known is cls), f"{cls.__module__}:{cls.__qualname__}")
 
 
+def _controls(controller: Controller, config: Config) -> dict[str, Any]:
+    """The limits of U, None for none; of a set of the user's own its name; nothing where U is all of ℝᵐ."""
+    controls = controller.controls
+    if controls.limits is None:
+        return {"name": f"{type(controls).__module__}:{type(controls).__qualname__}", **config.controls.parameters}
+    if not controls.limited:
+        return {}
+    sides = (side.expand(controller.system.m).tolist() for side in controls.limits)
+    listed = ([limit if math.isfinite(limit) else None for limit in side] for side in sides)
+    return dict(zip(("lower", "upper"), listed, strict=True))
+
+
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
-    """The cost's matrices as the config has them; of any other cost its name and parameters."""
-    if isinstance(controller.cost, QuadraticCost):
+    """The cost's matrices as the config has them, or its name and parameters; and what it is about."""
+    cost = controller.cost
+    if isinstance(cost, TargetCost):
+        about = {"target": controller.problem.goal.tolist(), "target_control": controller.problem.rest.tolist()}
+        return {**_own_cost(cost.cost, config), **about}
+    return _own_cost(cost, config)
+
+
+def _own_cost(cost: Cost, config: Config) -> dict[str, Any]:
+    if isinstance(cost, QuadraticCost):
         return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T}
-    cls = type(controller.cost)
+    cls = type(cost)
     return {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters}

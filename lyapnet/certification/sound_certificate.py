@@ -104,7 +104,9 @@ class SoundCertificate(Certificate):
 
     def figure(self) -> figures.Figure:
         controller = self.controller
-        return figures.funnel(self.claim, controller.V, controller.initial_states, controller.system.state_labels)
+        return figures.funnel(
+            self.claim, controller.V, controller.initial_states, controller.problem.goal, controller.system.state_labels
+        )
 
 
 def sound_certificate(

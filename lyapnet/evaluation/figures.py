@@ -143,9 +143,13 @@ def _draw_line_region(
 
 
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
-    """States, controls and their limits, and V with the cost still to come, over time, of a batch (b,) of loops."""
+    """States, controls and their limits, and V with the cost still to come, over time, of a batch (b,) of loops.
+
+    Dotted: the goal, and the control that costs nothing.
+    """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
+    at_rest = torch.cat([problem.goal, problem.rest]).tolist()
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
     columns = _columns(len(curves) + 1)
@@ -153,9 +157,9 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels = list(grid.flatten(order="F"))
-    for panel, (label, values_over_time, color) in zip(panels, curves, strict=False):
+    for panel, (label, values_over_time, color), height in zip(panels, curves, at_rest, strict=False):
         panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
-        panel.axhline(0, color=GREY, linewidth=0.6, linestyle=":")
+        panel.axhline(height, color=GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
     for limit in problem.controls.limits or ():
         for panel, height in zip(panels[system.n : len(curves)], limit.expand(system.m).tolist(), strict=True):

@@ -11,9 +11,9 @@ from lyapnet.controller import Controller
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
 from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.problem import Problem
 from lyapnet.random_streams import TEST, stream
 from lyapnet.sizes import require_memory, size_of_loops
-from lyapnet.systems import ControlAffineSystem
 from lyapnet.tables import csv_text
 from lyapnet.types import ControlPath, State
 
@@ -27,7 +27,7 @@ class Evaluation(NamedTuple):
     paper: StateTable  # K = 100 further states
     notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
     seed: int
-    system: ControlAffineSystem
+    problem: Problem
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -35,9 +35,10 @@ class Evaluation(NamedTuple):
         Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
-        terminal = dict(zip(self.system.state_labels, self.table.terminal_state.abs().mean(0).tolist(), strict=True))
+        system, errors = self.problem.system, (self.table.terminal_state - self.problem.goal).abs().mean(0)
+        terminal = dict(zip(system.state_labels, errors.tolist(), strict=True))
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
-        limits = self.table.use_of_limits(self.system.control_names)
+        limits = self.table.use_of_limits(system.control_names)
         used = {"at_limits": limits} if limits else {}
         return {**self.table.summary(), **paper, "terminal_errors": terminal, **used, **counts, **self._note()}
 
@@ -47,7 +48,7 @@ class Evaluation(NamedTuple):
         Raises:
             OSError: the file cannot be written.
         """
-        table, states = self.table, self.system.state_labels
+        table, states = self.table, self.problem.system.state_labels
         optimal = torch.full_like(table.cost, torch.nan) if table.optimal_cost is None else table.optimal_cost
         columns = {
             **dict(zip(states, table.x0.unbind(-1), strict=True)),
@@ -105,13 +106,13 @@ def evaluation(
         table = measure(controller.problem, controller.program, trajectory)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     if not optimum:
-        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.system)
+        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.problem)
     try:
         optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
     except OracleError as reason:
-        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.system)
+        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.problem)
     return Evaluation(
-        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.system
+        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.problem
     )
 
 

@@ -4,6 +4,7 @@ The truth of a comparison is a number, 1 or 0, and ½ ± ½ on a box that does n
 room for rounding: of two boxes that touch where a comparison turns, at least one is undecided.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -67,9 +68,13 @@ def minimum(x: Any, y: Any) -> TaylorForm:
 
 
 def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:
-    """min(max(x, low), high), of which each may depend on the point."""
-    x = x if low is None else maximum(x, low)
-    return x if high is None else minimum(x, high)
+    """min(max(x, low), high), of which each may depend on the point; a constant infinity is no limit."""
+    x = x if low is None or _is_constant(low, -math.inf) else maximum(x, low)
+    return x if high is None or _is_constant(high, math.inf) else minimum(x, high)
+
+
+def _is_constant(y: Any, value: float) -> bool:
+    return isinstance(y, Tensor) and bool((y == value).all())
 
 
 # Truths

@@ -6,6 +6,7 @@ The options are the fields of the config's network section that the constructor 
 from lyapnet.calculus import ValueFunction
 from lyapnet.networks.anchored import AnchoredNetwork, GoalAnchor, TerminalAnchor
 from lyapnet.networks.base import ACTIVATIONS, Scaling
+from lyapnet.networks.centred import CentredNetwork
 from lyapnet.networks.expansion import ExpansionNetwork
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
@@ -26,6 +27,7 @@ __all__ = [
     "ICNN",
     "NETWORKS",
     "AnchoredNetwork",
+    "CentredNetwork",
     "ExpansionNetwork",
     "GoalAnchor",
     "IgnoringStates",

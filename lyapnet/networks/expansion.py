@@ -14,6 +14,7 @@ from lyapnet.networks.fcn import FCN
 from lyapnet.types import PerState, State, Time
 
 FEW = 4  # states for which a narrower network is enough
+ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
 NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
 
 
@@ -91,11 +92,11 @@ class ExpansionNetwork(ValueFunction):
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
         self.expansion.take(t, torch.cat(parts, 1))
-        self.at_goal.fill_(float(not value.any()))
         early = curvature[: max(1, 3 * len(curvature) // 4)].mean(0) / 2
         values, vectors = torch.linalg.eigh(early)
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
         s = (apply(vectors.mT, spread) ** 2 * values).sum(-1).mean() / self.n
+        self.at_goal.fill_(float(value.abs().max() <= ROUNDING * s))
         s = s.clamp_min(1e-6 * float(value.abs().max()))  # no spread: X₀ is a point
         if s > 0:
             self.scale.copy_(s)

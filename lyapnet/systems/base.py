@@ -39,6 +39,12 @@ class ControlAffineSystem(nn.Module, ABC):
         """ẋ = f(x) + g(x)u."""
         return self.f(x) + apply(self.g(x), u)
 
+    def holding_control(self, x: State) -> tuple[Control, State]:
+        """u that holds a state (n,), f(x) + g(x)u = 0, and the ẋ that stays: by least squares, of least norm."""
+        f, g = self.f(x), self.g(x)
+        u = -apply(torch.linalg.pinv(g), f)
+        return u, f + apply(g, u)
+
     @property
     def n(self) -> int:
         """Number of states."""

@@ -43,28 +43,38 @@ def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
 
 
 def _task(problem: Problem) -> Fact:
-    horizon, system = problem.horizon, problem.system
+    horizon, system, controls = problem.horizon, problem.system, problem.controls
+    limits = ""
+    if controls.limited:
+        sides = None if controls.limits is None else [_listed(side.expand(system.m)) for side in controls.limits]
+        limits = f" in {type(controls).__name__}" if sides is None else f" between {sides[0]} and {sides[1]}"
     return Fact(
         "task",
-        f"{type(system).__name__}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}; "
+        f"{type(system).__name__}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}; "
         f"T = {horizon.duration:g} s in {_counted(horizon.steps, 'step')}",
     )
 
 
 def _goal(problem: Problem) -> Fact:
     """Whether the goal is an equilibrium, or which control makes it one."""
-    f, g = problem.system.f(problem.goal), problem.system.g(problem.goal)
-    if float(f.abs().max()) <= 1e-9:
-        return Fact("goal", "an equilibrium without control")
-    u = -torch.linalg.lstsq(g, f[:, None]).solution[:, 0]
-    residual = float((f + g @ u).abs().max())
-    if residual <= 1e-9 * float(f.abs().max()):
+    goal, system = problem.goal, problem.system
+    f, rest = system.f(goal), system.dynamics(goal, problem.rest)
+    where = f"{_listed(goal)}, " if goal.any() else ""
+    if not bool(problem.controls.contains(problem.rest)):
+        return Fact("goal", f"{where}u = {_listed(problem.rest)} is beyond its limits", "the cost has no rest there")
+    if float(rest.abs().max()) <= 1e-9 * max(1.0, float(f.abs().max())):
+        control = f"at u = {_listed(problem.rest)}" if problem.rest.any() else "without control"
+        return Fact("goal", f"{where}an equilibrium {control}")
+    u, left = system.holding_control(goal)
+    if float(left.abs().max()) <= 1e-9 * float(f.abs().max()):
         return Fact(
             "goal",
-            f"held by u = {_listed(u)}, which the cost charges",
-            "measure u from there, so that staying costs nothing",
+            f"{where}held by u = {_listed(u)}, which the cost charges",
+            f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing",
         )
-    return Fact("goal", f"no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there")
+    return Fact(
+        "goal", f"{where}no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there"
+    )
 
 
 def _linearisation(problem: Problem) -> list[Fact]:

@@ -10,10 +10,10 @@ from lyapnet.expansions import (
     Expansion,
     Optimum,
     Path,
+    at_rest,
     exchanged,
     greedy_law,
     in_float64,
-    no_control,
     optimal_trajectories,
     path_under,
 )
@@ -36,7 +36,7 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> 
     exact = in_float64(problem)
     x0 = x0.double().cpu()[: _affordable(problem)]
     few, others = x0[:SOUGHT], x0[SOUGHT:]
-    laws = [*(greedy_law(exact, each) for each in expansions), no_control(exact)]
+    laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
     optimum = optimal_trajectories(problem, few, _cheapest([path_under(exact, law, few) for law in laws]).u)
     optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR]))
     if len(others):

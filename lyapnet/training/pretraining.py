@@ -27,7 +27,7 @@ class Examples(NamedTuple):
     x: State
     value: PerState  # V(t_n, x_n)
     after: Tensor  # t_{n+1}
-    drifted: State  # x_n + Δt f
+    drifted: State  # x_n + Δt f, or x_n + Δt(f + gu*)
     gradient: State  # V_x(t_{n+1}, drifted)
     weight: Tensor  # L⁻¹gᵀ (k, m, n), LLᵀ = 2R + Δt gᵀHg: for what a wrong V_x costs
     mean_cost: float  # of the trajectories
@@ -99,7 +99,7 @@ def _columns(problem: Problem, expansion: Expansion, deviation: Tensor) -> list[
     (x, value, gradient, hessian), dt = expansion, problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
     here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
-    drifted = now + dt * problem.system.f(now)
+    drifted = problem.drifted(now)
     g, R = problem.system.g(now), problem.cost.R(now)
     values, vectors = torch.linalg.eigh(2 * R + dt * g.mT @ H @ g)
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]

@@ -53,7 +53,7 @@ class RisingCost(Callback):
         for member in members_of(pl_module):
             assert member.validation is not None
             costs = member.validation.cost.sort().values
-            cost = float(costs[: math.ceil(MOST * len(costs))].mean())
+            cost = float(costs[: math.ceil(MOST * len(costs))].mean()) if costs.isfinite().all() else math.inf
             least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
             if cost > RISE * least > 0:
                 module: Any = pl_module

@@ -100,6 +100,8 @@ def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[st
         if own is not None:  # whatever the checkpoint calls it; to be passed with each checkpoint of the round
             cls = own if isinstance(own, type) else type(own)
             config[part]["name"] = f"{cls.__module__}:{cls.__qualname__}"
+            if part == "controls":
+                config[part]["lower"] = config[part]["upper"] = None
     pointwise, earlier = config["pointwise"], config["pointwise"]["counterexamples"]
     rows = [["t", *controller.system.state_names], *failing_points(certificate).tolist()]
     if earlier is not None:

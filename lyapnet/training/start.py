@@ -12,9 +12,9 @@ from torch import Tensor
 from lyapnet.calculus import ValueFunction
 from lyapnet.expansions import (
     Expansion,
+    at_rest,
     greedy_law,
     in_float64,
-    no_control,
     optimal_trajectories,
     path_under,
     riccati,
@@ -157,11 +157,11 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
     """What can be known of the value function before training, by name, and finite; for controls in a box, or all."""
     if problem.controls.limits is None:
         return
-    at_goal = riccati(problem)
-    if all(part.isfinite().all() for part in at_goal):
+    at_goal, has_rest = riccati(problem), bool(problem.controls.contains(problem.rest))
+    if has_rest and all(part.isfinite().all() for part in at_goal):
         yield "the Riccati solution at the goal", at_goal
     centre = problem.initial_states.center.double().cpu()
-    if torch.equal(centre, problem.goal.double().cpu()):
+    if has_rest and torch.equal(centre, problem.goal.double().cpu()):
         return
     guesses = _guesses(problem, centre, at_goal)
     optimum = optimal_trajectories(problem, centre.expand(guesses.shape[1], -1), guesses, rivals=True)
@@ -186,7 +186,7 @@ def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:
     """
     N, m, waves = problem.horizon.steps, problem.system.m, torch.arange(1, 5)
     exact = in_float64(problem)
-    laws = greedy_law(exact, at_goal), no_control(exact)
+    laws = greedy_law(exact, at_goal), at_rest(exact)
     paths = [path_under(exact, law, x0) for law in laws]
     cost = min(float(path.cost) for path in paths)
     dearest = float(torch.linalg.eigvalsh(exact.cost.R(x0))[..., -1])

@@ -47,7 +47,7 @@ def legend(figure):
 
 
 def test_the_funnel_of_two_states_is_drawn_with_its_levels():
-    figure = draw(funnel(claim(1.0, wanted=1.0), bowl(), cube(1.0, 2), LABELS))
+    figure = draw(funnel(claim(1.0, wanted=1.0), bowl(), cube(1.0, 2), torch.zeros(2), LABELS))
     (axes,) = figure.axes
     levels = [1.0 + 0.01 * t for t in (0, 1, 2, 3, 4)]
     for radii, level in zip(outlines(axes), levels, strict=True):
@@ -56,7 +56,7 @@ def test_the_funnel_of_two_states_is_drawn_with_its_levels():
 
 
 def test_what_is_not_proved_is_not_drawn_as_proved():
-    figure = draw(funnel(claim(-float("inf")), bowl(), cube(1.0, 2), LABELS))
+    figure = draw(funnel(claim(-float("inf")), bowl(), cube(1.0, 2), torch.zeros(2), LABELS))
     (wanted,) = outlines(figure.axes[0])
     assert wanted == pytest.approx(2.0, rel=1e-2)
     assert "V(0, ·) ≤ ρ for all of X₀, not proved" in legend(figure)
@@ -67,7 +67,7 @@ def test_what_is_not_proved_is_not_drawn_as_proved():
 
 def test_four_states_have_six_slices_that_say_where_they_lie():
     system, X0 = Cartpole(), Box([-0.6, -0.5, -0.2, -0.1], [0.6, 0.5, 0.2, 0.1])
-    figure = draw(funnel(claim(1.0, 4), bowl(), X0, system.state_labels))
+    figure = draw(funnel(claim(1.0, 4), bowl(), X0, torch.zeros(4), system.state_labels))
     assert len(figure.axes) == 6
     shown = {(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes}
     assert len(shown) == 6
@@ -82,14 +82,16 @@ def test_four_states_have_six_slices_that_say_where_they_lie():
 
 
 def test_initial_states_off_the_slice_are_called_projected():
-    figure = draw(funnel(claim(1.0, 3), bowl(), Box([-0.5, -0.5, 0.5], [0.5, 0.5, 1.0]), ["a (m)", "b", "c"]))
+    figure = draw(
+        funnel(claim(1.0, 3), bowl(), Box([-0.5, -0.5, 0.5], [0.5, 0.5, 1.0]), torch.zeros(3), ["a (m)", "b", "c"])
+    )
     assert [axes.patches[0].get_label() for axes in figure.axes] == ["X₀, projected", "X₀", "X₀"]
     assert {"X₀", "X₀, projected"} <= set(legend(figure))
 
 
 def test_a_counterexample_is_marked_where_it_lies_and_where_it_is_projected():
     found = Counterexample(1.0, [0.5, 1.5, 0.01], 0.1, 2.4)
-    figure = draw(funnel(claim(1.0, 3, found=found), bowl(), cube(1.0, 3), ["a", "b", "c"]))
+    figure = draw(funnel(claim(1.0, 3, found=found), bowl(), cube(1.0, 3), torch.zeros(3), ["a", "b", "c"]))
     marked = [[line.get_label() for line in axes.lines if "fails" in str(line.get_label())] for axes in figure.axes]
     name = "condition fails, t = 1 s"
     assert marked == [[name], [f"{name} (projected onto the slice)"], [f"{name} (projected onto the slice)"]]
@@ -99,7 +101,7 @@ def test_a_counterexample_is_marked_where_it_lies_and_where_it_is_projected():
 
 def test_many_states_are_drawn_along_the_four_widest_of_the_initial_states():
     X0 = Box(-torch.arange(1.0, 7), torch.arange(1.0, 7))
-    figure = funnel(claim(1.0, 6), bowl(), X0, [f"x{i}" for i in range(6)])
+    figure = funnel(claim(1.0, 6), bowl(), X0, torch.zeros(6), [f"x{i}" for i in range(6)])
     assert {axes.get_xlabel() for axes in figure.axes} | {axes.get_ylabel() for axes in figure.axes} == {
         "x2", "x3", "x4", "x5",
     }  # fmt: skip
@@ -107,7 +109,7 @@ def test_many_states_are_drawn_along_the_four_widest_of_the_initial_states():
 
 def test_one_state_is_drawn_over_time():
     found = Counterexample(1.0, [1.5], 0.1, 2.4)
-    (axes,) = draw(funnel(claim(1.0, 1, found=found), bowl(), cube(0.5, 1), ["x"])).axes
+    (axes,) = draw(funnel(claim(1.0, 1, found=found), bowl(), cube(0.5, 1), torch.zeros(1), ["x"])).axes
     assert axes.get_xlabel() == "time (s)"
     (edge,) = [path.vertices for c in axes.collections if not c.get_facecolor().size for path in c.get_paths()]
     assert edge[:, 1] ** 2 == pytest.approx(1 + 0.01 * edge[:, 0], rel=1e-2)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lyapnet.certification import Counterexample, SampledClaim, SoundClaim, StatisticalClaim
-from lyapnet.certification.report import markdown, write_outputs
+from lyapnet.certification.report import markdown, report_of, write_outputs
 from lyapnet.certification.sampling_certificates import (
     SampledCertificate,
     StatisticalCertificate,
@@ -21,7 +21,7 @@ from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.controller import Controller, load
 from lyapnet.programs import Tolerances
-from lyapnet.sets import Box
+from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
@@ -65,6 +65,20 @@ def test_a_report_names_what_was_certified(kind, reported, checkpoint):
     assert report["versions"]["python"] == platform.python_version()
     assert report["experiment"] == "double_integrator_from_scratch"
     assert {path.name for path in (reported / kind).iterdir()} == {"report.json", "report.md", report["figure"]}
+
+
+def test_a_report_has_the_limits_of_the_controller(checkpoint):
+    """Not those of its config, which may be others."""
+
+    def controls_of(**own):
+        certificate = sampled_certificate(load(checkpoint, **own), 3)
+        report = report_of(certificate, checkpoint, "lyapnet certify")
+        (line,) = [line for line in markdown(report).splitlines() if line.startswith("| controls |")]
+        return report["controls"], line
+
+    assert controls_of() == ({}, "| controls | without limits |")
+    limited = {"lower": [-1.0], "upper": [None]}, "| controls | lower = [-1.0], upper = [None] |"
+    assert controls_of(controls=ControlBox(-1.0, math.inf)) == limited
 
 
 @pytest.mark.parametrize("kind", ["sampled", "statistical", "sound"])

@@ -51,6 +51,16 @@ def test_modes_and_controllability():
     assert not facts(linear([[-0.5, 0], [0, -1]], [[0], [1]]))["controllable"].advice, "what decays needs no control"
 
 
+def test_limits_and_what_they_do_not_admit():
+    task = linear([[0, 1], [0, 0]], [[0], [1]], controls={"lower": -1, "upper": 2})
+    assert "1 control between (-1) and (2)" in facts(task)["task"].found
+    assert facts(task)["goal"].found == "an equilibrium without control"
+    away = facts({**task, "controls": {"lower": 1, "upper": 2}})
+    assert away["goal"].found == "u = (0) is beyond its limits"
+    assert away["goal"].advice
+    assert not any("Riccati" in name for name in away), "whose V is zero at the goal"
+
+
 class Falling(Linear):
     """ẋ = Ax + Bu − 1 in its last state, as gravity pulls."""
 

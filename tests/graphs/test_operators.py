@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import math
 import os
 import zlib
 
@@ -216,6 +217,15 @@ def test_what_no_rule_covers_is_refused(name):
 @pytest.mark.parametrize("name", BOUNDED)
 def test_parameters_are_in_the_bounds(name):
     assert outside(lambda t, x: (BOUNDED[name](x),)) == 0
+
+
+@pytest.mark.parametrize("sides", [(-0.3, math.inf), (-math.inf, 0.2), (-math.inf, math.inf)])
+def test_a_limit_on_one_side_is_bounded(sides):
+    """The other is no limit: infinity minus infinity would be anything."""
+    low, high = torch.tensor(sides).double()
+    assert outside(lambda t, x: (x.clamp(low, high),)) == 0
+    ends = BoundedFunction(lambda t, x: (x.clamp(low, high),), (LOWER, UPPER)).bounds(LOWER[None], UPPER[None])
+    assert torch.stack(ends[0]).isfinite().all()
 
 
 @pytest.mark.parametrize("name", ["scalars", "comparisons", "α"])

@@ -2,14 +2,17 @@
 
 import importlib
 import json
+import sys
 
 import lightning
 import numpy as np
 import pytest
 import torch
+import yaml
 from torch.testing import assert_close
 
 import lyapnet
+from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.cli import main
 from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation.oracles import oracle_of
@@ -36,6 +39,11 @@ class Limits(ControlSet):
 
     def project(self, u):
         return torch.maximum(torch.minimum(u, self.limit), -self.limit)
+
+
+class Tight(Limits):
+    def __init__(self):
+        super().__init__(0.05)
 '''
 
 YAML = """
@@ -106,6 +114,29 @@ def test_the_command_measures_within_the_limits_and_refuses_without(checkpoint, 
     result = json.loads(capsys.readouterr().out)
     assert result["cost_mean"] > 0
     assert result["cost_ratio"] is None, "no oracle knows the optimum under limits"
+
+
+def test_a_set_of_ones_own_in_the_place_of_limits(limits, tmp_path, capsys):
+    """Of a checkpoint that was trained with limits; a config that names both is refused."""
+    task = yaml.safe_load(YAML)
+    task["controls"], task["logs"] = {"lower": -1, "upper": 1}, str(tmp_path)
+    run = lyapnet.train(task)
+    assert main(["evaluate", str(run.best), "--samples", "3", "--json", "--controls", "limits:Tight"]) == 0
+    with pytest.raises(UsageError, match="Expected limits or a controls"):
+        lyapnet.train({**task, "controls": {"lower": -1, "name": "limits:Tight"}})
+
+
+def test_no_system_is_imported_for_a_control_set(checkpoint, limits, tmp_path, capsys, monkeypatch):
+    """A file that names a class of its own is not to be believed, whatever else is passed."""
+    (tmp_path / "tripwire.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    content = read_checkpoint(checkpoint)
+    content[KEY]["config"]["system"]["name"] = "tripwire:System"
+    torch.save(content, tmp_path / "foreign.ckpt")
+    assert main(["evaluate", "foreign.ckpt", "--controls", "limits:Limits"]) == 2
+    assert "Expected system=…" in capsys.readouterr().err
+    assert "tripwire" not in sys.modules
 
 
 def test_the_oracles_say_that_they_know_no_limits(checkpoint, limits):

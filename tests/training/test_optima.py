@@ -8,7 +8,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.evaluation.oracles import Optima
-from lyapnet.expansions import no_control, optimal_trajectories, path_under, riccati
+from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.systems import Linear
 from lyapnet.training import optima
 from lyapnet.training.optima import optima_for
@@ -52,7 +52,7 @@ def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without
     x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
     monkeypatch.setattr(optima, "ROUNDS", 0)
     monkeypatch.setattr(optima, "FAR", 3)
-    good, idle = optima_for(problem, expansions, x0).path, path_under(problem, no_control(problem), x0)
+    good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
     def solve(states):
         return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])

@@ -5,7 +5,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.evaluation.oracles import discrete_riccati
-from lyapnet.expansions import no_control, optimal_trajectories, path_under, riccati
+from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.networks import FCN, Scaling
 from lyapnet.policy import SampledPolicy
 from lyapnet.programs import ValueProgram
@@ -102,7 +102,7 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
 def test_the_states_that_a_law_visits_are_examples(problem):
     """Of a linear problem, whose expansions are exact wherever they are asked."""
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
-    law = no_control(problem)
+    law = at_rest(problem)
     visited = examples_visited(problem, optimum, law)
     x = visited.x.reshape(problem.horizon.steps, 6, problem.system.n)
     led, best = path_under(problem, law, optimum.path.x[0]).x[:-1], optimum.path.x[:-1]

@@ -52,8 +52,8 @@ class Transcription(Oracle):
         require_equal(end, self.end, (x,))
         self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
-        self._solver = _solver(step, end, horizon.steps, iterations)
         limits = self.problem.controls.limits
+        self._objective, self._solver = _solver(step, end, horizon.steps, iterations, self.problem.controls.limited)
         assert limits is not None  # oracle_of asks before
         free = np.full(system.n * horizon.steps, np.inf)
         self._bounds = [
@@ -83,7 +83,8 @@ class Transcription(Oracle):
         states = x0.detach().double().cpu()
         nothing: list[Tensor | None] = [None] * len(states)
         stored = self._replayed(states, [self.cache.read(x) for x in states])
-        given = self._replayed(states, nothing if known is None else known.detach().double().cpu().unbind(1))
+        within = None if known is None else self.problem.controls.project(known.detach().double().cpu())
+        given = self._replayed(states, nothing if within is None else within.unbind(1))
         search = MultiStart(states.numpy(), stored, self.minimise)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
@@ -110,13 +111,13 @@ class Transcription(Oracle):
     def _starts(
         self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None]
     ) -> Iterator[list[Candidate]]:
-        """For each pending state: what the caller knows, and the line to the goal without control.
+        """For each pending state: what the caller knows, and the line to the goal with the control that costs nothing.
 
         A few states, evenly spread over the batch, try random curves around that line too; a better minimum that these
         find reaches the others from neighbour to neighbour.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
-        goal = self.problem.goal.numpy()
+        goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()
         s = np.arange(1, N + 1)[:, None] / N
         waves = np.stack([np.sin(k * np.pi * s) / k for k in (1, 2, 3)])  # smooth, and zero at both ends
         extent = states.abs().amax(0).numpy()
@@ -127,7 +128,7 @@ class Transcription(Oracle):
             line = goal + (1 - s) * (states[i].numpy() - goal)
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
             paths = (line, *(line + bends)) if k in bent else (line,)
-            cold = [Candidate(x, np.zeros((N, self.problem.system.m)), math.inf) for x in paths]
+            cold = [Candidate(x, rest, math.inf) for x in paths]
             known = given[i]
             yield cold if known is None else [known, *cold]
 
@@ -150,7 +151,9 @@ class Transcription(Oracle):
         """The local minimum that IPOPT finds from a start, or its reason for none."""
         lower, upper = self._bounds
         guess = np.concatenate([start.u.ravel(), start.x.ravel()])
-        result = self._solver(x0=guess, p=x0, lbx=lower, ubx=upper, lbg=0, ubg=0)
+        # a barrier is in units of J; without limits there is none
+        scale = (float(self._objective(guess, x0)) or 1.0) if self.problem.controls.limited else 1.0
+        result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=0, ubg=0)
         status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()
@@ -158,7 +161,7 @@ class Transcription(Oracle):
             return f"IPOPT: {status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
         u = self.problem.controls.project(torch.from_numpy(u.reshape(start.u.shape))).numpy()  # which IPOPT may pass
-        return Candidate(x.reshape(start.x.shape), u, float(result["f"]))
+        return Candidate(x.reshape(start.x.shape), u, scale * float(result["f"]))
 
     def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
         """The costs of the best controls in a rollout, where that confirms them."""
@@ -184,15 +187,22 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
     return ""
 
 
-def _solver(step: casadi.Function, end: casadi.Function, steps: int, iterations: int) -> casadi.Function:
-    """IPOPT for the transcribed task, with exact sparse derivatives: variables (u, x), parameter x₀."""
+def _solver(
+    step: casadi.Function, end: casadi.Function, steps: int, iterations: int, limited: bool
+) -> tuple[casadi.Function, casadi.Function]:
+    """J, and IPOPT for the transcribed task, with exact sparse derivatives.
+
+    Variables are (u, x), parameters x₀ and what J is divided by.
+    """
     n, m = step.size1_in(0), step.size1_in(1)
     x0, x, u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
     following, step_cost = step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
     J = casadi.sum2(step_cost) + end(x[:, -1])
-    problem = {"x": casadi.veccat(u, x), "p": x0, "f": J, "g": casadi.vec(following - x)}
+    variables, scale = casadi.veccat(u, x), casadi.MX.sym("scale")
+    problem = {"x": variables, "p": casadi.vertcat(x0, scale), "f": J / scale, "g": casadi.vec(following - x)}
+    # within the limits themselves, and with a barrier of which nothing is seen in J
+    exact = {"ipopt.bound_relax_factor": 0.0, "ipopt.tol": 1e-10} if limited else {}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     # acceptable_iter 0: only what meets the tolerances themselves has converged
-    return casadi.nlpsol(
-        "transcription", "ipopt", problem, {**quiet, "ipopt.max_iter": iterations, "ipopt.acceptable_iter": 0}
-    )
+    options = {**quiet, **exact, "ipopt.max_iter": iterations, "ipopt.acceptable_iter": 0}
+    return casadi.Function("J", [variables, x0], [J]), casadi.nlpsol("transcription", "ipopt", problem, options)

@@ -1,0 +1,130 @@
+"""What a controller does after T, for which V was not trained."""
+
+import logging
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.linalg import solve_discrete_are
+from torch import Tensor, nn
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.expansions import in_float64
+from lyapnet.linear_algebra import apply
+from lyapnet.policy import ValuePolicy
+from lyapnet.problem import Problem
+from lyapnet.types import Control, Matrix, PerState, State, Time
+
+BEYOND = {
+    "hold": "V(T, x) and its law",
+    "receding": "V(0, x) and its law, as if the horizon began at every step",
+    "riccati": "the linear-quadratic regulator of the goal, for an infinite horizon",
+    "error": "a ValueError",
+}
+ROUNDING = 1e-9  # of T, by which a time that was added up may miss it
+
+
+class ContinuedPolicy(ValuePolicy):
+    """u(t, x) = policy(t, x) before T, and after it what `beyond` says; its V is continued likewise.
+
+    Args:
+        problem, policy: what is continued.
+        beyond: a key of BEYOND; None: hold, and a note when it first counts.
+
+    Raises:
+        ValueError: another `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
+    """
+
+    def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None = None):
+        if beyond not in (None, *BEYOND):
+            raise ValueError(f"Expected beyond as one of {', '.join(BEYOND)}, got {beyond!r}; choose one of them.")
+        regulator = Regulator(problem) if beyond == "riccati" else None
+        super().__init__(problem, _ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
+        self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
+
+    def forward(self, t: Time, x: State) -> Control:
+        late = t >= self.duration * (1 - ROUNDING)
+        if not late.any():
+            return self.policy(t, x)
+        if self.beyond is None and bool((t > self.duration * (1 + ROUNDING)).any()):
+            logging.getLogger(__name__).warning(
+                "note: the control law is for %g s; after that it holds the law of t = T. Load with "
+                "beyond=hold, receding, riccati or error to choose.",
+                self.duration,
+            )
+            self.beyond = "hold"
+        u = self.policy(_within(t, late, self.duration, self.beyond), x)
+        return u if self.regulator is None else torch.where(late[..., None], self.regulator(x), u)
+
+
+class Regulator(nn.Module):
+    """u = u* − K(x − x*), kept to U: optimal for the problem linearised at its goal, over an infinite horizon.
+
+    P solves the discrete algebraic Riccati equation of the Euler step, and δᵀPδ, δ = x − x*, is the cost that is left.
+
+    Raises:
+        ValueError: the goal is no equilibrium, or no linear law stabilises it.
+    """
+
+    P: Matrix
+    K: Float[Tensor, "m n"]
+
+    def __init__(self, problem: Problem):
+        super().__init__()
+        exact = in_float64(problem)
+        x, u, dt = exact.goal, exact.rest, exact.horizon.dt
+        if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:
+            raise ValueError("Expected a goal that is an equilibrium for beyond=riccati, got another; take hold.")
+        jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian
+        f_x, q_xx = jacobian(lambda y: exact.system.dynamics(y, u), x), hessian(exact.cost.state, x)
+        A, B = np.eye(len(x)) + dt * np.asarray(f_x), dt * np.asarray(exact.system.g(x).detach())
+        Q, R = dt / 2 * np.asarray(q_xx), dt * np.asarray(exact.cost.R(x).detach())
+        try:
+            P = solve_discrete_are(A, B, Q, R)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise ValueError(
+                f"Expected a goal that a linear law stabilises for beyond=riccati, got another ({error}); take hold."
+            ) from error
+        self.problem = problem
+        self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
+
+    def forward(self, x: State) -> Control:
+        return self.problem.controls.project(self.problem.rest - apply(self.K, x - self.problem.goal))
+
+    def cost(self, x: State) -> PerState:
+        """What is left to pay, without limits."""
+        delta = x - self.problem.goal
+        return (apply(self.P, delta) * delta).sum(-1)
+
+
+class _ContinuedValue(ValueFunction):
+    """V(t, x) up to T, and after it what goes with the law."""
+
+    def __init__(self, V: ValueFunction, duration: float, beyond: str | None, regulator: Regulator | None):
+        super().__init__()
+        self.V, self.duration, self.beyond, self.regulator = V, duration, beyond, regulator
+
+    def forward(self, t: Time, x: State) -> PerState:
+        late = t > self.duration * (1 + ROUNDING)
+        if not late.any():
+            return self.V(t, x)
+        value = self.V(_within(t, late, self.duration, self.beyond), x)
+        return value if self.regulator is None else torch.where(late, self.regulator.cost(x), value)
+
+
+def _within(t: Time, late: Tensor, duration: float, beyond: str | None) -> Time:
+    """A time within the horizon for each that is late.
+
+    Raises:
+        ValueError: it is an error.
+    """
+    if beyond == "receding":
+        return torch.where(late, 0.0, t)
+    if beyond == "error" and bool((t > duration * (1 + ROUNDING)).any()):
+        raise ValueError(
+            f"Expected t within the horizon of {duration:g} s, got {float(t.max()):g}; load the controller with "
+            "beyond=hold, receding or riccati."
+        )
+    return t.clamp(max=duration)

@@ -1,0 +1,23 @@
+"""From a config to the objects it names."""
+
+from lyapnet.build.classes import REGISTRIES, Parts, own_parts, resolve
+from lyapnet.build.entries import entry_per_state
+from lyapnet.build.learner import build_program, build_rollout, build_value_function
+from lyapnet.build.named_parts import parts_named, parts_of
+from lyapnet.build.problem import build_problem, build_system, with_parameters
+
+__all__ = [
+    "REGISTRIES",
+    "Parts",
+    "build_problem",
+    "build_program",
+    "build_rollout",
+    "build_system",
+    "build_value_function",
+    "entry_per_state",
+    "own_parts",
+    "parts_named",
+    "parts_of",
+    "resolve",
+    "with_parameters",
+]

@@ -1,0 +1,43 @@
+"""The lists of a config: a number for each state or control, or one for all."""
+
+from typing import Any
+
+import torch
+
+from lyapnet.errors import UsageError
+from lyapnet.systems import ControlAffineSystem
+
+
+def rows(name: str, matrix: Any) -> Any:
+    """A flat list of numbers as the diagonal matrix it stands for."""
+    if not isinstance(matrix, list | tuple):
+        raise ValueError(f"Expected {name} as a list of rows, or of the diagonal's numbers, got {matrix!r}.")
+    if all(type(entry) in (int, float) for entry in matrix):
+        return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
+    return matrix
+
+
+def entry_per_state(key: str, entries: list[float] | None, system: ControlAffineSystem) -> list[float] | None:
+    """A list with an entry for each state, or with one number for all; None where there is none.
+
+    Raises:
+        UsageError: another length; names the key.
+    """
+    every = repeated(entries, system.n)
+    if every is not None:
+        require_length(key, len(every), system)
+    return every
+
+
+def repeated(entries: Any, n: int) -> Any:
+    """A list of one number as the number of every state; anything else as it is."""
+    alone = isinstance(entries, list | tuple) and len(entries) == 1 and isinstance(entries[0], int | float)
+    return [*entries] * n if alone else entries
+
+
+def require_length(key: str, length: int, system: ControlAffineSystem, expected: int | None = None) -> None:
+    """Refuse a list that has another number of entries than there are states, or than is expected."""
+    expected = system.n if expected is None else expected
+    if length != expected:
+        names = ", ".join(system.state_names if expected == system.n else system.control_names)
+        raise UsageError(f"Expected {key} with {expected} entries ({names}), got {length}; give one for each.")

@@ -1,0 +1,35 @@
+"""The parts of the user's own that a config names, as objects."""
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from lyapnet.build.classes import Parts, class_of, instance_of, own_parts
+from lyapnet.build.learner import build_program
+from lyapnet.build.problem import build_cost, build_system, refuse_two_sets
+from lyapnet.config import Config
+
+
+def parts_of(config: Config) -> Parts:
+    """The user's own parts that a config names as module:Class, imported; nothing for what is registered.
+
+    Raises:
+        UsageError: no such module or class, or arguments that it does not take.
+    """
+    refuse_two_sets(config.controls)
+    return parts_named(config, own_parts(config))
+
+
+def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
+    """Parts by their section and the name of their class, with the other options of a config; as parts_of."""
+    config = copy.deepcopy(config)
+    for part, name in names.items():
+        getattr(config, part).name = name
+    builders: dict[str, Callable[[], Any]] = {
+        "system": lambda: build_system(config.system),
+        "cost": lambda: build_cost(config.cost),
+        "controls": lambda: instance_of(config.controls, "controls"),
+        "network": lambda: class_of(config, "network"),
+        "program": lambda: build_program(config),
+    }
+    return Parts(**{part: builders[part]() for part in names})

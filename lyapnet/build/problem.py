@@ -1,0 +1,161 @@
+"""From a config to its problem."""
+
+import copy
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
+from lyapnet.build.entries import repeated, require_length, rows
+from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
+from lyapnet.contracts import initialised
+from lyapnet.cost import COSTS, Cost, QuadraticCost, TargetCost
+from lyapnet.errors import UsageError
+from lyapnet.problem import Horizon, Problem
+from lyapnet.sets import Box, ControlBox, ControlSet
+from lyapnet.systems import ControlAffineSystem, Linear
+
+HELD = 1e-9  # ẋ of a state that is held, against f
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+def build_problem(config: Config, parts: Parts | None = None) -> Problem:
+    """The problem of a config, in its precision.
+
+    Args:
+        parts: taken instead of those that the config names.
+
+    Raises:
+        UsageError: a parameter, matrix, bound or dimension does not fit; names the section.
+    """
+    parts, dtype = parts or Parts(), DTYPES[config.training.precision]
+    with float64_defaults():
+        # in float64 for the checks below, and copies: the caller's own parts keep their precision
+        system, cost, controls = (copy.deepcopy(initialised(p)) for p in (parts.system, parts.cost, parts.controls))
+        system = build_system(config.system) if system is None else system.double()
+        system.check_coordinates()
+        with section("initial_states"):
+            bounds = (config.initial_states.lower, config.initial_states.upper)
+            initial_states = Box(*(repeated(bound, system.n) for bound in bounds))
+            require_length("initial_states.lower", initial_states.dimension, system)
+        with section("horizon"):
+            horizon = Horizon(config.horizon.steps, config.horizon.dt)
+        with section("cost"):
+            cost = build_cost(config.cost, system) if cost is None else cost.double()
+        with section("controls"):
+            controls = build_controls(config.controls, system) if controls is None else controls.double()
+        cost = _about_target(config, cost, system, controls)
+        problem = Problem(system, cost, controls, initial_states, horizon)
+        problem.check()
+        return problem.to(dtype)
+
+
+def _about_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
+    """The cost about the target of a config, if there is one."""
+    if config.target is None and config.target_control is not None:
+        raise UsageError("Expected target with target_control, got none; name the state that it holds.")
+    if config.target is None or isinstance(cost, TargetCost):
+        return cost
+    target, given = repeated(config.target, system.n), repeated(config.target_control, system.m)
+    require_length("target", len(target), system)
+    x = torch.tensor(target, dtype=torch.float64)
+    if given is None:
+        u = _holding(system, x)
+    else:
+        require_length("target_control", len(given), system, system.m)
+        u = torch.tensor(given, dtype=torch.float64)
+    if not bool(controls.contains(u)):
+        raise UsageError(
+            f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
+            "choose another target."
+        )
+    return TargetCost(cost, x, u)
+
+
+def _holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
+    """u* with f(x*) + g(x*)u* = 0."""
+    u, left = system.holding_control(x)
+    worst = int(left.abs().argmax())
+    if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
+        raise UsageError(
+            f"Expected a target that some control holds, f(x*) + g(x*)u* = 0, got {float(left[worst]):.3g} for the "
+            f"rate of {system.state_names[worst]} at {x.tolist()}; choose another, or say what the cost counts "
+            "u from, as in target_control: [0]."
+        )
+    return u
+
+
+def build_system(config: SystemConfig) -> ControlAffineSystem:
+    """The system of a config, registered or the user's own."""
+    return instance_of(config, "system")
+
+
+def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:
+    """A system of the same class from other arguments, in the precision and on the device of a tensor."""
+    with float64_defaults():
+        return type(system)(**parameters).to(like)
+
+
+def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
+    """The cost of a config; a quadratic one with its shapes held against the system's."""
+    if config.name not in COSTS:
+        return instance_of(config, "cost")
+    assert system is not None
+    for key in ("Q", "R", "Q_T"):
+        if getattr(config, key) is None:
+            raise UsageError(
+                f"Expected a value for cost.{key}, got none; add it to the config, or cost.{key}=… to the command."
+            )
+    if config.parameters:
+        raise UsageError("Expected no cost.parameters with the quadratic cost, got some; it has Q, R and Q_T.")
+    R = _control_weight(config.R, system)
+    cost = QuadraticCost(rows("Q", repeated(config.Q, system.n)), R, rows("Q_T", repeated(config.Q_T, system.n)))
+    require_length("cost.Q", len(cost.Q), system)
+    return cost
+
+
+def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
+    """R as a matrix, or as the function of the state that inverse_mass names."""
+    if not isinstance(R, str):
+        R = rows("R", repeated(R, system.m))
+        require_length("cost.R", len(R), system, system.m)
+        return R
+    if R != "inverse_mass":
+        raise ValueError(f"Expected R as a matrix or inverse_mass, got {R!r}; write R as a list of rows.")
+    inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
+    if inverse_mass is None:
+        raise ValueError(
+            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} has not; write R as rows."
+        )
+    # constant for a linear system: a matrix then, as the Riccati equation needs it
+    return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
+
+
+def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> ControlSet:
+    """The control set of a config: a box where it has limits, else a registered one or the user's own."""
+    if config.lower is None and config.upper is None:
+        return instance_of(config, "controls")
+    refuse_two_sets(config)
+    with float64_defaults(), section("controls"):
+        lower = _limits("controls.lower", config.lower, -math.inf, system)
+        return ControlBox(lower, _limits("controls.upper", config.upper, math.inf, system))
+
+
+def refuse_two_sets(config: ControlsConfig) -> None:
+    """Refuse limits beside a set that is named."""
+    limited = config.lower is not None or config.upper is not None
+    if limited and (config.name != "unbounded" or config.parameters):
+        raise UsageError(f"Expected limits or a controls.name, got both ({config.name}); leave one of them out.")
+
+
+def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> list[float]:
+    """A limit for each control, from a number, one for all, or a list in which null is none."""
+    entries = [none if entry is None else entry for entry in (given if isinstance(given, list) else [given])]
+    if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):
+        raise UsageError(f"Expected {key} as a number or a list of them, got {given!r}; write null where is no limit.")
+    entries = repeated(entries, system.m)
+    require_length(key, len(entries), system, system.m)
+    return entries

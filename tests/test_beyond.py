@@ -1,0 +1,156 @@
+"""After T: what was asked for, and never in silence."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import solve_discrete_are
+from torch.testing import assert_close
+
+from lyapnet import Controller
+from lyapnet.beyond import BEYOND
+from lyapnet.cost import QuadraticCost, TargetCost
+from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.policy import POLICIES, HJBPolicy
+from lyapnet.rollout import Rollout
+from lyapnet.sets import ControlBox
+from lyapnet.systems import DoubleIntegrator, Linear, Pendulum
+from tests.problems import Formula, Quadratic, problem_of
+
+T = 1.0
+X = torch.tensor([[0.5, -0.3], [1.0, 0.2]], dtype=torch.float64)
+
+
+@pytest.fixture
+def logged(caplog):
+    return lambda: [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def controller(beyond, law="hjb", **parts):
+    """Of V = (2 − t) xᵀx on the double integrator, T = 1 s in 10 steps."""
+    problem = problem_of(DoubleIntegrator(), **parts)
+    V = Formula(lambda t, x: (2 - t) * (x**2).sum(-1))
+    rollout = Rollout(problem, POLICIES[law](problem, V), gradient="backprop")
+    return Controller(problem, V, rollout, beyond=beyond)
+
+
+@pytest.mark.parametrize("beyond", [None, *BEYOND])
+def test_before_the_end_nothing_changes(beyond, logged):
+    plain = controller(None)
+    expected = HJBPolicy(plain.problem, plain.V)
+    own = controller(beyond)
+    for t in (0.0, 0.3, 0.95):
+        assert_close(own.policy(t, X), expected(torch.tensor(t), X))
+        assert_close(own.value(t, X), plain.V(torch.tensor(t), X))
+    assert_close(own.value(T, X), plain.V(torch.tensor(T), X))
+    assert_close(own.rollout(X).x, Rollout(plain.problem, expected, gradient="backprop")(X).x)
+    assert not logged()
+
+
+def test_unless_told_it_holds_and_says_so_once(logged):
+    own = controller(None)
+    assert_close(own.policy(T, X), own.policy(7.0, X))
+    assert_close(own.policy(8.0, X), own.policy(T, X))
+    (note,) = logged()
+    assert note.startswith("note: the control law is for 1 s; after that it holds the law of t = T.")
+    assert_close(own.value(7.0, X), own.value(T, X))
+
+
+@pytest.mark.parametrize("law", ["hjb", "sampled"])
+def test_a_horizon_that_recedes_begins_at_every_step(law, logged):
+    own = controller("receding", law)
+    for t in (T, 1.05, 40.0):
+        assert_close(own.policy(t, X), own.policy(0.0, X))
+    assert_close(own.value(40.0, X), own.value(0.0, X))
+    assert not torch.allclose(own.policy(0.95, X), own.policy(0.0, X), rtol=1e-2)
+    mixed = own.policy(torch.tensor([0.5, 3.0]), X)
+    assert_close(mixed, torch.stack([own.policy(0.5, X[0]), own.policy(0.0, X[1])]))
+    assert not logged()
+
+
+def test_an_error_where_one_is_asked_for():
+    own = controller("error")
+    own.policy(T, X)
+    for ask in (own.policy, own.value):
+        with pytest.raises(
+            ValueError, match=r"Expected t within the horizon of 1 s, got 1\.1; .*hold, receding or riccati"
+        ):
+            ask(1.1, X)
+    with pytest.raises(ValueError, match="within the horizon"):
+        own.rollout(X, steps=11)
+
+
+@pytest.mark.parametrize("beyond", [None, "receding"])
+def test_no_time_is_before_the_horizon(beyond):
+    with pytest.raises(ValueError, match=r"Expected t ≥ 0, got -0\.1"):
+        controller(beyond).policy(-0.1, X)
+
+
+def test_the_regulator_is_that_of_a_long_horizon():
+    """Held against Riccati's recursion over 4000 steps, and against scipy's solution written out."""
+    system = DoubleIntegrator()
+    cost = QuadraticCost(torch.diag(torch.tensor([2.0, 0.5])), [[0.4]], torch.eye(2))
+    problem = problem_of(system, cost, 4000, 0.1)
+    own = Controller(problem, Quadratic(torch.eye(2)), beyond="riccati")
+    long = discrete_riccati(system, cost, problem.horizon)
+    assert_close(own.value(1e6, X), long.value(0, X), rtol=1e-6, atol=0)
+    A, B = np.array([[1, 0.1], [0, 1]]), np.array([[0], [0.1]])
+    P = solve_discrete_are(A, B, np.diag([0.2, 0.05]), [[0.04]])
+    K = np.linalg.solve(0.04 + B.T @ P @ B, B.T @ P @ A)
+    assert_close(own.policy(1e6, X), -X @ torch.from_numpy(K).mT, rtol=1e-9, atol=0)
+    settled = own.rollout(X, steps=8000).x
+    assert float(settled[-1].abs().max()) < 1e-6
+
+
+def test_about_a_target_within_limits():
+    """A pendulum that leans stays there for as long as one likes; with the law of T = 0.5 s alone it does not."""
+    system, target = Pendulum(), torch.tensor([0.6, 0.0])
+    u, _ = system.holding_control(target)
+    cost = TargetCost(QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2)), target, u)
+    problem = problem_of(system, cost, 10, 0.05, controls=ControlBox(-9.0, 2.0))
+    V = Formula(lambda t, x: ((x - target) ** 2).sum(-1) + 0 * t)
+
+    def ends(beyond):
+        loop = Controller(problem, V, beyond=beyond).rollout(target + torch.tensor([[0.01, 0.0]]), steps=100)
+        assert problem.controls.contains(loop.u).all()
+        return float((loop.x[-1] - target).abs().max())
+
+    assert ends("riccati") < 1e-4
+    assert ends("hold") > 0.1
+
+
+def test_a_longer_rollout_is_that_of_its_laws():
+    """The states of the horizon, then those of the continued law, step by step; its cost is what they pay."""
+    own = controller("receding")
+    whole, first = own.rollout(X, steps=25), own.rollout(X)
+    assert_close(whole.x[:11], first.x)
+    x, paid = first.x[-1], first.running_cost[-1]
+    for n in range(10, 25):
+        u = own.policy(0.1 * n, x)
+        x, paid = x + 0.1 * own.system.dynamics(x, u), paid + 0.1 * own.cost.running(x, u)
+    assert_close(whole.x[-1], x)
+    assert_close(whole.cost, paid + own.cost.terminal(x))
+    assert len(own.rollout(X, steps=4).u) == 4
+    assert isinstance(own.rollout(X.numpy(), steps=12).x, np.ndarray)
+
+
+@pytest.mark.parametrize(
+    ("system", "cost", "reason"),
+    [
+        (Linear([[1.0]], [[0.0]]), None, "that a linear law stabilises"),
+        (
+            Pendulum(),
+            TargetCost(QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2)), [0.6, 0.0], [0.0]),
+            "an equilibrium",
+        ),
+    ],
+)
+def test_where_there_is_no_regulator_it_says_so(system, cost, reason):
+    with pytest.raises(ValueError, match=f"Expected a goal .*{reason}.* for beyond=riccati"):
+        Controller(problem_of(system, cost), Quadratic(torch.eye(system.n)), beyond="riccati")
+
+
+def test_another_word_is_refused():
+    with pytest.raises(ValueError, match="Expected beyond as one of hold, receding, riccati, error, got 'stop'"):
+        controller("stop")

@@ -12,7 +12,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
     from lyapnet.controller import Controller, load
-    from lyapnet.cost import Cost, QuadraticCost, TargetCost
+    from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
     from lyapnet.interpolation import Table
     from lyapnet.policy import HJBPolicy, SontagPolicy
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
     "controller": ["Controller", "load"],
-    "cost": ["Cost", "QuadraticCost", "TargetCost"],
+    "cost": ["Cost", "ObstacleCost", "PeriodicCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
     "policy": ["HJBPolicy", "SontagPolicy"],
@@ -55,7 +55,9 @@ __all__ = [
     "InitialStateDataModule",
     "LyapnetError",
     "LyapunovProgram",
+    "ObstacleCost",
     "OptimizerOptions",
+    "PeriodicCost",
     "Problem",
     "Program",
     "QuadraticCost",

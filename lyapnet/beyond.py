@@ -21,11 +21,11 @@ BEYOND = {
     "riccati": "the linear-quadratic regulator of the goal, for an infinite horizon",
     "error": "a ValueError",
 }
-ROUNDING = 1e-9  # of T, by which a time that was added up may miss it
+STILL = 1e-9  # by which a mode has to decay in each step
 
 
 class ContinuedPolicy(ValuePolicy):
-    """u(t, x) = policy(t, x) before T, and after it what `beyond` says; its V is continued likewise.
+    """u(t, x) = policy(t, x) before T, and from T on what `beyond` says; its V is continued likewise after T.
 
     Args:
         problem, policy: what is continued.
@@ -43,10 +43,10 @@ class ContinuedPolicy(ValuePolicy):
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
 
     def forward(self, t: Time, x: State) -> Control:
-        late = t >= self.duration * (1 - ROUNDING)
+        late = t >= self.duration - slack(t, self.duration)
         if not late.any():
             return self.policy(t, x)
-        if self.beyond is None and bool((t > self.duration * (1 + ROUNDING)).any()):
+        if self.beyond is None and bool((t > self.duration + slack(t, self.duration)).any()):
             logging.getLogger(__name__).warning(
                 "note: the control law is for %g s; after that it holds the law of t = T. Load with "
                 "beyond=hold, receding, riccati or error to choose.",
@@ -83,11 +83,18 @@ class Regulator(nn.Module):
             P = solve_discrete_are(A, B, Q, R)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(
-                f"Expected a goal that a linear law stabilises for beyond=riccati, got another ({error}); take hold."
+                "Expected a goal that a linear law stabilises, and a cost q that sees every mode, for beyond=riccati, "
+                f"got others ({error}); give Q more weights, or take hold."
             ) from error
         self.problem = problem
         self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
+        if slowest >= 1 - STILL:
+            raise ValueError(
+                "Expected a cost q that sees every mode which does not decay for beyond=riccati, got a regulator "
+                f"with a factor of {slowest:.9g} in each step; give Q more weights, or take hold."
+            )
         self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
 
     def forward(self, x: State) -> Control:
@@ -99,6 +106,28 @@ class Regulator(nn.Module):
         return (apply(self.P, delta) * delta).sum(-1)
 
 
+class LaterPolicy(ValuePolicy):
+    """A law, and its V, on a clock that starts late: policy(t + start, x)."""
+
+    def __init__(self, problem: Problem, policy: ValuePolicy, start: float):
+        super().__init__(problem, _LaterValue(policy.V, start))
+        self.policy, self.start = policy, start
+
+    def forward(self, t: Time, x: State) -> Control:
+        return self.policy(t + self.start, x)
+
+
+class _LaterValue(ValueFunction):
+    """V(t + start, x)."""
+
+    def __init__(self, V: ValueFunction, start: float):
+        super().__init__()
+        self.V, self.start = V, start
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.V(t + self.start, x)
+
+
 class _ContinuedValue(ValueFunction):
     """V(t, x) up to T, and after it what goes with the law."""
 
@@ -107,11 +136,16 @@ class _ContinuedValue(ValueFunction):
         self.V, self.duration, self.beyond, self.regulator = V, duration, beyond, regulator
 
     def forward(self, t: Time, x: State) -> PerState:
-        late = t > self.duration * (1 + ROUNDING)
+        late = t > self.duration + slack(t, self.duration)
         if not late.any():
             return self.V(t, x)
         value = self.V(_within(t, late, self.duration, self.beyond), x)
         return value if self.regulator is None else torch.where(late, self.regulator.cost(x), value)
+
+
+def slack(t: Time, duration: float) -> float:
+    """By how much a time that was added up may miss the ends of the horizon."""
+    return max(1e-9, 4 * torch.finfo(t.dtype).eps) * duration
 
 
 def _within(t: Time, late: Tensor, duration: float, beyond: str | None) -> Time:
@@ -122,7 +156,7 @@ def _within(t: Time, late: Tensor, duration: float, beyond: str | None) -> Time:
     """
     if beyond == "receding":
         return torch.where(late, 0.0, t)
-    if beyond == "error" and bool((t > duration * (1 + ROUNDING)).any()):
+    if beyond == "error" and bool((t > duration + slack(t, duration)).any()):
         raise ValueError(
             f"Expected t within the horizon of {duration:g} s, got {float(t.max()):g}; load the controller with "
             "beyond=hold, receding or riccati."

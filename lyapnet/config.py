@@ -59,7 +59,7 @@ class PointwiseConfig:
 
     weight: float = option(0.0, "Weight of the condition at points of [0, T] × D.", at_least=0)
     points: int = option(512, "Points in each step.", at_least=2)
-    region: list[float] | None = option(None, "D, as a bound of each |x_i|; null: 1.5 times the extent of X₀.", above=0)
+    region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
     counterexamples: str | None = option(
         None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
     )
@@ -83,6 +83,8 @@ class CostConfig:
     Q: Any = option(None, "State weight, symmetric positive semidefinite.")
     R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
     Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
+    periodic: list[str] = option([], "Angles δ whose δ² counts as 2(1 − cos δ), names of states.")
+    obstacles: list[dict[str, Any]] = option([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
     parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
 
 
@@ -129,7 +131,7 @@ class NetworkConfig:
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
     terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
     state_scale: list[float] | None = option(
-        None, "Expected |x|; null: the extent of X₀, 1 where it has none.", above=0
+        None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0
     )
     value_scale: float | None = option(None, "Expected V; null: φ at the state scale.", above=0)
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from lyapnet.beyond import ContinuedPolicy
+from lyapnet.beyond import ContinuedPolicy, LaterPolicy, slack
 from lyapnet.build import (
     REGISTRIES,
     Parts,
@@ -158,19 +158,43 @@ class Controller:
         """The closed loop from x₀ (*batch, n); a Trajectory of what x₀ is, tensors or arrays.
 
         Args:
-            steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state.
+            steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state; after
+                T it goes on as `beyond` says.
 
         Raises:
             ValueError: the shape does not fit.
             DivergenceError: the closed loop leaves the finite numbers.
         """
-        rollout = self._rollout
-        if steps is not None and steps != self.horizon.steps:
-            problem = self.problem.replaced(horizon=Horizon(steps, self.horizon.dt))
-            rollout = Rollout(problem, self._continued, self.method, gradient="backprop")
+        if steps is not None and (not isinstance(steps, int) or steps < 1):
+            raise ValueError(f"Expected steps as a whole number ≥ 1, got {steps!r}; give how many steps of Δt to take.")
         with torch.no_grad():
-            trajectory = rollout(self._state(x0))
+            trajectory: Trajectory = self._rollout(self._state(x0))
+            if steps is not None and steps < self.horizon.steps:
+                trajectory = self._cut(trajectory, steps)
+            elif steps is not None and steps > self.horizon.steps:
+                trajectory = self._prolonged(trajectory, steps - self.horizon.steps)
         return Trajectory(*(_like(x0, field) for field in trajectory))
+
+    def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
+        """The first steps of a trajectory."""
+        nodes = slice(steps + 1)
+        end = self.cost.terminal(whole.x[steps])
+        value = whole.require_value()[nodes]
+        return Trajectory(whole.t[nodes], whole.x[nodes], whole.u[:steps], whole.running_cost[nodes], end, value)
+
+    def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
+        """A trajectory with further steps, under what follows the horizon."""
+        problem = self.problem.replaced(horizon=Horizon(steps, self.horizon.dt))
+        law, solver = LaterPolicy(problem, self._continued, self.horizon.duration), self._rollout.solver_arguments
+        rest = Rollout(problem, law, self.method, "backprop", solver["rtol"], solver["atol"])(first.x[-1])
+        return Trajectory(
+            Horizon(self.horizon.steps + steps, self.horizon.dt).times(first.x),
+            torch.cat([first.x, rest.x[1:]]),
+            torch.cat([first.u, rest.u]),
+            torch.cat([first.running_cost, first.running_cost[-1] + rest.running_cost[1:]]),
+            rest.terminal_cost,
+            torch.cat([first.require_value(), rest.require_value()[1:]]),
+        )
 
     def _answer(self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any) -> Any:
         time, state = self._inputs(t, x)
@@ -183,9 +207,9 @@ class Controller:
         batch = tuple(state.shape[:-1])
         if time.ndim and tuple(time.shape) != batch:
             raise ValueError(f"Expected t scalar or of shape {batch}, got {tuple(time.shape)}; give a time per state.")
-        if bool((time < 0).any()):
+        if bool((time < -slack(time, self.horizon.duration)).any()):
             raise ValueError(f"Expected t ≥ 0, got {float(time.min()):g}; the horizon begins at 0.")
-        return time, state
+        return time.clamp(min=0), state
 
     def _state(self, x: Any) -> Tensor:
         like = self.initial_states.lower
@@ -199,7 +223,7 @@ class Controller:
         return state
 
 
-def _like(given: Any, result: Tensor) -> Any:
+def _like(given: Any, result: Any) -> Any:
     return result if isinstance(given, Tensor) else result.detach().cpu().numpy()
 
 

@@ -27,7 +27,7 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath, Valu
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
 NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
-HOPELESS = 2.0  # times the cost of a settled rival
+HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
 
 
@@ -48,6 +48,11 @@ class Expansion(NamedTuple):
         return Expansion(
             self.x[..., kept], self.value, self.gradient[..., kept], self.hessian[..., kept, :][..., :, kept]
         )
+
+    def initially(self, x0: State) -> PerState:
+        """V(0, x₀) as a single expansion has it."""
+        delta = x0 - self.x[0]
+        return self.value[0] + ((self.gradient[0] + apply(self.hessian[0], delta) / 2) * delta).sum(-1)
 
 
 class Path(NamedTuple):
@@ -136,7 +141,7 @@ def optimal_trajectories(
 def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float, rivals: bool) -> Path:
     """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
-    for _ in range(iterations):
+    for k in range(iterations):
         rows = torch.nonzero(~settled).flatten()
         if not len(rows):
             break
@@ -148,7 +153,7 @@ def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enoug
         failures[rows] = torch.where(better, 0, failures[rows] + 1)
         damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
         settled[rows] = better & (was.cost - tried.cost <= enough * was.cost.abs()) | (failures[rows] > TRIES)
-        if rivals and settled.any():
+        if rivals and (curved or k >= GRACE) and settled.any():
             settled |= now.cost > HOPELESS * now.cost[settled].min()
     return now
 

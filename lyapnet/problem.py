@@ -184,8 +184,11 @@ class Problem(nn.Module):
         own = self.record()
         if not isinstance(record, dict) or not _alike(record.get("x"), own.pop("x")):
             return []
-        free = {side: [[sign * math.inf] * self.system.m] for side, sign in LIMITS.items()}
-        return [name for name, value in own.items() if not _alike(record.get(name, free.get(name)), value)]
+        m = self.system.m
+        unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
+        if "u*" in record:
+            own = {"u*": unsaid["u*"], **own}
+        return [name for name, value in own.items() if not _alike(record.get(name, unsaid.get(name)), value)]
 
 
 def _alike(recorded: Any, own: list[Any]) -> bool:

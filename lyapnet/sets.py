@@ -181,12 +181,13 @@ class ControlBox(ControlSet):
         """In another precision, limits are rounded inwards, so that no control exceeds those that were given."""
         given = self.lower, self.upper
         super()._apply(fn, recurse)
-        for name, old, inwards, other in zip(("lower", "upper"), given, (1, -1), reversed(given), strict=True):
-            new = getattr(self, name)
-            outside = (inwards * (old - new.to(old)) > 0) & (old != other)
-            setattr(
-                self, name, torch.where(outside.to(new.device), new.nextafter(inwards * new.new_tensor(torch.inf)), new)
-            )
+        nearest, far = (self.lower, self.upper), self.lower.new_tensor(math.inf)
+        low, high = (
+            torch.where((side * (old - new.to(old)) > 0).to(new.device), new.nextafter(side * far), new)
+            for side, old, new in zip((1, -1), given, nearest, strict=True)
+        )
+        crossed = low > high  # limits that this precision does not tell apart
+        self.lower, self.upper = torch.where(crossed, nearest[0], low), torch.where(crossed, nearest[1], high)
         return self
 
     @property

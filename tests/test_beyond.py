@@ -151,6 +151,46 @@ def test_where_there_is_no_regulator_it_says_so(system, cost, reason):
         Controller(problem_of(system, cost), Quadratic(torch.eye(system.n)), beyond="riccati")
 
 
+def test_a_mode_that_the_cost_does_not_see_is_no_regulator():
+    """scipy has a solution all the same: no gain, and a cart that drifts for ever."""
+    unseen = QuadraticCost(torch.zeros(2, 2), [[1.0]], torch.eye(2))
+    with pytest.raises(ValueError, match=r"every mode.*give Q more weights"):
+        Controller(problem_of(DoubleIntegrator(), unseen), Quadratic(torch.eye(2)), beyond="riccati")
+
+
+@pytest.mark.parametrize("steps", [0, -1])
+def test_steps_that_are_no_number_are_refused(steps):
+    with pytest.raises(ValueError, match="Expected steps as a whole number"):
+        controller("hold").rollout(X, steps=steps)
+
+
+@pytest.mark.parametrize("method", ["rk4", "dopri5"])
+def test_a_longer_rollout_begins_as_the_horizon_has_it(method):
+    """Also where the integrator looks ahead of a node."""
+    problem = problem_of(DoubleIntegrator())
+    V = Formula(lambda t, x: (5 - 4 * t) * (x**2).sum(-1))
+    own = Controller(problem, V, Rollout(problem, HJBPolicy(problem, V), method, "backprop"), beyond="receding")
+    whole = own.rollout(X)
+    for steps in (3, 10, 14):
+        other = own.rollout(X, steps=steps)
+        shared = min(steps, 10)
+        for field in ("t", "x", "running_cost", "value"):
+            assert_close(getattr(other, field)[: shared + 1], getattr(whole, field)[: shared + 1], rtol=0, atol=1e-12)
+        assert [len(field) for field in other[:4]] == [steps + 1, steps + 1, steps, steps + 1]
+        assert_close(other.terminal_cost, own.cost.terminal(other.x[-1]))
+
+
+@pytest.mark.parametrize(("steps", "dt"), [(90, 1 / 30), (49, 0.1 / 3)])
+def test_the_last_node_is_within_the_horizon_in_single_precision(steps, dt, logged):
+    problem = problem_of(DoubleIntegrator(), None, steps, dt).float()
+    V = Quadratic(torch.eye(2)).float()
+    for beyond in ("error", None):
+        own = Controller(problem, V, beyond=beyond)
+        own.policy(problem.horizon.times(problem.goal)[-1], X.float())
+        own.policy(-1e-9, X.float())
+    assert not logged()
+
+
 def test_another_word_is_refused():
     with pytest.raises(ValueError, match="Expected beyond as one of hold, receding, riccati, error, got 'stop'"):
         controller("stop")

@@ -219,6 +219,13 @@ def test_in_single_precision_limits_are_no_wider(low, width):
     assert single.lower.dtype == torch.float32
 
 
+@pytest.mark.parametrize("width", [0.0, 1e-12])
+def test_limits_that_single_precision_does_not_tell_apart(width):
+    box = ControlBox([0.1], [0.1 + width]).float()
+    assert box.lower == box.upper
+    assert box.contains(box.project(torch.zeros(1).float()))
+
+
 def test_limits_that_are_none_are_no_limits():
     assert not ControlBox([-math.inf], [math.inf]).limited
     assert ControlBox([-math.inf], [0.0]).limited

@@ -7,8 +7,10 @@ import torch
 import yaml
 from torch.testing import assert_close
 
+import lyapnet
+from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.config import config_from_plain
-from lyapnet.cost import QuadraticCost, TargetCost
+from lyapnet.cost import ObstacleCost, QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.figures import trajectories
 from lyapnet.evaluation.oracles import oracle_of
@@ -18,7 +20,7 @@ from lyapnet.rollout import Rollout
 from lyapnet.sets import Box, ControlBox, Unbounded
 from lyapnet.systems import ControlAffineSystem, Pendulum
 from tests.configs import objects
-from tests.problems import CONF, Formula, problem_of
+from tests.problems import CONF, Formula, problem_of, untrained
 
 TARGET = [math.pi / 4, 0.0]
 MINE = {
@@ -165,6 +167,46 @@ def test_networks_that_know_the_origin_know_the_target():
     origin = V(t, torch.zeros(2, 2))
     assert (origin > 1e-3).all(), "the origin is a state like others"
     problem.check_value_function(V)
+
+
+def test_what_a_cost_ignores_it_ignores_about_a_target():
+    inner = QuadraticCost(torch.diag(torch.tensor([0.0, 1.0])), [[1.0]], torch.diag(torch.tensor([0.0, 1.0])))
+    about = TargetCost(inner, [0.5, 0.0], [0.0])
+    assert [about.ignores(i, 2) for i in range(2)] == [True, False]
+    assert [about.ignores_at_end(i, 2) for i in range(2)] == [True, False]
+    bump = ObstacleCost(about, [0], [1.0], 0.4, 8.0)
+    assert not bump.ignores(0, 2)
+    assert bump.ignores_at_end(0, 2)
+    task = {**MINE, "system": {"name": "double_integrator"}, "target": [0.5, 0],
+            "cost": {"Q": [0, 1], "R": [1], "Q_T": [0, 1]}, "program": {"name": "value"},
+            "network": {"name": "fcn", "hidden": [8], "ignored_states": ["position"], "terminal": "exact"}}  # fmt: skip
+    problem, V, *_ = objects(config_from_plain(task))
+    assert_close(V(torch.tensor(2.0), torch.tensor([7.0, 0.3])), torch.tensor(0.09))
+    cart = untrained("cartpole_balancing_certified", "target=[0, 0, 0, 0]")
+    assert isinstance(cart.cost, TargetCost)
+    assert ignorable_states(cart.closed_loop) == [0]
+    assert problem.differences({**problem.record(), "u*": [[1.0]] * 3}) == ["u*"]
+    without = {key: value for key, value in problem.record().items() if key != "u*"}
+    assert not problem.differences(without), "u* = 0 is the same as none"
+
+
+def test_fine_tuning_to_another_target_is_no_silent_matter(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    brief = ["training.iterations=1", "evaluation.test_states=2", "evaluation.validation_states=2", "loggers=[csv]",
+             "rollout.compile=off", "evaluation.optimum=false"]  # fmt: skip
+    task = {**MINE, "logs": str(tmp_path)}
+    run = lyapnet.train(task, brief)
+
+    def notes(**changes):
+        caplog.clear()
+        lyapnet.train({**task, **changes}, brief, finetune=run.best)
+        return [record.getMessage() for record in caplog.records if "was trained about" in record.getMessage()]
+
+    assert not notes(cost={**MINE["cost"], "R": [0.2]})
+    (note,) = notes(target=[0.3, 0])
+    assert "this run is about [0.3, 0.0]" in note
+    assert "about [0.0, 0.0]" in notes(target=None)[0]
 
 
 def test_figures_show_the_target(both):

@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
 from lyapnet.build.entries import repeated, require_length, rows
 from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised
-from lyapnet.cost import COSTS, Cost, QuadraticCost, TargetCost
+from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
 from lyapnet.problem import Horizon, Problem
 from lyapnet.sets import Box, ControlBox, ControlSet
@@ -47,7 +47,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = build_cost(config.cost, system) if cost is None else cost.double()
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
-        cost = _about_target(config, cost, system, controls)
+        if not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
+            cost = _with_obstacles(config.cost, _about_target(config, cost, system, controls), system)
         problem = Problem(system, cost, controls, initial_states, horizon)
         problem.check()
         return problem.to(dtype)
@@ -57,7 +58,7 @@ def _about_target(config: Config, cost: Cost, system: ControlAffineSystem, contr
     """The cost about the target of a config, if there is one."""
     if config.target is None and config.target_control is not None:
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")
-    if config.target is None or isinstance(cost, TargetCost):
+    if config.target is None:
         return cost
     target, given = repeated(config.target, system.n), repeated(config.target_control, system.m)
     require_length("target", len(target), system)
@@ -102,6 +103,8 @@ def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], 
 def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
     """The cost of a config; a quadratic one with its shapes held against the system's."""
     if config.name not in COSTS:
+        if config.periodic:
+            raise UsageError("Expected cost.periodic with the quadratic cost, got another; write it into your own.")
         return instance_of(config, "cost")
     assert system is not None
     for key in ("Q", "R", "Q_T"):
@@ -114,7 +117,41 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
     R = _control_weight(config.R, system)
     cost = QuadraticCost(rows("Q", repeated(config.Q, system.n)), R, rows("Q_T", repeated(config.Q_T, system.n)))
     require_length("cost.Q", len(cost.Q), system)
+    return _going_round(config.periodic, cost, system) if config.periodic else cost
+
+
+def _going_round(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
+    """The cost with some angles that go round; it must not know on which side of the goal they are."""
+    angles = [_index(name, "cost.periodic", system) for name in names]
+    for weight in (cost.Q, cost.Q_T):
+        beside = weight[angles] * (1 - torch.eye(system.n)[angles])
+        if beside.any():
+            raise UsageError("Expected no products of a cost.periodic angle in Q and Q_T, got some; remove them.")
+    return PeriodicCost(cost, angles, system.n)
+
+
+def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
+    """The cost with the obstacles of a config."""
+    for k, given in enumerate(config.obstacles):
+        center = given.get("center")
+        numbers = [*center.values()] if isinstance(center, Mapping) else []
+        admitted = all(type(number) in (int, float) for number in [given.get("radius"), given.get("weight"), *numbers])
+        if given.keys() != {"center", "radius", "weight"} or not numbers or not admitted:
+            raise UsageError(
+                f"Expected cost.obstacles, each as {{center: {{{system.state_names[0]}: 1}}, radius: 0.3, weight: 9}}, "
+                f"got {given}; give all three."
+            )
+        states = [_index(name, f"cost.obstacles[{k}].center", system) for name in given["center"]]
+        with section("cost.obstacles"):
+            cost = ObstacleCost(cost, states, list(given["center"].values()), given["radius"], given["weight"])
     return cost
+
+
+def _index(name: str, key: str, system: ControlAffineSystem) -> int:
+    if name not in system.state_names:
+        names = ", ".join(system.state_names)
+        raise UsageError(f"Expected {key} among {names}, got {name!r}; name states of the system.")
+    return list(system.state_names).index(name)
 
 
 def _control_weight(R: Any, system: ControlAffineSystem) -> Any:

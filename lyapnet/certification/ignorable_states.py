@@ -2,7 +2,7 @@
 
 import torch
 
-from lyapnet.cost import is_quadratic
+from lyapnet.cost import innermost, is_quadratic
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.graphs.tracing import trace
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -22,7 +22,7 @@ def ignorable_states(closed_loop: ClosedLoop) -> list[int]:
 
 
 def _depends_on(closed_loop: ClosedLoop, i: int) -> bool:
-    by_matrices = is_quadratic(closed_loop.cost)
+    by_matrices = is_quadratic(innermost(closed_loop.cost))
     if by_matrices and not closed_loop.cost.ignores(i, closed_loop.system.n):
         return True
     t, x = _some_point(closed_loop)

@@ -14,7 +14,7 @@ from lyapnet.certification.certificates import Certificate
 from lyapnet.certification.tables import certificate_rows
 from lyapnet.config import Config
 from lyapnet.controller import Controller
-from lyapnet.cost import Cost, QuadraticCost, TargetCost
+from lyapnet.cost import MadeOfAnother, QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.files import digest_of_file, write_atomically
 from lyapnet.provenance import versions
@@ -186,15 +186,12 @@ def _controls(controller: Controller, config: Config) -> dict[str, Any]:
 
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
     """The cost's matrices as the config has them, or its name and parameters; and what it is about."""
-    cost = controller.cost
-    if isinstance(cost, TargetCost):
-        about = {"target": controller.problem.goal.tolist(), "target_control": controller.problem.rest.tolist()}
-        return {**_own_cost(cost.cost, config), **about}
-    return _own_cost(cost, config)
-
-
-def _own_cost(cost: Cost, config: Config) -> dict[str, Any]:
+    cost, words = controller.cost, list[str]()
+    while isinstance(cost, MadeOfAnother):
+        words.append(cost.words)
+        cost = cost.cost
+    about = {"with": "; ".join(words)} if words else {}
     if isinstance(cost, QuadraticCost):
-        return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T}
+        return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T, **about}
     cls = type(cost)
-    return {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters}
+    return {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters, **about}

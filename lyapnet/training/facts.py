@@ -67,10 +67,11 @@ def _goal(problem: Problem) -> Fact:
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
     if float(left.abs().max()) <= 1e-9 * float(f.abs().max()):
+        remedy = "no target_control" if problem.cost.rest is not None else f"target: {goal.tolist()}"
         return Fact(
             "goal",
             f"{where}held by u = {_listed(u)}, which the cost charges",
-            f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing",
+            f"{remedy} has the cost count u from there, so that staying costs nothing",
         )
     return Fact(
         "goal", f"{where}no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there"

@@ -1,11 +1,13 @@
 """What a training is to do: start a run, resume one, or start one from the weights of another."""
 
+import logging
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 
 from lyapnet.build import Parts, parts_of
@@ -13,6 +15,7 @@ from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.controller import config_of, load_value_function, require_parts
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.problem import Problem
 from lyapnet.sizes import check_training_sizes
 from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
@@ -101,6 +104,19 @@ def plan_run(
         return plan
 
 
+def _note_another_target(target: list[float] | None, problem: Problem, checkpoint: Path) -> None:
+    """Say that V was made for another goal, which it then begins about."""
+    goal = problem.goal.tolist()
+    if target is None and problem.cost.rest is None:
+        return
+    before = [0.0] if target is None else target
+    if not np.allclose(before if len(before) == len(goal) else before[0], goal, rtol=1e-6):
+        logging.getLogger(__name__).warning(
+            "note: %s was trained about x* = %s, and V begins there; this run is about %s. Unless they are close, "
+            "start anew without --finetune.", checkpoint, target or "the origin", goal,
+        )  # fmt: skip
+
+
 def _read(checkpoint: Path, run: Run) -> dict[str, Any]:
     """A checkpoint to go on from; where the last one is lost, a refusal that names the best one."""
     try:
@@ -124,7 +140,8 @@ def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)
         if content[KEY].get("config") is not None:
-            config_of(content, checkpoint)  # refuses what this version does not understand
+            given = config_of(content, checkpoint)  # refuses what this version does not understand
+            _note_another_target(given.target, module.members[0].problem, checkpoint)
         for member in module.members:
             load_value_function(member.V, content, checkpoint)
 

@@ -79,8 +79,10 @@ def failing_points(certificate: SoundCertificate) -> Tensor:
 
 
 def _extent(certificate: SoundCertificate) -> list[float]:
-    """A bound of each |x_i| in D; 1 for states that the claim leaves out."""
-    return [bound if bound > 0 else 1.0 for bound in certificate.claim.states.magnitude.tolist()]
+    """A bound of each |x_i − x*_i| in D; 1 for states that the claim leaves out."""
+    states = certificate.claim.states
+    reach = states.reach_from(certificate.controller.problem.goal.to(states.lower))
+    return [bound if bound > 0 else 1.0 for bound in reach.tolist()]
 
 
 def _finished_run(folder: Path) -> Run | None:

@@ -1,11 +1,15 @@
 """Optima within limits, whatever the units of cost and control: IPOPT against differential dynamic programming."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.evaluation.oracles.multistart import Candidate
 from lyapnet.expansions import optimal_trajectories
 from lyapnet.sets import ControlBox
 from lyapnet.systems import Linear
@@ -34,6 +38,20 @@ def test_units_do_not_matter(cost, unit):
     )
     assert problem.controls.contains(optima.u).all()
     assert (expected.u.abs() == problem.controls.upper).any()
+
+
+def test_a_bent_path_is_a_start_too():
+    """Its cost says nothing of that of the optimum where the way there costs nothing."""
+    problem = limited()
+    free = QuadraticCost(torch.zeros(2, 2), [[1.0]], torch.diag(torch.tensor([50.0, 5.0])))
+    oracle = oracle_of(problem.replaced(cost=free))
+    x0 = problem.initial_states.sample(1, torch.Generator().manual_seed(0))
+    s = np.arange(1, 61)[:, None] / 60
+    line, bend = (1 - s) * x0.numpy(), np.sin(np.pi * s) * np.array([[0.5, -1.0]])
+    idle = np.zeros((60, 1))
+    found = [oracle.minimise(x0[0].numpy(), Candidate(x, idle, math.inf)) for x in (line, line + bend, line - 2 * bend)]
+    assert [type(each) for each in found if isinstance(each, str)] == []
+    assert [each.cost for each in found] == pytest.approx([found[0].cost] * len(found), rel=1e-6)
 
 
 def test_known_controls_beyond_the_limits_are_not_believed():

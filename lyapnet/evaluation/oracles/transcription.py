@@ -16,6 +16,7 @@ from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
+from lyapnet.expansions import riccati
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
@@ -53,7 +54,8 @@ class Transcription(Oracle):
         self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
         limits = self.problem.controls.limits
-        self._objective, self._solver = _solver(step, end, horizon.steps, iterations, self.problem.controls.limited)
+        self._solver = _solver(step, end, horizon.steps, iterations, self.problem.controls.limited)
+        self._riccati = riccati(self.problem) if self.problem.controls.limited else None
         assert limits is not None  # oracle_of asks before
         free = np.full(system.n * horizon.steps, np.inf)
         self._bounds = [
@@ -151,8 +153,7 @@ class Transcription(Oracle):
         """The local minimum that IPOPT finds from a start, or its reason for none."""
         lower, upper = self._bounds
         guess = np.concatenate([start.u.ravel(), start.x.ravel()])
-        # a barrier is in units of J; without limits there is none
-        scale = (float(self._objective(guess, x0)) or 1.0) if self.problem.controls.limited else 1.0
+        scale = self._scale(torch.from_numpy(x0))
         result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=0, ubg=0)
         status = self._solver.stats()["return_status"]
         if self._stopped:
@@ -162,6 +163,13 @@ class Transcription(Oracle):
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
         u = self.problem.controls.project(torch.from_numpy(u.reshape(start.u.shape))).numpy()  # which IPOPT may pass
         return Candidate(x.reshape(start.x.shape), u, scale * float(result["f"]))
+
+    def _scale(self, x0: State) -> float:
+        """A cost of about the size of J*, as IPOPT's barrier is absolute; 1 where there is none, or no barrier."""
+        if self._riccati is None:
+            return 1.0
+        cost = float(self._riccati.initially(x0))
+        return cost if 0 < cost < math.inf else 1.0
 
     def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
         """The costs of the best controls in a rollout, where that confirms them."""
@@ -187,10 +195,8 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
     return ""
 
 
-def _solver(
-    step: casadi.Function, end: casadi.Function, steps: int, iterations: int, limited: bool
-) -> tuple[casadi.Function, casadi.Function]:
-    """J, and IPOPT for the transcribed task, with exact sparse derivatives.
+def _solver(step: casadi.Function, end: casadi.Function, steps: int, iterations: int, limited: bool) -> casadi.Function:
+    """IPOPT for the transcribed task, with exact sparse derivatives.
 
     Variables are (u, x), parameters x₀ and what J is divided by.
     """
@@ -205,4 +211,4 @@ def _solver(
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     # acceptable_iter 0: only what meets the tolerances themselves has converged
     options = {**quiet, **exact, "ipopt.max_iter": iterations, "ipopt.acceptable_iter": 0}
-    return casadi.Function("J", [variables, x0], [J]), casadi.nlpsol("transcription", "ipopt", problem, options)
+    return casadi.nlpsol("transcription", "ipopt", problem, options)

@@ -1,0 +1,19 @@
+"""What a problem charges: a running cost and a terminal cost."""
+
+from lyapnet.cost.base import Cost
+from lyapnet.cost.made_of_another import MadeOfAnother, ObstacleCost, PeriodicCost, TargetCost, innermost
+from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
+
+COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
+
+__all__ = [
+    "COSTS",
+    "Cost",
+    "MadeOfAnother",
+    "ObstacleCost",
+    "PeriodicCost",
+    "QuadraticCost",
+    "TargetCost",
+    "innermost",
+    "is_quadratic",
+]

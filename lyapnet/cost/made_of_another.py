@@ -1,0 +1,139 @@
+"""Costs made of another: about a target, with angles that go round, with obstacles."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lyapnet.cost.base import Cost
+from lyapnet.types import ControlMatrix, PerState, State
+
+
+class MadeOfAnother(Cost):
+    """A cost that is another one until a subclass says otherwise: its goal, R(x), q and φ."""
+
+    cost: Cost
+    words = ""  # what is made of the other, in words
+
+    def __init__(self, cost: Cost):
+        super().__init__()
+        self.cost = cost
+        for name in ("goal", "rest", "R_constant", "R_inverse"):
+            self.register_buffer(name, getattr(cost, name), persistent=False)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(x)
+
+    def R(self, x: State) -> ControlMatrix:
+        return self.cost.R(x)
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(x)
+
+    def ignores(self, i: int, n: int) -> bool:
+        return self.cost.ignores(i, n)
+
+    def ignores_at_end(self, i: int, n: int) -> bool:
+        return self.cost.ignores_at_end(i, n)
+
+
+class TargetCost(MadeOfAnother):
+    """Another cost about a target: q(x − d) + (u − u*)ᵀR(x)(u − u*) and φ(x − d), d = x* − the goal of that cost.
+
+    Args:
+        cost: q, R and φ.
+        target: x*, (n,).
+        rest: u*, (m,), the control that costs nothing; what holds x* where something does.
+    """
+
+    shift: Float[Tensor, " n"]
+
+    def __init__(self, cost: Cost, target: Sequence[float] | Tensor, rest: Sequence[float] | Tensor):
+        super().__init__(cost)
+        goal, u = (torch.as_tensor(entries, dtype=torch.get_default_dtype()) for entries in (target, rest))
+        self.register_buffer("shift", goal - (0 if cost.goal is None else cost.goal), persistent=False)
+        self.goal, self.rest = goal, u
+        self.words = f"about x* = {goal.tolist()} and u* = {u.tolist()}"
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(x - self.shift)
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(x - self.shift)
+
+    def terminal_gradient(self, x: State) -> State:
+        return self.cost.terminal_gradient(x - self.shift)
+
+
+class PeriodicCost(MadeOfAnother):
+    """Another cost in which the distance δ of some angles from the goal counts as 2 sin(δ/2), δ² as 2(1 − cos δ).
+
+    So an angle costs as little after a whole turn as before, and near the goal what it did.
+
+    Args:
+        cost: q and φ, even in each of these angles.
+        angles: their indices.
+    """
+
+    turns: Float[Tensor, " n"]  # 1 for an angle that goes round, 0 for any other state
+
+    def __init__(self, cost: Cost, angles: Sequence[int], n: int):
+        super().__init__(cost)
+        turns = torch.zeros(n, dtype=torch.get_default_dtype())
+        turns[list(angles)] = 1
+        self.register_buffer("turns", turns, persistent=False)
+        self.words = f"δ² as 2(1 − cos δ) of the states {list(angles)}"
+
+    def _chords(self, x: State) -> State:
+        delta = x if self.cost.goal is None else x - self.cost.goal
+        return x + self.turns * (2 * torch.sin(delta / 2) - delta)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(self._chords(x))
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(self._chords(x))
+
+
+class ObstacleCost(MadeOfAnother):
+    """Another cost, and w exp(−2 d²/r²) per second, d the distance of some states from a centre: a smooth bump.
+
+    At the edge, d = r, it is 0.14 w, at 2r 0.0003 w.
+
+    Args:
+        cost: what is paid besides.
+        states: indices of the states that the obstacle has a place in, (k,).
+        centre: (k,), in their units.
+        radius: r.
+        weight: w, in cost per second.
+
+    Raises:
+        ValueError: r or w is not positive.
+    """
+
+    states: Int[Tensor, " k"]
+    centre: Float[Tensor, " k"]
+
+    def __init__(self, cost: Cost, states: Sequence[int], centre: Sequence[float], radius: float, weight: float):
+        super().__init__(cost)
+        if not (radius > 0 and weight > 0):
+            raise ValueError(f"Expected an obstacle with radius > 0 and weight > 0, got {radius:g} and {weight:g}.")
+        self.radius, self.weight = radius, weight
+        self.words = f"an obstacle at {list(centre)} of the states {list(states)}, radius {radius:g}, weight {weight:g}"
+        self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)
+        self.register_buffer("centre", torch.tensor(list(centre), dtype=torch.get_default_dtype()), persistent=False)
+
+    def state(self, x: State) -> PerState:
+        squared = ((x[..., self.states] - self.centre) ** 2).sum(-1)
+        return self.cost.state(x) + self.weight * torch.exp(-2 / self.radius**2 * squared)
+
+    def ignores(self, i: int, n: int) -> bool:
+        return i not in self.states.tolist() and self.cost.ignores(i, n)
+
+
+def innermost(cost: Cost) -> Cost:
+    """What a cost is made of in the end, if each step is one of these; else the cost itself."""
+    while isinstance(cost, MadeOfAnother) and type(cost) in (TargetCost, PeriodicCost, ObstacleCost):
+        cost = cost.cost
+    return cost

@@ -143,9 +143,9 @@ class Unbounded(ControlSet):
 class ControlBox(ControlSet):
     """U = {u : lower ≤ u ≤ upper}, componentwise: limits of actuators.
 
-    The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with more, each way to
-    hold some of them at a limit leaves a linear system for the others, and of those that end within the limits the one
-    of least cost counts. All 3ᵐ are solved as one batch.
+    The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with two, clipped
+    twice; with more, each way to hold some of them at a limit leaves a linear system for the others, and of those that
+    end within the limits the one of least cost counts. All 3ᵐ are solved as one batch.
 
     Args:
         lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none.
@@ -207,9 +207,26 @@ class ControlBox(ControlSet):
             )
         if m == 1:
             return self.project(-b / (2 * R[..., 0]))
-        dtype, R, b = b.dtype, R.double(), b.double()  # costs of single precision do not tell the ways apart
+        # in double precision: costs of single precision do not tell the ways apart
+        two_or_more = self._of_two if m == 2 else self._of_several
+        return two_or_more(R.double(), b.double(), self.lower.double().expand(m), self.upper.double().expand(m)).to(b)
+
+    @staticmethod
+    def _of_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """u₂ where the slope in it of min over u₁ vanishes, which is the middle one of three lines; then u₁."""
+        finite = (side.clamp(-HUGE, HUGE) for side in (low, high))
+        roots = [-(b[..., 1] + 2 * R[..., 0, 1] * side[0]) / (2 * R[..., 1, 1]) for side in finite]  # u₁ held
+        determinant = R[..., 0, 0] * R[..., 1, 1] - R[..., 0, 1] * R[..., 0, 1]
+        free = (R[..., 0, 1] * b[..., 0] - R[..., 0, 0] * b[..., 1]) / (2 * determinant)
+        middle = free.clamp(torch.minimum(*roots), torch.maximum(*roots))
+        second = middle.clamp(low[1], high[1])
+        first = (-(b[..., 0] + 2 * R[..., 0, 1] * second) / (2 * R[..., 0, 0])).clamp(low[0], high[0])
+        return torch.stack([first, second], -1)
+
+    @staticmethod
+    def _of_several(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        m = b.shape[-1]
         held = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=m))).to(b)  # at lower, free, at upper
-        low, high = self.lower.double().expand(m), self.upper.double().expand(m)
         sides = torch.where(held < 0, low, torch.where(held > 0, high, 0.0))
         exists = sides.isfinite().all(-1)
         u_held, free = sides.where(sides.isfinite(), 0), (held == 0).to(b)
@@ -221,7 +238,7 @@ class ControlBox(ControlSet):
         fits = exists[each] & ((u >= low) & (u <= high) | (free == 0)).all(-1)
         cost = ((apply(R, u) + b) * u).sum(-1)
         best = cost.where(fits & cost.isfinite(), torch.inf).argmin(0)
-        u = self.project(u.gather(0, best[None, ..., None].expand(1, *b.shape))[0].to(dtype))
+        u = u.gather(0, best[None, ..., None].expand(1, *b.shape))[0].clamp(low, high)
         known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         return torch.where(known[..., None], u, torch.nan)  # what is no number stays none
 
@@ -233,5 +250,6 @@ class ControlBox(ControlSet):
 
 
 MOST = 4  # controls under limits: 3⁴ = 81 linear systems
+HUGE = 1e150  # in the place of a limit that is none, where it is multiplied
 
 CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}  # limits are controls.lower and upper

@@ -212,7 +212,7 @@ def test_the_minimum_within_limits_in_single_precision():
 def test_in_single_precision_limits_are_no_wider(low, width):
     box = ControlBox([low], [low + width])
     single = ControlBox([low], [low + width]).float()
-    if box.lower < box.upper:
+    if single.lower < single.upper:  # else it does not tell them apart
         assert single.lower.double() >= box.lower
         assert single.upper.double() <= box.upper
     assert_close(single.lower.double(), box.lower, rtol=3e-7, atol=1e-30)

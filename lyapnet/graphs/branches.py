@@ -69,8 +69,21 @@ def minimum(x: Any, y: Any) -> TaylorForm:
 
 def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:
     """min(max(x, low), high), of which each may depend on the point; a constant infinity is no limit."""
-    x = x if low is None or _is_constant(low, -math.inf) else maximum(x, low)
-    return x if high is None or _is_constant(high, math.inf) else minimum(x, high)
+    y = x if low is None or _is_constant(low, -math.inf) else maximum(x, low)
+    y = y if high is None or _is_constant(high, math.inf) else minimum(y, high)
+    if isinstance(low, Tensor) and isinstance(high, Tensor) and bool((low.isfinite() & high.isfinite()).all()):
+        return _no_wider(y, low, high)
+    return y
+
+
+def _no_wider(y: TaylorForm, low: Tensor, high: Tensor) -> TaylorForm:
+    """A form, but [low, high] on boxes where it is wider than that, or nothing is known."""
+    least, most = y.interval()
+    low, high = (side.to(y.radius).expand_as(y.radius) for side in (torch.minimum(low, high), high))
+    wide = ~(most - least <= high - low)
+    room = 4 * taylor.EPSILON * (low.abs() + high.abs())  # for the rounding of centre and radius
+    constant = between(low - room, high + room, y)
+    return y.with_parts(torch.where(wide, constant.terms, y.terms), torch.where(wide, constant.radius, y.radius))
 
 
 def _is_constant(y: Any, value: float) -> bool:

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.sets import ControlBox
 
 aten = torch.ops.aten
 LOWER, UPPER = torch.tensor([0.0, -1.0, -1.0]).double(), torch.tensor([1.0, 1.0, 1.0]).double()
@@ -226,6 +227,23 @@ def test_a_limit_on_one_side_is_bounded(sides):
     assert outside(lambda t, x: (x.clamp(low, high),)) == 0
     ends = BoundedFunction(lambda t, x: (x.clamp(low, high),), (LOWER, UPPER)).bounds(LOWER[None], UPPER[None])
     assert torch.stack(ends[0]).isfinite().all()
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_the_law_within_limits_is_bounded_by_them(m):
+    """Also on boxes so wide that nothing else is known; one beside them is not in the bounds."""
+    limits = [-1.03, -0.37][:m], [0.9, 0.5][:m]
+    controls, factor = ControlBox(*limits), torch.tensor([[1.0, 0.3], [-0.4, 0.8]])[:m, :m].double()
+
+    def law(t, x):
+        b = torch.stack([20 * x[..., 0] - 9 * x[..., 1] ** 2, torch.exp(3 * x[..., 1]) - 4 * x[..., 0]], -1)[..., :m]
+        return (controls.minimise((factor @ factor.mT).expand(*x.shape[:-1], m, m), b),)
+
+    assert outside(law, boxes=200) == 0
+    ((least, most),) = BoundedFunction(law, (LOWER, UPPER)).bounds(LOWER[None], UPPER[None])
+    low, high = (torch.tensor(side).double() for side in limits)
+    assert ((low - 1e-12 <= least) & (most <= high + 1e-12)).all()
+    assert (law(0, 2 * torch.rand(500, 2).double() - 1)[0].amin(0) == low).any()
 
 
 @pytest.mark.parametrize("name", ["scalars", "comparisons", "α"])

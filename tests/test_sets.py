@@ -150,13 +150,14 @@ def test_every_registered_set_keeps_its_contract(controls):
 def cheapest(R, b, lower, upper):
     """argmin of uᵀRu + bᵀu within limits, by scipy's solver of bounded least squares."""
     root = np.linalg.cholesky(R).T
-    return lsq_linear(root, -np.linalg.solve(root.T, b) / 2, (lower, upper), method="bvls", tol=1e-14).x
+    return lsq_linear(root, -np.linalg.solve(root.T, b) / 2, (lower, upper), method="bvls", tol=1e-14, max_iter=100).x
 
 
-@pytest.mark.parametrize("m", range(1, 5))
-def test_within_limits_the_minimum_is_that_of_another_solver(m):
+@pytest.mark.parametrize("count", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("m", range(1, 7))
+def test_within_limits_the_minimum_is_that_of_another_solver(m, count):
     """Some controls are held at a limit, in some states; the clipped minimum of all is another."""
-    factor, b = torch.randn(400, m, m), 4 * torch.randn(400, m)
+    factor, b = torch.randn(count, m, m), 4 * torch.randn(count, m)
     R = factor @ factor.mT + 0.05 * torch.eye(m)
     lower, upper = -torch.rand(m), torch.rand(m)
     controls = ControlBox(lower, upper)
@@ -183,6 +184,28 @@ def test_limits_on_one_side_or_none(m):
     assert above.isfinite().all()
     assert_close(above[(free > 0).all(-1)], free[(free > 0).all(-1)])
     assert_close(ControlBox([0.2] * m, [0.2] * m).minimise(R, b), torch.full((50, m), 0.2))
+
+
+def slope_inwards(R, b, u, controls):
+    """How far a step down the slope of uᵀRu + bᵀu leads within the limits: zero at the minimum, and there alone."""
+    step = (2 * (R @ u[..., None])[..., 0] + b) / (2 * R.diagonal(dim1=-2, dim2=-1))
+    return (controls.project(u - step) - u).abs().amax(-1)
+
+
+@pytest.mark.parametrize("m", range(1, 9))
+@pytest.mark.parametrize("condition", [10, 1e6])
+def test_no_step_within_the_limits_is_downhill_from_the_minimum(m, condition):
+    """Of a convex cost that is enough; on R of any condition, ties and limits on one side among them."""
+    rotation = torch.linalg.qr(torch.randn(4000, m, m))[0]
+    R = (rotation * condition ** torch.rand(4000, 1, m)) @ rotation.mT
+    R, b = (R + R.mT) / 2, 2 * torch.randn(4000, m) * condition ** torch.rand(4000, 1)
+    b[:1000] = b[:1000].round()
+    lower = torch.where(torch.arange(m) % 3 == 2, -math.inf, -torch.rand(m))
+    controls = ControlBox(lower, torch.rand(m))
+    u = controls.minimise(R, b)
+    assert controls.contains(u).all()
+    assert float(slope_inwards(R, b, u, controls).max()) < 1e-9
+    assert float(slope_inwards(R, b, controls.project(0.99 * u), controls).max()) > 1e-3
 
 
 @pytest.mark.parametrize("m", range(1, 5))
@@ -251,7 +274,7 @@ def test_the_minimum_within_limits_has_a_gradient_where_controls_are_free():
     ("lower", "upper", "reason"),
     [
         (1.0, -1.0, "lower ≤ upper"), (math.nan, 1.0, "lower ≤ upper"), (math.inf, math.inf, "lower ≤ upper"),
-        ([-1.0], [1.0, 2.0], "one for each control"), ([-1.0] * 5, [1.0] * 5, "at most 4 controls"),
+        ([-1.0], [1.0, 2.0], "one for each control"),
     ],
 )  # fmt: skip
 def test_limits_without_meaning_are_refused(lower, upper, reason):
@@ -261,5 +284,5 @@ def test_limits_without_meaning_are_refused(lower, upper, reason):
 
 @pytest.mark.parametrize("m", [1, 3, 5])
 def test_limits_of_another_number_of_controls_are_refused(m):
-    with pytest.raises(ValueError, match=f"Expected limits of {m} controls, and of no more than 4, got 2"):
+    with pytest.raises(ValueError, match=f"Expected limits of {m} controls, got 2"):
         ControlBox([-1.0, -1.0], [1.0, 1.0]).minimise(torch.eye(m), torch.ones(m))

@@ -203,6 +203,9 @@ class Config:
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
     target: list[float] | None = option(None, "x*, the state that the cost is about; null: its own goal.")
     target_control: list[float] | None = option(None, "u*, likewise; null: what holds x*, f(x*) + g(x*)u* = 0.")
+    family: dict[str, list[float]] = option(
+        {}, "Ranges of what V is told: parameters of the system, and target_STATE; each as [least, greatest]."
+    )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

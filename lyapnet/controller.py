@@ -3,7 +3,7 @@
 import inspect
 import json
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, overload
 
@@ -20,12 +20,15 @@ from lyapnet.build import (
     build_program,
     build_rollout,
     build_value_function,
+    member_config,
+    member_parts,
 )
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, SystemConfig, config_from_plain
 from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
+from lyapnet.family import AtParameters, FamilySystem
 from lyapnet.policy import HJBPolicy, ValuePolicy
 from lyapnet.problem import Horizon, Problem
 from lyapnet.programs import Program, ValueProgram
@@ -58,6 +61,7 @@ class Controller:
         program: Program | None = None,
         config: Config | None = None,
         beyond: str | None = None,
+        parts: Parts | None = None,
     ):
         """A controller of parts.
 
@@ -68,8 +72,9 @@ class Controller:
             program: what V was trained for, and so what a certificate asks of it; None: the value program.
             config: of the run that trained it, where there was one.
             beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load.
+            parts: the user's own parts that stood in the place of the config's.
         """
-        self.problem, self._config = problem, config
+        self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
         self.program = ValueProgram() if program is None else program
         self.V = V.requires_grad_(False).eval()
         self._rollout = Rollout(problem, HJBPolicy(problem, V), gradient="backprop") if rollout is None else rollout
@@ -131,40 +136,66 @@ class Controller:
         return self._rollout.closed_loop
 
     @overload
-    def value(self, t: Tensor | float, x: Tensor) -> Tensor: ...
+    def value(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
     @overload
-    def value(self, t: ArrayLike, x: ArrayLike) -> np.ndarray: ...
-    def value(self, t: Any, x: Any) -> Any:
+    def value(self, t: ArrayLike, x: ArrayLike, **parameters: Any) -> np.ndarray: ...
+    def value(self, t: Any, x: Any, **parameters: Any) -> Any:
         """V(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch,).
 
+        Args:
+            parameters: of a family, each by its name, scalar or (*batch,); none where x is (x, p).
+
         Raises:
             ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self._continued.V, t, x)
+        return self._answer(self._continued.V, t, x, parameters)
 
     @overload
-    def policy(self, t: Tensor | float, x: Tensor) -> Tensor: ...
+    def policy(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
     @overload
-    def policy(self, t: ArrayLike, x: ArrayLike) -> np.ndarray: ...
-    def policy(self, t: Any, x: Any) -> Any:
+    def policy(self, t: ArrayLike, x: ArrayLike, **parameters: Any) -> np.ndarray: ...
+    def policy(self, t: Any, x: Any, **parameters: Any) -> Any:
         """u(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch, m).
 
+        Args:
+            parameters: of a family, each by its name, scalar or (*batch,), as in policy(t, x, pole_mass=0.2); none
+                where x is (x, p).
+
         Raises:
             ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self._continued, t, x)
+        return self._answer(self._continued, t, x, parameters)
 
-    def rollout(self, x0: Any, steps: int | None = None) -> Trajectory:
+    def with_(self, **parameters: float) -> "Controller":
+        """The controller of one member of a family: of its own problem, with V(t, (x, p)) at these parameters.
+
+        Raises:
+            UsageError: it is of no family; or a parameter is missing, unknown, or outside the range that V was told.
+        """
+        system = self.system
+        if not isinstance(system, FamilySystem) or self._config is None:
+            raise UsageError("Expected a controller of a family, got one of a single problem; add family to the YAML.")
+        values = {name: float(value) for name, value in parameters.items()}
+        config = member_config(self.config, values, system.system)
+        parts = member_parts(self._parts, system, values)
+        problem = build_problem(config, parts).to(self.initial_states.lower.device)
+        V = AtParameters(self.V, self.initial_states.lower.new_tensor([*values.values()]))
+        return Controller(problem, V, build_rollout(config, problem, V), self.program, config, self._beyond, parts)
+
+    def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Trajectory:
         """The closed loop from x₀ (*batch, n); a Trajectory of what x₀ is, tensors or arrays.
 
         Args:
             steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state; after
                 T it goes on as `beyond` says.
+            parameters: of a family, each by its name; none where x₀ is (x₀, p).
 
         Raises:
             ValueError: the shape does not fit.
             DivergenceError: the closed loop leaves the finite numbers.
         """
+        if parameters:
+            return self.with_(**parameters).rollout(x0, steps)
         if steps is not None and (not isinstance(steps, int) or steps < 1):
             raise ValueError(f"Expected steps as a whole number ≥ 1, got {steps!r}; give how many steps of Δt to take.")
         with torch.no_grad():
@@ -196,8 +227,10 @@ class Controller:
             torch.cat([first.require_value(), rest.require_value()[1:]]),
         )
 
-    def _answer(self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any) -> Any:
-        time, state = self._inputs(t, x)
+    def _answer(
+        self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any, parameters: Mapping[str, Any]
+    ) -> Any:
+        time, state = self._inputs(t, self._told(x, parameters) if parameters else x)
         with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
             return _like(x, function(time, state))
 
@@ -210,6 +243,13 @@ class Controller:
         if bool((time < -slack(time, self.horizon.duration)).any()):
             raise ValueError(f"Expected t ≥ 0, got {float(time.min()):g}; the horizon begins at 0.")
         return time.clamp(min=0), state
+
+    def _told(self, x: Any, parameters: Mapping[str, Any]) -> Tensor:
+        """(x, p) of x and the parameters of a family."""
+        if not isinstance(self.system, FamilySystem):
+            raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
+        like = self.initial_states.lower
+        return self.system.joined(torch.as_tensor(x, dtype=like.dtype, device=like.device), parameters)
 
     def _state(self, x: Any) -> Tensor:
         like = self.initial_states.lower
@@ -270,7 +310,7 @@ def load(
         )  # fmt: skip
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
-    return Controller(problem, V, build_rollout(config, problem, V), own, config, beyond)
+    return Controller(problem, V, build_rollout(config, problem, V), own, config, beyond, parts)
 
 
 def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:

@@ -13,7 +13,7 @@ LEVELS = (
     {"drawing", "errors", "interpolation", "linear_algebra", "provenance", "random_streams", "tables", "types"},
     {"contracts", "cost", "files", "schema", "sets", "sizes", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
-    {"expansions", "networks"},
+    {"expansions", "family", "networks"},
     {"policy"},
     {"beyond", "rollout"},
     {"programs"},
@@ -28,7 +28,7 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "beyond", "calculus", "contracts", "cost", "errors", "expansions", "files", "graphs", "interpolation",
+    "beyond", "calculus", "contracts", "cost", "errors", "expansions", "family", "files", "graphs", "interpolation",
     "linear_algebra", "networks", "policy", "problem", "programs", "random_streams", "rollout", "sets", "systems",
     "types",
 }  # fmt: skip

@@ -119,7 +119,8 @@ KNOWN = dict(keys_of(Config))
 
 def is_key(name: str) -> bool:
     """Whether the config has a key or a section of that name; what a section leaves open, it has."""
-    open_ended = ("trainer", "system.parameters", "cost.parameters", "controls.parameters", "program.parameters")
+    parts = ("system", "cost", "controls", "program")
+    open_ended = ("trainer", "family", *(f"{part}.parameters" for part in parts))
     return name in {*KNOWN, *SECTIONS} or name.rpartition(".")[0] in open_ended
 
 

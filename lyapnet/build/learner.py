@@ -40,6 +40,8 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}
     accepted = inspect.signature(cls).parameters
+    if "constants" in accepted:
+        chosen["constants"] = [kept.index(i) for i in problem.system.constants if i in kept]
     if "scaling" not in accepted:
         raise UsageError(
             f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."

@@ -10,15 +10,16 @@ from torch import Tensor
 
 from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
 from lyapnet.build.entries import repeated, require_length, rows
+from lyapnet.build.family import family_of
+from lyapnet.build.target import about_target
 from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised
-from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
+from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.problem import Horizon, Problem
 from lyapnet.sets import Box, ControlBox, ControlSet
 from lyapnet.systems import ControlAffineSystem, Linear
 
-HELD = 1e-9  # ẋ of a state that is held, against f
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -47,46 +48,15 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = build_cost(config.cost, system) if cost is None else cost.double()
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
-        if not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
-            cost = _with_obstacles(config.cost, _about_target(config, cost, system, controls), system)
+        if config.family:
+            system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
+        elif not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
+            cost = about_target(config, cost, system, controls)
+        if not isinstance(parts.cost, MadeOfAnother):
+            cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
         problem.check()
         return problem.to(dtype)
-
-
-def _about_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
-    """The cost about the target of a config, if there is one."""
-    if config.target is None and config.target_control is not None:
-        raise UsageError("Expected target with target_control, got none; name the state that it holds.")
-    if config.target is None:
-        return cost
-    target, given = repeated(config.target, system.n), repeated(config.target_control, system.m)
-    require_length("target", len(target), system)
-    x = torch.tensor(target, dtype=torch.float64)
-    if given is None:
-        u = _holding(system, x)
-    else:
-        require_length("target_control", len(given), system, system.m)
-        u = torch.tensor(given, dtype=torch.float64)
-    if not bool(controls.contains(u)):
-        raise UsageError(
-            f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
-            "choose another target."
-        )
-    return TargetCost(cost, x, u)
-
-
-def _holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
-    """u* with f(x*) + g(x*)u* = 0."""
-    u, left = system.holding_control(x)
-    worst = int(left.abs().argmax())
-    if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
-        raise UsageError(
-            f"Expected a target that some control holds, f(x*) + g(x*)u* = 0, got {float(left[worst]):.3g} for the "
-            f"rate of {system.state_names[worst]} at {x.tolist()}; choose another, or say what the cost counts "
-            "u from, as in target_control: [0]."
-        )
-    return u
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:

@@ -4,11 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.special import betaincinv
 from torch import Tensor
 
 from lyapnet.certification.verdict import Verdict
+from lyapnet.cost import Cost
 from lyapnet.errors import DivergenceError
 from lyapnet.problem import Problem
 from lyapnet.programs import EVENTS, Tolerances
@@ -142,7 +143,7 @@ def sampled_claim(
         raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
     require_memory("samples", samples, NUMBER * samples * problem.system.n, "draw fewer")
     x0 = problem.initial_states.sample(samples, generator)
-    held = torch.cat([_events(rollout, part, tolerances, problem.goal) for part in x0.split(batch)])
+    held = torch.cat([_events(rollout, part, tolerances, problem.cost) for part in x0.split(batch)])
     return SampledClaim(x0.cpu(), held, tolerances)
 
 
@@ -177,7 +178,7 @@ FEWEST = 16  # states that are counted as failures together where one of them di
 
 
 def _events(
-    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, goal: Float[Tensor, " n"]
+    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, cost: Cost
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
@@ -190,12 +191,12 @@ def _events(
     except DivergenceError:
         if len(x0) <= FEWEST:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
-        return torch.cat([_events(rollout, half, tolerances, goal) for half in x0.tensor_split(2)])
+        return torch.cat([_events(rollout, half, tolerances, cost) for half in x0.tensor_split(2)])
     values = trajectory.require_value()
     decrease = terminal = torch.ones_like(values[0], dtype=torch.bool)
     if tolerances.decrease is not None:
         decrease = satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease)
     if tolerances.radius is not None:
-        terminal = torch.linalg.vector_norm(trajectory.x[-1] - goal, dim=-1) <= tolerances.radius
+        terminal = torch.linalg.vector_norm(cost.from_goal(trajectory.x[-1]), dim=-1) <= tolerances.radius
     single = torch.stack([decrease, terminal, trajectory.cost <= (1 + tolerances.cost) * values[0]], -1)
     return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

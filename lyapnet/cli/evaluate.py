@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+from lyapnet.cli.options import (
+    At,
+    Checkpoint,
+    Controls,
+    Cost,
+    Debug,
+    Network,
+    Program,
+    System,
+    load_controller,
+    member_of,
+)
 from lyapnet.errors import UsageError
 
 if TYPE_CHECKING:
@@ -31,9 +42,10 @@ def evaluate(
     cost: Cost = None,
     controls: Controls = None,
     program: Program = None,
+    at: At = None,
     debug: Debug = False,
 ) -> None:
-    """Measure a controller on fresh initial states of X₀.
+    """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
 
     The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
     once for each state: the next evaluation of any controller of the task reads it.
@@ -49,6 +61,7 @@ def evaluate(
     controller = load_controller(
         checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
     )
+    controller = member_of(controller, at) if at else controller
     notes = Console(stderr=True, highlight=False, markup=False)
     with notes.status("measuring …") as status:
         measured = evaluation(

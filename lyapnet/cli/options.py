@@ -11,6 +11,10 @@ System = Annotated[str | None, typer.Option(help="module:Class of a system of yo
 Network = Annotated[str | None, typer.Option(help="module:Class of a network of your own.")]
 Cost = Annotated[str | None, typer.Option(help="module:Class of a cost of your own.")]
 Controls = Annotated[str | None, typer.Option(help="module:Class of a control set of your own.")]
+At = Annotated[
+    list[str] | None,
+    typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
+]
 Program = Annotated[str | None, typer.Option(help="module:Class of a program of your own.")]
 
 
@@ -33,3 +37,14 @@ def load_controller(checkpoint: Path, **own: str | None) -> Any:
     controller = load(checkpoint, **vars(parts_given(checkpoint, **own)))
     torch.set_num_threads(controller.config.training.threads)
     return controller
+
+
+def member_of(controller: Any, at: list[str]) -> Any:
+    """The controller of one member of a family, from NAME=VALUE of its parameters."""
+    from lyapnet.errors import UsageError
+
+    try:
+        parameters = {name: float(value) for name, _, value in (each.partition("=") for each in at)}
+    except ValueError as error:
+        raise UsageError(f"Expected --at NAME=VALUE with a number, got {' '.join(at)}; as in --at mass=0.9.") from error
+    return controller.with_(**parameters)

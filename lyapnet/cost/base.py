@@ -44,6 +44,10 @@ class Cost(nn.Module, ABC):
     def terminal(self, x: State) -> PerState:
         """φ(x)."""
 
+    def from_goal(self, x: State) -> State:
+        """x − x*; of a family x* is the target of each member, and its parameters count as zero."""
+        return x if self.goal is None else x - self.goal.to(x)
+
     def terminal_gradient(self, x: State) -> State:
         """φ_x(x); by automatic differentiation unless a subclass knows better."""
         recording = torch.is_grad_enabled()

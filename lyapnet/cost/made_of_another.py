@@ -31,6 +31,9 @@ class MadeOfAnother(Cost):
     def terminal(self, x: State) -> PerState:
         return self.cost.terminal(x)
 
+    def from_goal(self, x: State) -> State:
+        return self.cost.from_goal(x)
+
     def ignores(self, i: int, n: int) -> bool:
         return self.cost.ignores(i, n)
 
@@ -55,6 +58,9 @@ class TargetCost(MadeOfAnother):
         self.register_buffer("shift", goal - (0 if cost.goal is None else cost.goal), persistent=False)
         self.goal, self.rest = goal, u
         self.words = f"about x* = {goal.tolist()} and u* = {u.tolist()}"
+
+    def from_goal(self, x: State) -> State:
+        return Cost.from_goal(self, x)
 
     def state(self, x: State) -> PerState:
         return self.cost.state(x - self.shift)

@@ -145,12 +145,16 @@ def _draw_line_region(
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     """States, controls and their limits, and V with the cost still to come, over time, of a batch (b,) of loops.
 
-    Dotted: the goal, and the control that costs nothing.
+    Dotted: the goal, where it is one, and the control that costs nothing. Parameters of a family have no panel.
     """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
-    at_rest = torch.cat([problem.goal, problem.rest]).tolist()
-    curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in range(system.n)]
+    drawn = [i for i in range(system.n) if i not in system.constants]
+    x0 = trajectory.x[0]
+    goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # of each, in a family
+    one = torch.where((goal - goal[0]).abs().amax(0) <= 1e-9 * (1 + goal[0].abs()), goal[0], torch.nan)
+    at_rest = torch.cat([one, problem.rest]).tolist()
+    curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
     columns = _columns(len(curves) + 1)
     rows = -(-(len(curves) + 1) // columns)
@@ -162,7 +166,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
         panel.axhline(height, color=GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
     for limit in problem.controls.limits or ():
-        for panel, height in zip(panels[system.n : len(curves)], limit.expand(system.m).tolist(), strict=True):
+        for panel, height in zip(panels[len(drawn) : len(curves)], limit.expand(system.m).tolist(), strict=True):
             if math.isfinite(height):
                 panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
     last = panels[len(curves)]

@@ -35,8 +35,9 @@ class Evaluation(NamedTuple):
         Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
-        system, errors = self.problem.system, (self.table.terminal_state - self.problem.goal).abs().mean(0)
-        terminal = dict(zip(system.state_labels, errors.tolist(), strict=True))
+        system, errors = self.problem.system, self.problem.cost.from_goal(self.table.terminal_state).abs().mean(0)
+        labels = dict(enumerate(system.state_labels))
+        terminal = {labels[i]: float(errors[i]) for i in labels if i not in system.constants}
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
         limits = self.table.use_of_limits(system.control_names)
         used = {"at_limits": limits} if limits else {}

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lyapnet.build import with_parameters
+from lyapnet.build import knows, with_parameters
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.family import FamilySystem
 from lyapnet.problem import Horizon, Problem
 from lyapnet.random_streams import TEST, stream
 from lyapnet.rollout import Rollout
@@ -81,8 +82,11 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
     Those are: initial states up to 20 % outside X₀ and none inside; each positive physical parameter of the system 20 %
     lower and higher, gravity aside, while the policy and the cost keep the old one; noise of 1 % on the state that the
-    policy reads; and half the Δt.
+    policy reads; and half the Δt. Of a family it is the task of one member, `nominal`; and where V can be told a
+    parameter, there is also the task of the member that has it.
     """
+    family = dict[str, float]() if not controller.system.constants else nominal(controller)
+    whole, controller = controller, controller.with_(**family) if family else controller
     X0 = controller.initial_states
     x0 = X0.sample(samples, stream(seed, TEST))
     problem = controller.problem
@@ -96,10 +100,22 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
             yield undisturbed._replace(
                 name=f"{name.replace('_', ' ')} {share:+.0%}", problem=problem.replaced(system=system)
             )
+            if name in family and knows(whole.config, name, value * (1 + share)):
+                told = whole.with_(**{**family, name: value * (1 + share)})
+                policy = told.closed_loop.policy
+                yield Disturbance(f"{name.replace('_', ' ')} {share:+.0%}, told", told.problem, policy, x0)
     policy = NoisyPolicy(undisturbed.policy, NOISE * magnitude(controller, x0), stream(seed, TEST))
     yield undisturbed._replace(name=f"noise of {NOISE:.0%} on the state", policy=policy)
     halved = Horizon(2 * problem.horizon.steps, problem.horizon.dt / 2)
     yield undisturbed._replace(name="half the Δt", problem=problem.replaced(horizon=halved))
+
+
+def nominal(family: Controller) -> dict[str, float]:
+    """The member of a family in whose task others are disturbances: the config's own, else the middle of a range."""
+    assert isinstance(family.system, FamilySystem)
+    own, middle = family.system.system, {name: sum(ends) / 2 for name, ends in family.config.family.items()}
+    given = {name: getattr(own, name, middle[name]) for name in middle}
+    return {name: value if knows(family.config, name, value) else middle[name] for name, value in given.items()}
 
 
 def robustness(
@@ -137,7 +153,7 @@ def _row(controller: Controller, disturbance: Disturbance, optimum: bool) -> Dis
     except DivergenceError:
         return DisturbanceRow(name, None, None, None, None, None)
     cost = float(trajectory.cost.mean())
-    error = float(torch.linalg.vector_norm(trajectory.x[-1] - problem.goal, dim=-1).mean())
+    error = float(torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1).mean())
     without_optimum = DisturbanceRow(name, cost, None, None, None, error)
     if not optimum:
         return without_optimum

@@ -97,7 +97,7 @@ def measure(
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),
         terminal_state=trajectory.x[-1],
-        terminal_error=torch.linalg.vector_norm(trajectory.x[-1] - problem.goal.to(trajectory.x), dim=-1),
+        terminal_error=torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1),
         at_limits=_at_limits(problem.controls, trajectory.u),
     )
 

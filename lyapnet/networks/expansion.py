@@ -14,6 +14,7 @@ from lyapnet.networks.fcn import FCN
 from lyapnet.types import PerState, State, Time
 
 FEW = 4  # states for which a narrower network is enough
+SINGULAR = 1e-6  # of the greatest curvature, below which there is no valley to follow
 ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
 NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
 
@@ -27,17 +28,30 @@ class ExpansionNetwork(ValueFunction):
     units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, all but N is
     zero and C = diag(1/scale).
 
+    Constant states p, the parameters of a family, are told apart from the others, y: ξ is (Cᵀ(δy + Sδp), δp / spread),
+    S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
+    ξ_y.
+
     Args:
         scaling: of the task, for what starts without an expansion.
         hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
+        constants: indices of the states that stay what they are.
     """
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
     at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
+    moves: Float[Tensor, " n"]  # 0 for a constant state, 1 for any other
 
-    def __init__(self, scaling: Scaling, hidden: Sequence[int] | None = None, activation: str = "tanh"):
+    def __init__(
+        self,
+        scaling: Scaling,
+        hidden: Sequence[int] | None = None,
+        activation: str = "tanh",
+        constants: Sequence[int] = (),
+    ):
         super().__init__()
+        self.constants = list(constants)
         n = self.n = len(scaling.state)
         hidden = [64 if n <= FEW else 128] * 2 if hidden is None else hidden
         self.network = FCN(Scaling([1.0] * n, scaling.duration, 1.0), hidden, activation)
@@ -46,6 +60,9 @@ class ExpansionNetwork(ValueFunction):
         self.register_buffer("scale", torch.tensor(scaling.value))
         self.register_buffer("coordinates", torch.diag(1 / torch.tensor(scaling.state)))
         self.register_buffer("at_goal", torch.tensor(0.0))
+        self.register_buffer(
+            "moves", torch.ones(n).index_fill(0, torch.tensor(self.constants, dtype=torch.long), 0.0), persistent=False
+        )
         self.expansion = Curve(torch.linspace(0, scaling.duration, NODES), torch.zeros(NODES, 1 + 2 * n + 2 * n * n))
 
     def forward(self, t: Time, x: State) -> PerState:
@@ -62,13 +79,16 @@ class ExpansionNetwork(ValueFunction):
         near, curved = self._near(xi), apply(H, delta)
         share = 1 - self.at_goal * near
         value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
-        rest_xi = share[..., None] * N_xi + (2 * self.at_goal * near**2 * N)[..., None] * xi
+        rest_xi = share[..., None] * N_xi + (2 * self.at_goal * near**2 * N)[..., None] * self._moving(xi)
         return value, p + curved + self.scale * (rest_xi @ self.coordinates.mT)
 
-    @staticmethod
-    def _near(xi: State) -> PerState:
-        """1 / (1 + ‖ξ‖²)."""
-        return 1 / (1 + (xi**2).sum(-1))
+    def _near(self, xi: State) -> PerState:
+        """1 / (1 + ‖ξ_y‖²)."""
+        return 1 / (1 + (self._moving(xi) ** 2).sum(-1))
+
+    def _moving(self, xi: State) -> State:
+        """ξ_y, with zeros for the constant states."""
+        return self.moves * xi if self.constants else xi
 
     def curvature(self, t: Time) -> Tensor:
         return self.expansion(t)[..., -self.n * self.n :].unflatten(-1, (self.n, self.n))
@@ -92,12 +112,22 @@ class ExpansionNetwork(ValueFunction):
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
         self.expansion.take(t, torch.cat(parts, 1))
-        early = curvature[: max(1, 3 * len(curvature) // 4)].mean(0) / 2
-        values, vectors = torch.linalg.eigh(early)
+        y, p = [i for i in range(self.n) if i not in self.constants], self.constants
+        early = slice(max(1, 3 * len(curvature) // 4))
+        values, vectors = torch.linalg.eigh(curvature[early][:, y][..., y].mean(0) / 2)
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
-        s = (apply(vectors.mT, spread) ** 2 * values).sum(-1).mean() / self.n
+        inverse = (vectors * values.reciprocal().where(values > SINGULAR * values.max(), 0)) @ vectors.mT
+        S = inverse @ hessian[early][:, y][..., p].mean(0) / 2
+        along = apply(vectors.mT, spread[:, y] + spread[:, p] @ S.mT)
+        s = (along**2 * values).sum(-1).mean() / len(y)
         self.at_goal.fill_(float(value.abs().max() <= ROUNDING * s))
         s = s.clamp_min(1e-6 * float(value.abs().max()))  # no spread: X₀ is a point
         if s > 0:
             self.scale.copy_(s)
-            self.coordinates.copy_(vectors * (values / s).sqrt())
+            C, reach = vectors * (values / s).sqrt(), spread[:, p].abs().amax(0)
+            self.coordinates.zero_()
+            for k, i in enumerate(y):
+                self.coordinates[i, y] = C[k]
+            for k, i in enumerate(p):
+                self.coordinates[i, y] = S[:, k] @ C
+                self.coordinates[i, i] = 1 / reach[k].where(reach[k] > 0, 1)

@@ -26,6 +26,7 @@ class ControlAffineSystem(nn.Module, ABC):
     control_names: Sequence[str] = ()
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
+    constants: Sequence[int] = ()  # indices of the states that stay what they are: the parameters of a family
 
     @abstractmethod
     def f(self, x: State) -> State:
@@ -44,6 +45,11 @@ class ControlAffineSystem(nn.Module, ABC):
         f, g = self.f(x), self.g(x)
         u = -apply(torch.linalg.pinv(g), f)
         return u, f + apply(g, u)
+
+    @property
+    def title(self) -> str:
+        """What it is called in tables."""
+        return type(self).__name__
 
     @property
     def n(self) -> int:
@@ -72,8 +78,10 @@ class ControlAffineSystem(nn.Module, ABC):
                 raise UsageError(f"Expected {name}.{names} with a name for each, got {listed!r}; declare them.")
             if len(of_each) != len(listed):
                 raise UsageError(f"Expected one unit for each of {name}.{names}, got {len(of_each)}; declare {units}.")
-        if not all(isinstance(i, int) and 0 <= i < self.n for i in self.angles):
-            raise UsageError(f"Expected {name}.angles as indices of states, got {self.angles!r}; count from 0.")
+        for attribute in ("angles", "constants"):
+            listed = getattr(self, attribute)
+            if not all(isinstance(i, int) and 0 <= i < self.n for i in listed):
+                raise UsageError(f"Expected {name}.{attribute} as indices of states, got {listed!r}; count from 0.")
 
     @property
     def state_labels(self) -> list[str]:

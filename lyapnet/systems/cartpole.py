@@ -44,8 +44,8 @@ class Cartpole(MechanicalSystem):
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         coupling = self.pole_mass * self.length * torch.cos(q[..., 1])
-        cart = torch.full_like(coupling, self.cart_mass + self.pole_mass)
-        pole = torch.full_like(coupling, self.pole_mass * self.length**2)
+        cart = self.cart_mass + self.pole_mass + torch.zeros_like(coupling)
+        pole = self.pole_mass * self.length**2 + torch.zeros_like(coupling)
         return torch.stack([cart, coupling, coupling, pole], -1).unflatten(-1, (2, 2))
 
     def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:

@@ -28,10 +28,11 @@ class Pendulum(MechanicalSystem):
         self.mass, self.length, self.gravity = mass, length, gravity
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
-        return torch.full_like(q, self.mass * self.length**2)[..., None]
+        inertia = self.mass * self.length**2 + torch.zeros_like(q[..., 0])
+        return inertia[..., None, None]
 
     def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
-        return self.mass * self.gravity * self.length * torch.sin(q)
+        return (self.mass * self.gravity * self.length * torch.sin(q[..., 0]))[..., None]
 
     def energy(self, x: State) -> PerState:
         q, qdot = self._split(x)

@@ -32,18 +32,19 @@ class PlanarQuadrotor(ControlAffineSystem):
 
     def f(self, x: State) -> State:
         pitch = x[..., 2]
-        falling = self.gravity * torch.stack([-torch.sin(pitch), torch.cos(pitch) - 1, torch.zeros_like(pitch)], -1)
+        sideways, up = -self.gravity * torch.sin(pitch), self.gravity * (torch.cos(pitch) - 1)
+        falling = torch.stack([sideways, up, torch.zeros_like(pitch)], -1)
         return torch.cat([x[..., 3:], falling], -1)
 
     def g(self, x: State) -> InputMatrix:
         pitch, turn = x[..., 2], self.arm / self.inertia
-        push = torch.stack([-torch.sin(pitch), torch.cos(pitch)], -1) / self.mass
-        right, left = (torch.cat([push, torch.full_like(push[..., :1], a)], -1) for a in (turn, -turn))
+        push = [-torch.sin(pitch) / self.mass, torch.cos(pitch) / self.mass]
+        right, left = (torch.stack([*push, a + torch.zeros_like(pitch)], -1) for a in (turn, -turn))
         accelerations = torch.stack([right, left], -1)
         return torch.cat([torch.zeros_like(accelerations), accelerations], -2)
 
     def inverse_mass(self, x: State) -> ControlMatrix:
         """BᵀM⁻¹B, the control weight R of the reference tasks; the same at every state."""
-        push, turn = 1 / self.mass, self.arm**2 / self.inertia
-        R = torch.tensor([[push + turn, push - turn], [push - turn, push + turn]]).to(x)
-        return R.expand(*x.shape[:-1], 2, 2)
+        zero = torch.zeros_like(x[..., 0])
+        push, turn = 1 / self.mass + zero, self.arm**2 / self.inertia + zero
+        return torch.stack([push + turn, push - turn, push - turn, push + turn], -1).unflatten(-1, (2, 2))

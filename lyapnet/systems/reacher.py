@@ -43,13 +43,13 @@ class Reacher(MechanicalSystem):
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         a2_cos = self.a2 * torch.cos(q[..., 1])
         coupling = self.a3 + a2_cos
-        elements = [self.a1 + 2 * a2_cos, coupling, coupling, torch.full_like(coupling, self.a3)]
+        elements = [self.a1 + 2 * a2_cos, coupling, coupling, self.a3 + torch.zeros_like(coupling)]
         return torch.stack(elements, -1).unflatten(-1, (2, 2))
 
     def forces(self, q: Coordinates, qdot: Coordinates) -> Coordinates:
         first, second = qdot.unbind(-1)
         coriolis = torch.stack([second * (2 * first + second), -(first**2)], -1)
-        return self.a2 * torch.sin(q[..., 1:]) * coriolis
+        return (self.a2 * torch.sin(q[..., 1]))[..., None] * coriolis
 
     def energy(self, x: State) -> PerState:
         return self.kinetic_energy(*self._split(x))

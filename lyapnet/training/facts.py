@@ -50,7 +50,7 @@ def _task(problem: Problem) -> Fact:
         limits = f" in {type(controls).__name__}" if sides is None else f" between {sides[0]} and {sides[1]}"
     return Fact(
         "task",
-        f"{type(system).__name__}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}; "
+        f"{system.title}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}; "
         f"T = {horizon.duration:g} s in {_counted(horizon.steps, 'step')}",
     )
 
@@ -83,9 +83,11 @@ def _linearisation(problem: Problem) -> list[Fact]:
     system, goal, dt = problem.system, problem.goal, problem.horizon.dt
     A = torch.autograd.functional.jacobian(system.f, goal)
     assert isinstance(A, Tensor)
-    B, values = system.g(goal).detach(), torch.linalg.eigvals(A)
+    moving = [i for i in range(system.n) if i not in system.constants]
+    A, B = A[moving][:, moving], system.g(goal).detach()[moving]
+    values = torch.linalg.eigvals(A)
     listed = ", ".join(_complex(value) for value in sorted(values.tolist(), key=lambda v: (-v.real, abs(v.imag))))
-    unreached = [value for value in values if _rank(A, B, value) < system.n]
+    unreached = [value for value in values if _rank(A, B, value) < len(A)]
     facts = [Fact("modes at the goal", f"{listed} 1/s")]
     if not unreached:
         facts.append(Fact("controllable", "yes, linearised at the goal"))

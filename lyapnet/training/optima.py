@@ -22,6 +22,7 @@ from lyapnet.types import State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
+WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
 
 
@@ -44,6 +45,18 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> 
         u = _cheapest([_along(exact, optimum, column, others) for column in columns]).u
         optimum = _joined(optimum, optimal_trajectories(problem, others, u))
     return _followed(exact, optimum)
+
+
+def minima(optimum: Optimum) -> Optimum:
+    """Those with an expansion: where a trajectory that was not improved is no minimum, V_xx grows without bound.
+
+    Source: Bryson, Ho, Applied Optimal Control, 1975, § 6.3 (conjugate points).
+    """
+    curvature = optimum.expansion.hessian.abs().amax((0, -2, -1)).nan_to_num(torch.inf)
+    finite = optimum.path.cost.isfinite() & curvature.isfinite()
+    kept = finite & (curvature <= WILD * curvature[finite].median()) if finite.any() else finite
+    path = Path(optimum.path.x[:, kept], optimum.path.u[:, kept], optimum.path.cost[kept])
+    return Optimum(path, optimum.expansion.member(kept))
 
 
 def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:

@@ -23,7 +23,7 @@ from lyapnet.networks import ExpansionNetwork, IgnoringStates
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
-from lyapnet.training.optima import OPTIMA, optima_for
+from lyapnet.training.optima import OPTIMA, minima, optima_for
 from lyapnet.training.pretraining import examples_of, fit
 from lyapnet.types import State
 
@@ -126,8 +126,9 @@ def _fitted(
     """
     problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"optima from {OPTIMA} states of X₀")
-    optimum = optima_for(problem, expansions, problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0))
-    found = int(optimum.path.cost.isfinite().sum())
+    states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
+    optimum = minima(optima_for(problem, expansions, states))
+    found = len(optimum.path.cost)
     if not found:
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
@@ -173,7 +174,8 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
 def take(network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept: list[int], x0: State) -> None:
     """Start a network from an expansion."""
     expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
-    values, vectors = torch.linalg.eigh(expansion.hessian)
+    moves = network.moves.double().cpu()  # of the others, no law asks how V curves in them
+    values, vectors = torch.linalg.eigh(expansion.hessian * moves[:, None] * moves)
     curvature = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
     network.take(*(part.to(network.scale) for part in parts))

@@ -1,0 +1,201 @@
+"""Families: one problem for every parameter in a range, as a problem whose parameters are states that stay.
+
+With p among the states, z = (x, p) and ṗ = 0, V(t, x, p) is a V(t, z) like any other: training, optima, evaluation and
+certificates of the family are those of one problem in n + k states.
+"""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.cost import Cost
+from lyapnet.errors import UsageError, one_line
+from lyapnet.systems import ControlAffineSystem
+from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State, Time
+
+ALIKE = 1e-9  # relative: f and g of a member, by attributes and by its constructor
+PREFIX = "target_"
+
+
+class FamilySystem(ControlAffineSystem):
+    """ẋ = f(x; p) + g(x; p)u and ṗ = 0, in the state z = (x, p).
+
+    A parameter of the dynamics is a number that the system keeps under the name of its constructor's argument and reads
+    in f and g; there it becomes a tensor (*batch,), one number for each state. Other parameters are carried along.
+
+    Args:
+        system: f and g.
+        names: of p, (k,).
+        units: of p.
+    """
+
+    def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
+        super().__init__()
+        self.system = system
+        self.parameters_in_f = {name: i for i, name in enumerate(names) if not name.startswith(PREFIX)}
+        self.state_names = (*system.state_names, *names)
+        self.state_units = (*system.state_units, *units)
+        self.control_names, self.control_units = tuple(system.control_names), tuple(system.control_units)
+        self.angles = tuple(system.angles)
+        self.constants = tuple(range(system.n, system.n + len(names)))
+
+    @property
+    def title(self) -> str:
+        return f"family of {self.system.title}"
+
+    def split(self, z: State) -> tuple[Tensor, Tensor]:
+        """(x, p)."""
+        return z[..., : self.system.n], z[..., self.system.n :]
+
+    def joined(self, x: Tensor, parameters: Mapping[str, Any]) -> Tensor:
+        """(x, p) of states and parameters by their names, each scalar or (*batch,).
+
+        Raises:
+            ValueError: other names than those of the family.
+        """
+        names = [self.state_names[i] for i in self.constants]
+        if parameters.keys() != set(names):
+            raise ValueError(f"Expected values for {', '.join(names)}, got {', '.join(parameters)}; give each.")
+        told = [torch.as_tensor(parameters[name]).to(x).expand(x.shape[:-1]) for name in names]
+        return torch.cat([x, torch.stack(told, -1)], -1)
+
+    def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
+        """The system with parameters (k,), or with those of each of a batch of states."""
+        return with_attributes(self.system, {name: p[..., i] for name, i in self.parameters_in_f.items()})
+
+    def f(self, x: State) -> State:
+        x, p = self.split(x)
+        return torch.cat([self.member(p).f(x), torch.zeros_like(p)], -1)
+
+    def g(self, x: State) -> InputMatrix:
+        x, p = self.split(x)
+        g = self.member(p).g(x)
+        return torch.cat([g, g.new_zeros(*g.shape[:-2], p.shape[-1], self.m)], -2)
+
+    def dynamics(self, x: State, u: Control) -> State:
+        x, p = self.split(x)
+        return torch.cat([self.member(p).dynamics(x, u), torch.zeros_like(p)], -1)
+
+    def inverse_mass(self, x: State) -> ControlMatrix:
+        """BᵀM(q; p)⁻¹B of each member, of a system that has one."""
+        x, p = self.split(x)
+        member: Any = self.member(p)
+        return member.inverse_mass(x)
+
+
+class FamilyCost(Cost):
+    """The cost of each member: q(x − E(p − p̄)) and φ(x − E(p − p̄)), and R(x) or R(x; p).
+
+    Args:
+        cost: q, R and φ at p̄, in x alone.
+        shift: E (n, k): how the target moves with p.
+        center: p̄ (k,).
+        R: z ↦ (*batch, m, m), where it depends on p; None: that of the cost.
+    """
+
+    shift: Float[Tensor, "n k"]
+    center: Float[Tensor, " k"]
+
+    def __init__(self, cost: Cost, shift: Tensor, center: Tensor, R: Callable[[State], ControlMatrix] | None = None):
+        super().__init__()
+        self.cost, self.R_of_member = cost, R
+        self.register_buffer("shift", shift, persistent=False)
+        self.register_buffer("center", center, persistent=False)
+        self.goal = torch.cat([shift.new_zeros(len(shift)) if cost.goal is None else cost.goal, center])
+        self.rest, self.R_constant, self.R_inverse = cost.rest, cost.R_constant, cost.R_inverse
+
+    def _centred(self, z: Tensor) -> Tensor:
+        n = len(self.shift)
+        return z[..., :n] - (z[..., n:] - self.center) @ self.shift.mT
+
+    def from_goal(self, x: State) -> State:
+        n = len(self.shift)
+        return torch.cat([self.cost.from_goal(self._centred(x)), torch.zeros_like(x[..., n:])], -1)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(self._centred(x))
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(self._centred(x))
+
+    def R(self, x: State) -> ControlMatrix:
+        return self.cost.R(x[..., : len(self.shift)]) if self.R_of_member is None else self.R_of_member(x)
+
+
+class AtParameters(ValueFunction):
+    """V(t, (x, p)) of a family as a function of (t, x), at one p.
+
+    Args:
+        V: of the family.
+        p: (k,).
+    """
+
+    p: Float[Tensor, " k"]
+
+    def __init__(self, V: ValueFunction, p: Tensor):
+        super().__init__()
+        self.V = V
+        self.register_buffer("p", p, persistent=False)
+
+    def _joined(self, x: Tensor) -> Tensor:
+        return torch.cat([x, self.p.expand(*x.shape[:-1], -1)], -1)
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.V(t, self._joined(x))
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        value, gradient = self.V.value_and_state_gradient(t, self._joined(x))
+        return value, gradient[..., : x.shape[-1]]
+
+    def curvature(self, t: Time) -> Tensor | None:
+        H, n = self.V.curvature(t), -len(self.p)
+        return None if H is None else H[..., :n, :n]
+
+
+def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> ControlAffineSystem:
+    """A copy of a system that shares what it is made of, but for some of its numbers."""
+    member = copy.copy(system) if values else system
+    for name, value in values.items():
+        setattr(member, name, value)
+    return member
+
+
+def check_members(family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State) -> None:
+    """Hold f and g of a family, at some states (b, n + k), against systems that are built with their parameters.
+
+    Args:
+        build: a system from the values of the parameters in f.
+
+    Raises:
+        UsageError: f or g reads no such number, or not it alone, or does not take it as a tensor.
+    """
+    names, cls = list(family.parameters_in_f), type(family.system).__name__
+    if unread := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
+        known = [name for name, value in vars(family.system).items() if type(value) in (int, float)]
+        raise UsageError(
+            f"Expected parameters of a family among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "
+            f"{unread[0]}; write self.{unread[0]} = {unread[0]} in its __init__, and read it in f and g."
+        )
+    try:
+        f, g = family.f(z), family.g(z)
+    except Exception as error:  # of any kind: f and g may be the user's
+        raise UsageError(
+            f"Expected {cls}.f and g that take {', '.join(names)} as a tensor, one number for each state, got "
+            f"{one_line(error)[:160]}; read states as x[..., i], and write c + torch.zeros_like(x[..., 0]) for "
+            "torch.full_like(x[..., 0], c)."
+        ) from error
+    for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
+        member = build({name: float(p[k]) for name, k in family.parameters_in_f.items()}).to(z)
+        for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
+            got = own[i][: len(x)] if own.ndim > 1 and len(own) == len(z) else own
+            if got.shape != expected.shape or not torch.allclose(got, expected, ALIKE, ALIKE):
+                raise UsageError(
+                    f"Expected {cls}.{symbol} to read {', '.join(names)} as self.{names[0]} and so on, a number for "
+                    f"each state x[..., i], got another {symbol} than that of {cls} built with {p.tolist()}; what "
+                    "__init__ derives from them has to be derived in f and g."
+                )

@@ -1,7 +1,8 @@
 """The callback that compiles a closed loop before its first step, and when that pays."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -11,6 +12,7 @@ from lyapnet.config import Config
 from lyapnet.errors import CompilationError, UntraceableError
 from lyapnet.graphs.compilation import cache_folder, has_compiler
 from lyapnet.rollout import TABLEAUX
+from lyapnet.training.compiling_ahead import CompilingAhead
 
 
 class Compilation(Callback):
@@ -25,6 +27,17 @@ class Compilation(Callback):
 
     def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[..., None]):
         self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
+        self._ahead: CompilingAhead | None = None
+
+    @contextmanager
+    def ahead(self, module: LightningModule) -> Iterator[None]:
+        """Compile beside what is done before the first step, in a process that ends with it."""
+        self._ahead = CompilingAhead(module, self.batch_size) if self.wanted and has_compiler() else None
+        try:
+            yield
+        finally:
+            if self._ahead is not None:
+                self._ahead.stop()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         module: Any = pl_module
@@ -41,9 +54,12 @@ class Compilation(Callback):
         if not on_disk and has_compiler():
             self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
         started = time.perf_counter()
+        if self._ahead is not None and not on_disk:
+            self._ahead.wait()
         module.compile_for(self.batch_size)
         verb, seconds = "loaded" if on_disk else "compiled", time.perf_counter() - started
-        self._say(trainer, f"{verb} machine code in {seconds:.0f} s, kept in {cache_folder()}")
+        beside = " more than the start took" if self._ahead is not None and not on_disk else ""
+        self._say(trainer, f"{verb} machine code in {seconds:.0f} s{beside}, kept in {cache_folder()}")
         if trainer.is_global_zero:
             self.record(compiled=True, compilation_seconds=round(seconds, 2))
 

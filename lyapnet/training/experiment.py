@@ -5,7 +5,7 @@ import shlex
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,13 @@ from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
 from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
 from lyapnet.training.build import build_data
+from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
 from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.start import Start, choose_start, silent
+from lyapnet.training.start import Start, choose_start, has_place_for_start, silent
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -96,10 +97,9 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
     started = time.perf_counter()
     try:
-        start = None
-        if plan.resume_from is None and run.finetuned_from is None:
-            start = _choose_start(plan, console, trainer.is_global_zero)
-        trainer = _train(plan, trainer, console, start)
+        with _compiling_beside_start(plan, trainer):
+            start = _choose_start(plan, console, trainer.is_global_zero) if _seeks_start(plan) else None
+            trainer = _train(plan, trainer, console, start)
     except Interrupted as stop:
         hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
         raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
@@ -124,6 +124,18 @@ def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None
         except DivergenceError as error:
             plan = returns.go_back(error, trainer)
             trainer = build_trainer(plan, console)
+
+
+def _compiling_beside_start(plan: Plan, trainer: L.Trainer) -> AbstractContextManager[None]:
+    """Compiles in another process, where there is a start to seek meanwhile."""
+    callbacks: list[Any] = trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
+    compiling = [callback for callback in callbacks if isinstance(callback, Compilation)]
+    seeks = _seeks_start(plan) and has_place_for_start(list(plan.module.members)) and trainer.is_global_zero
+    return compiling[0].ahead(plan.module) if compiling and seeks else nullcontext()
+
+
+def _seeks_start(plan: Plan) -> bool:
+    return plan.resume_from is None and plan.run.finetuned_from is None
 
 
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:

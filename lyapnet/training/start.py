@@ -75,9 +75,9 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     Args:
         report: told what is being done.
     """
-    networks = [_network_of(learner.V) for learner in learners]
-    if any(network is None for network in networks):
+    if not has_place_for_start(learners):
         return None
+    networks = [_network_of(learner.V) for learner in learners]
     problem, kept = learners[0].problem, _kept(learners[0].V)
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
@@ -102,6 +102,11 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
     return Start(chosen, tried)
+
+
+def has_place_for_start(learners: Sequence[Learner]) -> bool:
+    """Whether an expansion can be put into every one of some networks."""
+    return all(_network_of(learner.V) is not None for learner in learners)
 
 
 def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:

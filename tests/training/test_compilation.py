@@ -1,17 +1,26 @@
 """When a training compiles its closed loop, and what it says and records of it."""
 
 import json
+import os
+import time
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
+import torch
 
+from lyapnet.build import Parts
 from lyapnet.calculus import ValueFunction
 from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import CompilationError
 from lyapnet.graphs import compilation
 from lyapnet.networks import FCN, NETWORKS
+from lyapnet.training import start
+from lyapnet.training.build import build_module
 from lyapnet.training.compilation import earns_compilation
+from lyapnet.training.compiling_ahead import CompilingAhead
+from lyapnet.training.start import choose_start
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -124,3 +133,99 @@ def test_what_cannot_be_traced_says_so_once(tmp_path, monkeypatch, capsys, caplo
     assert train(tmp_path, capsys, "network.name=fcn", "rollout.compile=on") == (False, [])
     (record,) = (record for record in caplog.records if record.name.startswith("lyapnet"))
     assert "runs as it is written" in record.getMessage()
+
+
+class Noting:
+    """A module whose compilation leaves a note, and may fail or take long."""
+
+    def __init__(self, path, known=False, fails=False, seconds=0):
+        self.path, self.known, self.fails, self.seconds = path, known, fails, seconds
+
+    def compiled_before(self, batch_size):
+        return self.known
+
+    def compile_for(self, batch_size):
+        time.sleep(self.seconds)
+        if self.fails:
+            raise CompilationError("Expected luck, got none")
+        self.path.write_text(f"{batch_size} {torch.get_num_threads()} {os.getpid()}")
+
+
+@pytest.fixture
+def cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+
+
+def test_compiling_ahead_happens_in_another_process(tmp_path, cores):
+    ahead = CompilingAhead(Noting(tmp_path / "note"), 7)
+    ahead.wait()
+    batch_size, threads, process = (tmp_path / "note").read_text().split()
+    assert (batch_size, threads) == ("7", str(torch.get_num_threads()))
+    assert int(process) != os.getpid()
+    ahead.stop()
+
+
+@pytest.mark.slow
+def test_compiling_ahead_may_fail_or_be_needless(tmp_path, cores, capfd):
+    for note in (Noting(tmp_path / "note", fails=True), Noting(tmp_path / "note", known=True)):
+        CompilingAhead(note, 7).wait()
+        assert not (tmp_path / "note").exists()
+    assert capfd.readouterr() == ("", ""), "the run compiles it itself, and says what is wrong"
+
+
+def test_what_no_other_process_can_have_is_not_compiled_ahead(cores):
+    assert CompilingAhead(Noting(lambda: None), 7)._process is None
+
+
+def test_compiling_ahead_ends_with_what_it_is_beside(tmp_path, cores):
+    ahead = CompilingAhead(Noting(tmp_path / "note", seconds=600), 7)
+    ahead.stop()
+    ahead.wait()
+    assert not (tmp_path / "note").exists()
+
+
+def test_without_a_core_for_it_nothing_is_compiled_ahead(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(torch.get_num_threads())))
+    assert CompilingAhead(Noting(tmp_path / "note"), 7)._process is None
+
+
+class Recorded:
+    """In the place of CompilingAhead: what became of it."""
+
+    events: ClassVar[list] = []
+
+    def __init__(self, module, batch_size):
+        self.events.append(batch_size)
+
+    def wait(self):
+        self.events.append("waited")
+
+    def stop(self):
+        self.events.append("stopped")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "events"),
+    [
+        (["network={name: expansion, hidden: [4]}"], [3, "waited", "stopped"]),
+        (["network={name: expansion, hidden: [4]}", "rollout.compile=off"], []),
+        ([], []),  # no start to seek meanwhile
+    ],
+)
+def test_a_run_compiles_beside_its_start(overrides, events, tmp_path, machine_code, capsys, monkeypatch):
+    monkeypatch.setattr(Recorded, "events", [])
+    monkeypatch.setattr("lyapnet.training.compilation.CompilingAhead", Recorded)
+    monkeypatch.setattr(start, "OPTIMA", 4)
+    train(tmp_path, capsys, "rollout.compile=on", *overrides)
+    assert Recorded.events == events
+
+
+@pytest.mark.slow
+def test_what_is_compiled_ahead_is_what_the_run_takes(tmp_path, cores):
+    """Another process traces the same function, whatever the start puts into its buffers meanwhile."""
+    module = build_module(load_config(CONFIG, [*SMALL, "network={name: expansion, hidden: [4]}"]), Parts())
+    ahead = CompilingAhead(module, 3)
+    choose_start(list(module.members))
+    assert not module.compiled_before(3) or ahead._process is None
+    ahead.wait()
+    assert module.compiled_before(3)

@@ -22,6 +22,7 @@ from lyapnet.family import FamilySystem
 from lyapnet.networks import ExpansionNetwork
 from lyapnet.random_streams import TEST, stream
 from lyapnet.systems import SYSTEMS, Pendulum
+from lyapnet.training import pretraining, start
 from lyapnet.training.optima import minima
 from lyapnet.training.start import take
 from tests.configs import objects
@@ -163,7 +164,10 @@ def trained(tmp_path_factory):
         "program": {"name": "value"}, "network": {"name": "expansion", "hidden": [4]}, "rollout": {"policy": "sampled"},
         "evaluation": {"validation_states": 2, "test_states": 2, "optimum": False},
     })  # fmt: skip
-    lyapnet.train(config)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(start, "OPTIMA", 8)
+        patch.setattr(pretraining, "STEPS", (20, 10))
+        lyapnet.train(config)
     return folder / "masses" / "version_0" / "checkpoints" / "best.ckpt"
 
 

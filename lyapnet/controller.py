@@ -76,6 +76,7 @@ class Controller:
         """
         self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
         self.program = ValueProgram() if program is None else program
+        self._warned = False  # of parameters of a family that V was not told
         self.V = V.requires_grad_(False).eval()
         self._rollout = Rollout(problem, HJBPolicy(problem, V), gradient="backprop") if rollout is None else rollout
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
@@ -248,8 +249,14 @@ class Controller:
         """(x, p) of x and the parameters of a family."""
         if not isinstance(self.system, FamilySystem):
             raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
-        like = self.initial_states.lower
-        return self.system.joined(torch.as_tensor(x, dtype=like.dtype, device=like.device), parameters)
+        box, n = self.initial_states, self.system.system.n
+        state = self.system.joined(torch.as_tensor(x, dtype=box.lower.dtype, device=box.lower.device), parameters)
+        told = state[..., n:]
+        if not self._warned and bool(((told < box.lower[n:]) | (told > box.upper[n:])).any()):
+            self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in self.config.family.items())
+            note = "note: V was told %s, and is asked outside of that; what it says there is extrapolated."
+            logging.getLogger(__name__).warning(note, known)
+        return state
 
     def _state(self, x: Any) -> Tensor:
         like = self.initial_states.lower

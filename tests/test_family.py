@@ -191,6 +191,16 @@ def test_a_controller_is_told_its_member(trained):
     assert controller.rollout(x, 3, mass=1.1, length=1.2).x.shape == (4, 2, 2)
 
 
+def test_a_policy_asked_outside_its_family_says_so_once(trained, caplog):
+    controller = lyapnet.load(trained)
+    controller.policy(0, [0.0, 0.0], mass=0.8, length=1.5)
+    assert not caplog.records
+    for _ in range(2):
+        controller.policy(0, [0.0, 0.0], mass=0.8, length=1.6)
+    (record,) = caplog.records
+    assert "length in [0.9, 1.5], and is asked outside" in record.getMessage()
+
+
 def test_what_a_member_is_asked_for_and_cannot_be(trained):
     controller = lyapnet.load(trained)
     with pytest.raises(UsageError, match="Expected values for mass, length, got mass"):

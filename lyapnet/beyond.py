@@ -71,6 +71,8 @@ class Regulator(nn.Module):
 
     def __init__(self, problem: Problem):
         super().__init__()
+        if problem.system.constants:
+            raise ValueError("Expected a single problem for beyond=riccati, got a family; take hold or receding.")
         exact = in_float64(problem)
         x, u, dt = exact.goal, exact.rest, exact.horizon.dt
         if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:

@@ -20,8 +20,7 @@ from lyapnet.build import (
     build_program,
     build_rollout,
     build_value_function,
-    member_config,
-    member_parts,
+    member,
 )
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
@@ -176,11 +175,9 @@ class Controller:
         system = self.system
         if not isinstance(system, FamilySystem) or self._config is None:
             raise UsageError("Expected a controller of a family, got one of a single problem; add family to the YAML.")
-        values = {name: float(value) for name, value in parameters.items()}
-        config = member_config(self.config, values, system.system)
-        parts = member_parts(self._parts, system, values)
+        config, parts, p = member(self.config, self._parts, system, parameters)
         problem = build_problem(config, parts).to(self.initial_states.lower.device)
-        V = AtParameters(self.V, self.initial_states.lower.new_tensor([*values.values()]))
+        V = AtParameters(self.V, self.initial_states.lower.new_tensor(p))
         return Controller(problem, V, build_rollout(config, problem, V), self.program, config, self._beyond, parts)
 
     def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Trajectory:
@@ -251,8 +248,9 @@ class Controller:
             raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
         box, n = self.initial_states, self.system.system.n
         state = self.system.joined(torch.as_tensor(x, dtype=box.lower.dtype, device=box.lower.device), parameters)
-        told = state[..., n:]
-        if not self._warned and bool(((told < box.lower[n:]) | (told > box.upper[n:])).any()):
+        lower, upper = box.lower[n:], box.upper[n:]
+        room = 1e-9 * torch.maximum(lower.abs(), upper.abs())
+        if not self._warned and not bool(Box(lower - room, upper + room).contains(state[..., n:]).all()):
             self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in self.config.family.items())
             note = "note: V was told %s, and is asked outside of that; what it says there is extrapolated."
             logging.getLogger(__name__).warning(note, known)

@@ -56,13 +56,15 @@ class FamilySystem(ControlAffineSystem):
         """(x, p) of states and parameters by their names, each scalar or (*batch,).
 
         Raises:
-            ValueError: other names than those of the family.
+            ValueError: other names than those of the family, or other shapes.
         """
-        names = [self.state_names[i] for i in self.constants]
+        names, n = [self.state_names[i] for i in self.constants], self.system.n
         if parameters.keys() != set(names):
             raise ValueError(f"Expected values for {', '.join(names)}, got {', '.join(parameters)}; give each.")
-        told = [torch.as_tensor(parameters[name]).to(x).expand(x.shape[:-1]) for name in names]
-        return torch.cat([x, torch.stack(told, -1)], -1)
+        if not x.ndim or x.shape[-1] != n:
+            listed = ", ".join(self.system.state_names)
+            raise ValueError(f"Expected x of shape (*batch, {n}), got {tuple(x.shape)}; the last axis holds {listed}.")
+        return torch.cat([x, torch.stack([_of_each(x, name, parameters[name]) for name in names], -1)], -1)
 
     def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
         """The system with parameters (k,), or with those of each of a batch of states."""
@@ -157,6 +159,16 @@ class AtParameters(ValueFunction):
         return None if H is None else H[..., :n, :n]
 
 
+def _of_each(x: State, name: str, value: Any) -> PerState:
+    """The value of a parameter for each of a batch of states."""
+    batch = tuple(x.shape[:-1])
+    try:
+        return torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(batch)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = tuple(value.shape) if hasattr(value, "shape") else repr(value)
+        raise ValueError(f"Expected {name} scalar or of shape {batch}, got {got}; give a number per state.") from error
+
+
 def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> ControlAffineSystem:
     """A copy of a system that shares what it is made of, but for some of its numbers."""
     member = copy.copy(system) if values else system
@@ -189,6 +201,10 @@ def check_members(family: FamilySystem, build: Callable[[Mapping[str, float]], C
             f"{one_line(error)[:160]}; read states as x[..., i], and write c + torch.zeros_like(x[..., 0]) for "
             "torch.full_like(x[..., 0], c)."
         ) from error
+    if unread := _unread(family, z):
+        raise UsageError(
+            f"Expected {cls}.f or g to read {unread[0]}, got the same for each; read self.{unread[0]}, or leave it out."
+        )
     for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
         member = build({name: float(p[k]) for name, k in family.parameters_in_f.items()}).to(z)
         for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
@@ -197,5 +213,17 @@ def check_members(family: FamilySystem, build: Callable[[Mapping[str, float]], C
                 raise UsageError(
                     f"Expected {cls}.{symbol} to read {', '.join(names)} as self.{names[0]} and so on, a number for "
                     f"each state x[..., i], got another {symbol} than that of {cls} built with {p.tolist()}; what "
-                    "__init__ derives from them has to be derived in f and g."
+                    "__init__ derives from them has to be derived in f and g, and a system that is passed has the "
+                    "other parameters of the config."
                 )
+
+
+def _unread(family: FamilySystem, z: State) -> list[str]:
+    """The parameters that neither f nor g reads."""
+    x, p = family.split(z)
+    with torch.enable_grad():
+        read = {name: p[:, k].clone().requires_grad_() for name, k in family.parameters_in_f.items()}
+        member = with_attributes(family.system, read)
+        total = member.f(x).sum() + member.g(x).sum() + 0 * x.new_zeros((), requires_grad=True)
+        found = torch.autograd.grad(total, [*read.values()], allow_unused=True)
+    return [name for name, gradient in zip(read, found, strict=True) if gradient is None]

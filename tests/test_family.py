@@ -9,7 +9,8 @@ import torch
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.build import build_problem, build_value_function
+from lyapnet.build import Parts, build_problem, build_value_function, member
+from lyapnet.certification.draws import draws_of
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain, load_config
 from lyapnet.cost import innermost
@@ -191,9 +192,22 @@ def test_a_controller_is_told_its_member(trained):
     assert controller.rollout(x, 3, mass=1.1, length=1.2).x.shape == (4, 2, 2)
 
 
+def test_a_member_is_the_same_however_it_is_named(trained):
+    torch.set_default_dtype(torch.float32)  # as it is outside of tests: 0.9 is no number of float32
+    controller, x = lyapnet.load(trained), np.array([[0.4, 0.1], [0.2, -0.3]])
+    told = controller.policy(0.2, x, mass=0.9, length=1.4)
+    np.testing.assert_array_equal(told, controller.policy(0.2, np.column_stack([x, [0.9, 0.9], [1.4, 1.4]])))
+    np.testing.assert_array_equal(told, controller.policy(0.2, x, length=[1.4, 1.4], mass=0.9))
+    member = controller.with_(length=1.4, mass=0.9)
+    assert (member.system.mass, member.system.length) == (0.9, 1.4)
+    np.testing.assert_allclose(member.policy(0.2, x), told, rtol=1e-12)
+    np.testing.assert_array_equal(controller.rollout(x, length=1.4, mass=0.9).cost, member.rollout(x).cost)
+
+
 def test_a_policy_asked_outside_its_family_says_so_once(trained, caplog):
     controller = lyapnet.load(trained)
     controller.policy(0, [0.0, 0.0], mass=0.8, length=1.5)
+    controller.policy(0, [0.0, 0.0], mass=0.8 * 1.5, length=1.5)
     assert not caplog.records
     for _ in range(2):
         controller.policy(0, [0.0, 0.0], mass=0.8, length=1.6)
@@ -213,6 +227,15 @@ def test_what_a_member_is_asked_for_and_cannot_be(trained):
         controller.policy(0, [0.0, 0.0], weight=3)
     with pytest.raises(ValueError, match="Expected no parameters, got mass"):
         controller.with_(mass=1, length=1).policy(0, [0.0, 0.0], mass=1)
+    for mass in ("heavy", None, [1, 1, 1]):
+        with pytest.raises(ValueError, match=r"Expected mass scalar or of shape \(2,\), got"):
+            controller.policy(0, [[0.0, 0.0], [0.1, 0.0]], mass=mass, length=1)
+    with pytest.raises(ValueError, match=r"Expected x of shape \(\*batch, 2\), got \(4,\)"):
+        controller.policy(0, [0.0, 0.0, 1.0, 1.0], mass=1, length=1)
+    with pytest.raises(UsageError, match=r"Expected mass as one number, got \[1, 1\]"):
+        member(controller.config, Parts(), controller.system, {"mass": [1, 1], "length": 1})
+    with pytest.raises(ValueError, match="Expected a single problem for beyond=riccati, got a family"):
+        lyapnet.load(trained, beyond="riccati")
 
 
 def test_a_disturbed_parameter_is_told_where_v_knows_it(trained):
@@ -238,6 +261,42 @@ def test_a_member_is_evaluated_by_name(trained, capsys):
     status, printed = evaluated("--at", "mass=heavy")
     assert status == 2
     assert "Expected --at NAME=VALUE with a number, got mass=heavy" in " ".join(printed.err.split())
+    status, printed = evaluated("--at", "mass=0.9", "--at", "length=1", "--at", "mass=1")
+    assert status == 2
+    assert "Expected --at once for each parameter" in " ".join(printed.err.split())
+
+
+def test_a_certificate_is_about_all_members_or_one(trained, capsys, tmp_path):
+    def certified(*arguments):
+        status = main(["certify", *arguments])
+        return status, " ".join(capsys.readouterr().err.split())
+
+    assert certified("sampled", str(trained), "--samples", "3", "--report", str(tmp_path))[0] == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert "include the parameters of a family, which stay what they are: mass, length" in report["claim"]["words"]
+    assert report["system"] == {"name": "family of pendulum", "parameters": {"damping": 0.1, "gravity": 9.81}}
+    assert report["cost"] == {"Q": [1, 0.1], "R": "inverse_mass", "Q_T": [10, 1]}
+    one = ("--at", "length=1.4", "--at", "mass=0.9")
+    assert certified("statistical", str(trained), "--samples", "3", "--report", str(tmp_path), *one)[0] == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["system"]["parameters"]["mass"], report["certificate"]["draws"]) == (0.9, 1), "another claim"
+    assert report["command"].endswith("--at=length=1.4 --at=mass=0.9")
+    assert certified("statistical", str(trained), "--samples", "4", "--at", "mass=0.90", "--at", "length=1.4")[0] == 0
+    assert draws_of(trained, ["mass=0.9", "length=1.4"], radius=None).others(0, 3) == 1
+    assert "Expected --at or --refine, got both" in certified("sound", str(trained), "--refine", "1", *one)[1]
+
+
+def test_weights_go_on_with_the_same_parameters_in_the_same_places(trained, tmp_path, caplog):
+    few = {"logs": str(tmp_path), "training": {"iterations": 1, "batch_size": 2}, "program": {"name": "value"},
+           "network": {"name": "expansion", "hidden": [4]}, "rollout": {"policy": "sampled"},
+           "evaluation": {"validation_states": 2, "test_states": 2, "optimum": False}}  # fmt: skip
+    swapped = {"family": {"length": [0.9, 1.5], "mass": [0.8, 1.2]}}
+    with pytest.raises(UsageError, match=r"Expected a family in mass, length, as of .*, got one in length, mass"):
+        lyapnet.train(config_from_plain(MASSES | few | swapped), finetune=trained)
+    with pytest.raises(UsageError, match=r"got another order in family"):
+        lyapnet.train(config_from_plain(MASSES | few | swapped | {"logs": str(trained.parents[3])}), resume="last")
+    with pytest.raises(UsageError, match=r"got one in none"):
+        lyapnet.train(config_from_plain(MASSES | few | {"family": {}}), finetune=trained)
 
 
 def test_figures_show_what_moves(trained):
@@ -258,6 +317,14 @@ class Derived(Pendulum):
         return self.weight * torch.sin(q)
 
 
+class Unread(Pendulum):
+    """It does not read its number."""
+
+    def __init__(self, wind: float = 1.0):
+        super().__init__()
+        self.wind = wind
+
+
 class Wide(Pendulum):
     """It takes no tensor for its length."""
 
@@ -273,12 +340,15 @@ class Wide(Pendulum):
     [
         ({"family": {"mass": [1.2, 0.8]}}, r"Expected family.mass as \[least, greatest\]"),
         ({"family": {"mass": [0.8, 1, 1.2]}}, r"Expected family.mass as \[least, greatest\]"),
+        ({"family": {"x": [0.8, 1.2]}}, "other than t, x, x0, steps, got x"),
         ({"family": {"mess": [0.8, 1.2]}}, "numbers that Pendulum keeps .mass, length, gravity., got mess"),
         ({"family": {"damping": [0.1, 0.2]}}, "got damping; write self.damping = damping"),
         ({"family": {"target_angel": [-1, 1]}}, "Expected family.target_angel among target_angle, target_velocity"),
         ({"family": {"target_angle": [-1, 1]}}, "whose targets one control holds"),
         ({"family": {"target_velocity": [-1, 1]}}, "Expected a target that some control holds"),
         ({"family": {"mass": [0.8, 1.2]}, "target": [1, 0]}, "whose targets one control holds"),
+        ({"family": {"target_angle": [-math.pi, math.pi]}}, "whose targets one control holds"),
+        ({"family": {"wind": [0, 1]}, "system": {"name": f"{__name__}:Unread"}}, "Unread.f or g to read wind"),
         ({"family": {"mass": [0.0, 1.2]}}, "mass > 0"),
         ({"family": {"mass": [0.8, 1.2]}, "system": {"name": f"{__name__}:Derived"}}, "derived in f and g"),
         ({"family": {"length": [0.8, 1.2]}, "system": {"name": f"{__name__}:Wide"}}, "as a tensor"),

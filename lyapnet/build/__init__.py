@@ -2,7 +2,7 @@
 
 from lyapnet.build.classes import REGISTRIES, Parts, own_parts, resolve
 from lyapnet.build.entries import entry_per_state
-from lyapnet.build.family import knows, member_config, member_parts
+from lyapnet.build.family import knows, member
 from lyapnet.build.learner import build_program, build_rollout, build_value_function
 from lyapnet.build.named_parts import parts_named, parts_of
 from lyapnet.build.problem import build_problem, build_system, with_parameters
@@ -17,8 +17,7 @@ __all__ = [
     "build_value_function",
     "entry_per_state",
     "knows",
-    "member_config",
-    "member_parts",
+    "member",
     "own_parts",
     "parts_named",
     "parts_of",

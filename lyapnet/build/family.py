@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import ControlMatrix, State
 
+TAKEN = ("t", "x", "x0", "steps")  # what a controller takes beside them
 TRIED = 8  # states at which members are held against systems built with their parameters
 
 
@@ -46,25 +48,39 @@ def family_of(
         if name in targets:
             shift[targets[name], k] = 1
     if targets or config.target is not None:
-        at_center = member_config(config, dict(zip(ranges, center.tolist(), strict=True)), system)
+        at_center = _config_of(config, dict(zip(ranges, center.tolist(), strict=True)), system)
         cost = about_target(at_center, cost, family.member(center), controls)
         if config.target_control is None:
             _require_one_control(family, cost, shift, center, low, high)
     return family, FamilyCost(cost, shift, center, _weight_of_members(cost, family)), box
 
 
-def member_config(config: Config, parameters: Mapping[str, float], system: ControlAffineSystem) -> Config:
-    """The config of one member of a family.
+def member(
+    config: Config, parts: Parts, family: FamilySystem, parameters: Mapping[str, Any]
+) -> tuple[Config, Parts, list[float]]:
+    """The config of one member of a family, the user's own parts for it, and its p in the order of the family.
 
     Raises:
-        UsageError: a parameter is missing, unknown, or outside the range that V was told.
+        UsageError: a parameter is missing, unknown, no number, or outside the range that V was told.
     """
     if parameters.keys() != config.family.keys():
         names = ", ".join(parameters) or "none"
         raise UsageError(f"Expected values for {', '.join(config.family)}, got {names}; give each.")
-    for name, value in parameters.items():
-        if not knows(config, name, value):
-            raise UsageError(f"Expected {name} in {config.family[name]}, which V knows, got {value:g}.")
+    values = dict[str, float]()
+    for name, ends in config.family.items():
+        try:
+            values[name] = float(parameters[name])
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UsageError(f"Expected {name} as one number, got {parameters[name]!r}; name one member.") from error
+        if not knows(config, name, values[name]):
+            raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
+    numbers = {name: values[name] for name in family.parameters_in_f}
+    own = dataclasses.replace(parts, system=with_attributes(family.system, numbers))
+    return _config_of(config, values, family.system), own, [*values.values()]
+
+
+def _config_of(config: Config, parameters: Mapping[str, float], system: ControlAffineSystem) -> Config:
+    """The config of one member of a family."""
     given = {name: value for name, value in parameters.items() if not name.startswith(PREFIX)}
     own = dataclasses.replace(config.system, parameters={**config.system.parameters, **given})
     target = None if config.target is None else [*repeated(config.target, system.n)]
@@ -81,14 +97,10 @@ def knows(config: Config, name: str, value: float) -> bool:
     return least - room <= value <= greatest + room
 
 
-def member_parts(parts: Parts, family: FamilySystem, parameters: Mapping[str, float]) -> Parts:
-    """The user's own parts for one member of a family."""
-    numbers = {name: parameters[name] for name in family.parameters_in_f}
-    return dataclasses.replace(parts, system=with_attributes(family.system, numbers))
-
-
 def _ranges(family: Mapping[str, list[float]]) -> dict[str, list[float]]:
     for name, bounds in family.items():
+        if name in TAKEN:
+            raise UsageError(f"Expected parameters of a family other than {', '.join(TAKEN)}, got {name}; rename it.")
         if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
             raise UsageError(f"Expected family.{name} as [least, greatest], got {bounds}; give two finite numbers.")
     return dict(family)
@@ -125,17 +137,14 @@ def _require_one_control(
     """Refuse targets of which some are held by another control than the one at the centre."""
     assert cost.goal is not None
     assert cost.rest is not None
-    for k in range(len(center)):
-        for bound in (low, high):
-            p = center.clone()
-            p[k] = bound[k]
-            x = cost.goal + shift @ (p - center)
-            u = holding(family.member(p), x)
-            if not float((u - cost.rest).abs().max()) <= HELD * max(1.0, float(cost.rest.abs().max())):
-                raise UsageError(
-                    f"Expected a family whose targets one control holds, got u = {cost.rest.tolist()} at its centre "
-                    f"and {u.tolist()} at x = {x.tolist()}; say what the cost counts u from, as in target_control: [0]."
-                )
+    for p in (low, high, *Box(low, high).sample(TRIED, torch.Generator().manual_seed(0))):
+        x = cost.goal + shift @ (p - center)
+        u = holding(family.member(p), x)
+        if not float((u - cost.rest).abs().max()) <= HELD * max(1.0, float(cost.rest.abs().max())):
+            raise UsageError(
+                f"Expected a family whose targets one control holds, got u = {cost.rest.tolist()} at its centre "
+                f"and {u.tolist()} at x = {x.tolist()}; say what the cost counts u from, as in target_control: [0]."
+            )
 
 
 def _weight_of_members(cost: Cost, family: FamilySystem) -> Callable[[State], ControlMatrix] | None:

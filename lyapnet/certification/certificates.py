@@ -2,7 +2,7 @@
 
 import shlex
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -46,6 +46,13 @@ class Certificate(ABC):
     def in_words(self) -> str:
         """What is claimed, with its numbers."""
 
+    @property
+    def of_parameters(self) -> str:
+        """What there is to say of the parameters of a family."""
+        system = self.controller.system
+        names = ", ".join(system.state_names[i] for i in system.constants)
+        return f" The states include the parameters of a family, which stay what they are: {names}." * bool(names)
+
     @abstractmethod
     def in_formulas(self) -> list[str]:
         """The conditions of the claim, one a line, with their numbers."""
@@ -58,11 +65,13 @@ class Certificate(ABC):
     def figure(self) -> figures.Figure:
         """The claim, drawn."""
 
-    def command(self, checkpoint: str, **user: str | None) -> str:
+    def command(self, checkpoint: str, at: Sequence[str] = (), **user: str | None) -> str:
         """The command line that makes the certificate again, defaults written out.
 
         Args:
+            at: NAME=VALUE of each parameter, where it is about one member of a family.
             user: `system`, `network` and so on, where they are the user's own.
         """
         named = {name: value for name, value in {**self.options, **user}.items() if value is not None}
-        return shlex.join(["lyapnet", "certify", self.kind, checkpoint, *(f"--{n}={v}" for n, v in named.items())])
+        options = [*(f"--{name}={value}" for name, value in named.items()), *(f"--at={each}" for each in at)]
+        return shlex.join(["lyapnet", "certify", self.kind, checkpoint, *options])

@@ -1,7 +1,7 @@
 """The draws that were made of one checkpoint, in its run's folder: who draws until a claim pleases has to say so."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,11 +59,17 @@ class Draws(NamedTuple):
             return ("unreadable", number)
 
 
-def draws_of(checkpoint: Path, **about: Any) -> Draws:
-    """The draws of a checkpoint's content for claims with these further facts."""
-    digest = digest_of_file(checkpoint)
+def draws_of(checkpoint: Path, at: Sequence[str] | None = None, **about: Any) -> Draws:
+    """The draws of a checkpoint's content, or of one member of its family, for claims with these further facts."""
+    digest = " ".join([digest_of_file(checkpoint), *sorted(_plain(each) for each in at or [])])
     folders = _folders(checkpoint.resolve())
     return Draws(next((folder / DRAWS for folder in folders), None), {"checkpoint": digest, **about})
+
+
+def _plain(at: str) -> str:
+    """NAME=VALUE with the value as Python writes it: 0.90 is 0.9."""
+    name, _, value = at.partition("=")
+    return f"{name}={float(value)!r}"
 
 
 def _folders(checkpoint: Path) -> Iterator[Path]:

@@ -28,6 +28,7 @@ from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
 LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most …
 LEAST, SHARE_OF_LEVELS = 1.0, 0.3  # … in seconds at the least, and of the budget
+NOTHING = 1e-200  # bounds of zero have the least room for rounding
 SHARE_OF_FINISH = 0.15  # of what is left, for the share of X₀ and κ
 KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command goes on."
 NOT_KEPT = "Stopped while certifying: nothing is kept without --keep FILE."
@@ -48,6 +49,7 @@ class SoundClaim:
     States that neither f, g, ℓ, φ nor V and u depend on are left out: D is all of ℝ along them. There {W ≤ ρ} is a
     cylinder whose points are all alike, a closed loop can leave it through its side only, and what is proved on the
     slice at 0 holds on every slice. (Such a state does not escape: its derivative is bounded along with the others.)
+    The parameters of a family stay what they are: along them D is their range, and no closed loop leaves it there.
 
     The verdict is about the funnel of ρ = `wanted`, which holds all of X₀. Whatever the verdict, `rho` is the largest
     level that was proved, a funnel of its own, and `volume_share` how much of X₀ it holds.
@@ -130,14 +132,14 @@ def sound_claim(
     _require_continuous(condition.V, x_low, x_high)
     levels = Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
-    if states is None:
-        states = enclosing_box(condition.height, initial_states, goal, duration, wanted)
+    constants = condition.closed_loop.system.constants
+    states = states or enclosing_box(condition.height, initial_states, goal, duration, wanted, constants)
     states = _without(states, left_out)
-    domain = _domain(states, initial_states, duration, left_out)
+    domain = _domain(states, initial_states, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     _check_states(condition, domain)
     needed = just_above(wanted)
-    axes = [1 + i for i in range(states.dimension) if i not in left_out]
+    axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
     set_up = time.monotonic() - started
     level = min(needed, just_below(rim))
@@ -171,13 +173,19 @@ def _proof(
     return proof
 
 
-def enclosing_box(W: Value, initial_states: Box, goal: State, duration: float, level: float) -> Box:
+def enclosing_box(
+    W: Value, initial_states: Box, goal: State, duration: float, level: float, constants: Sequence[int] = ()
+) -> Box:
     """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
 
     Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
-    of what the first gave. No ray is followed further than 30 times the largest component of X₀.
+    of what the first gave. No ray is followed further than 30 times the largest component of X₀. Along the constants
+    the box is X₀.
     """
     generator = torch.Generator().manual_seed(0)
+    lower, upper = initial_states.lower.double(), initial_states.upper.double()
+    constant = torch.tensor([i in constants for i in range(len(goal))])
+    least, greatest = torch.where(constant, lower, -torch.inf), torch.where(constant, upper, torch.inf)
     inner = initial_states.reach_from(goal).double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
@@ -187,10 +195,11 @@ def enclosing_box(W: Value, initial_states: Box, goal: State, duration: float, l
         rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
         rays = reach * rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
         points = (radii[:, None, None] * rays).clamp(-30 * largest, 30 * largest)
+        points = (goal + points).clamp(least, greatest) - goal
         reach = torch.stack([_reach_below(W, t, goal, points, level) for t in times]).amax(0)
         reach = reach.clamp_min(1e-6 * float(largest))
     reach = 1.15 * torch.maximum(reach, inner)
-    return Box(goal - reach, goal + reach)
+    return Box(torch.where(constant, lower, goal - reach), torch.where(constant, upper, goal + reach))
 
 
 def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float) -> State:
@@ -242,6 +251,7 @@ def _freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None
 def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
     """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
     lower, upper = domain
+    _require_constant(condition.closed_loop, domain)
     share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
     points = lower + (upper - lower) * share
 
@@ -306,13 +316,27 @@ def _without(states: Box, left_out: Sequence[int]) -> Box:
     return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
 
 
-def _domain(states: Box, initial_states: Box, duration: float, left_out: Sequence[int]) -> tuple[Corner, Corner]:
+def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
+    """Refuse constants that move: D has no faces along them."""
+    constants = list(loop.system.constants)
+    if constants:
+        moved = BoundedFunction(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
+        ((low, high),) = moved.bounds(*(end[None] for end in domain))
+        if not bool(torch.maximum(-low, high).max() <= NOTHING):
+            raise UsageError("Expected ẋ = 0 for the constants of a system, got others; leave them out.")
+
+
+def _domain(
+    states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
+) -> tuple[Corner, Corner]:
     """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
     if states.dimension != initial_states.dimension:
         raise UsageError(
             f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
         )
     outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
+    for i in constants:
+        outside[i] = states.lower[i] > initial_states.lower[i] or states.upper[i] < initial_states.upper[i]
     outside[left_out] = False
     if outside.any():
         i = int(torch.nonzero(outside)[0])

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 from lyapnet.certification.certificates import Certificate
 from lyapnet.certification.tables import certificate_rows
 from lyapnet.config import Config
-from lyapnet.controller import Controller
+from lyapnet.controller import Controller, parameters_of
 from lyapnet.cost import MadeOfAnother, QuadraticCost
 from lyapnet.errors import UsageError
+from lyapnet.family import PREFIX, FamilyCost, FamilySystem
 from lyapnet.files import digest_of_file, write_atomically
 from lyapnet.provenance import versions
 from lyapnet.systems import SYSTEMS, ControlAffineSystem
@@ -92,7 +93,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
         "options": dict(certificate.options),
         "checkpoint": {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
         "experiment": config.experiment,
-        "system": {"name": _name(controller.system), "parameters": controller.parameters},
+        "system": _system(controller, config),
         "states": controller.system.state_labels,
         "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
         "cost": _cost(controller, config),
@@ -166,6 +167,16 @@ def _table(heading: Any, rows: Any) -> str:
     return "\n".join(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
 
 
+def _system(controller: Controller, config: Config) -> dict[str, Any]:
+    """Its name and its parameters, but for those of which there is a family."""
+    system = controller.system
+    if not isinstance(system, FamilySystem):
+        return {"name": _name(system), "parameters": controller.parameters}
+    parameters = parameters_of(system.system, config.system)
+    fixed = {name: value for name, value in parameters.items() if name not in config.family}
+    return {"name": f"family of {_name(system.system)}", "parameters": fixed}
+
+
 def _name(system: ControlAffineSystem) -> str:
     """The name of a registered system, module:Class of any other."""
     cls = type(system)
@@ -187,10 +198,11 @@ def _controls(controller: Controller, config: Config) -> dict[str, Any]:
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
     """The cost's matrices as the config has them, or its name and parameters; and what it is about."""
     cost, words = controller.cost, list[str]()
-    while isinstance(cost, MadeOfAnother):
-        words.append(cost.words)
+    while isinstance(cost, MadeOfAnother | FamilyCost):
+        moving = ", ".join(name for name in config.family if name.startswith(PREFIX))
+        words.append(cost.words if isinstance(cost, MadeOfAnother) else f"x* moved by {moving}" if moving else "")
         cost = cost.cost
-    about = {"with": "; ".join(words)} if words else {}
+    about = {"with": "; ".join(filter(None, words))} if any(words) else {}
     if isinstance(cost, QuadraticCost):
         return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T, **about}
     cls = type(cost)

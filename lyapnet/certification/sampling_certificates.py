@@ -50,7 +50,7 @@ class SampledCertificate(Certificate):
     def in_words(self) -> str:
         return (
             f"Of {self._drawn}, {self.claim.successes['all']} succeed: their closed loops keep the conditions below on "
-            "the nodes of the horizon. About the other states of X₀ this proves nothing."
+            f"the nodes of the horizon. About the other states of X₀ this proves nothing.{self.of_parameters}"
         )
 
     @property
@@ -104,7 +104,7 @@ class StatisticalCertificate(SampledCertificate):
             f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop keeps the "
             "conditions below on the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound of "
             f"{successes} successes in {self._drawn}. The confidence is over the draw{self._others}. Like the rollouts "
-            "the claim speaks of this model, this Δt and this integrator."
+            f"the claim speaks of this model, this Δt and this integrator.{self.of_parameters}"
         )
 
     @property

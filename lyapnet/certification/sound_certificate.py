@@ -76,7 +76,7 @@ class SoundCertificate(Certificate):
             f"model: no closed loop that starts in it leaves the funnel, or D, up to T = {claim.duration:g} s, and its "
             f"cost is bounded as below. It holds at least {floored(claim.volume_share)} of X₀ by volume. It is about "
             "the operations that f, g, ℓ, V and u were traced to, of this fingerprint; whatever else their code reads "
-            "(globals, counters, files) is frozen as it was then."
+            f"(globals, counters, files) is frozen as it was then.{self.of_parameters}"
         )
 
     def in_formulas(self) -> list[str]:

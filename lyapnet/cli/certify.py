@@ -14,7 +14,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller
+from lyapnet.cli.options import At, Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller, titled
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
 
@@ -112,6 +112,7 @@ def sampled(
     cost: Cost = None,
     controls: Controls = None,
     program: Program = None,
+    at: At = None,
     debug: Debug = False,
 ) -> None:
     """The share of some states whose closed loop succeeds. It proves no more."""
@@ -121,10 +122,10 @@ def sampled(
 
     require_writable(figure, report)
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
-    certificate = sampled_certificate(load_controller(checkpoint, **own), samples, radius, seed)
-    _record(certificate, draws_of(checkpoint, **own, radius=radius))
-    _show(certificate, checkpoint, as_json)
-    _write(certificate, checkpoint, own, as_json, figure, report)
+    certificate = sampled_certificate(load_controller(checkpoint, at, **own), samples, radius, seed)
+    _record(certificate, draws_of(checkpoint, at, **own, radius=radius))
+    _show(certificate, checkpoint, at, as_json)
+    _write(certificate, checkpoint, at, own, as_json, figure, report)
 
 
 @app.command()
@@ -149,6 +150,7 @@ def statistical(
     cost: Cost = None,
     controls: Controls = None,
     program: Program = None,
+    at: At = None,
     debug: Debug = False,
 ) -> None:
     """A share of X₀ that succeeds, with a confidence."""
@@ -158,13 +160,13 @@ def statistical(
 
     require_writable(figure, report)
     own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
-    controller = load_controller(checkpoint, **own)
-    draws = draws_of(checkpoint, **own, radius=radius)
+    controller = load_controller(checkpoint, at, **own)
+    draws = draws_of(checkpoint, at, **own, radius=radius)
     made = 1 + draws.others(seed, samples)
     certificate = statistical_certificate(controller, samples, confidence, share, radius, seed, draws=made)
     _record(certificate, draws)
-    _show(certificate, checkpoint, as_json)
-    _write(certificate, checkpoint, own, as_json, figure, report)
+    _show(certificate, checkpoint, at, as_json)
+    _write(certificate, checkpoint, at, own, as_json, figure, report)
 
 
 @app.command()
@@ -209,12 +211,15 @@ def sound(
     cost: Cost = None,
     controls: Controls = None,
     program: Program = None,
+    at: At = None,
     debug: Debug = False,
 ) -> None:  # fmt: skip
     """A funnel that no closed loop leaves, and its cost: proved."""
     begun = time.monotonic()
     if refine and keep is not None:
         raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
+    if refine and at:
+        raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
     from lyapnet.certification.report import require_writable
@@ -229,12 +234,12 @@ def sound(
 
     def certified(path: Path, started: float | None = None) -> Any:
         started = started or time.monotonic()
-        controller = load_controller(path, **own)
+        controller = load_controller(path, at, **own)
         with proof_progress(notes, "sound") as progress:
             certificate = sound_certificate(
                 controller, alpha, delta, states, seconds, workers, keep, seed, progress, started=started
             )
-        _show(certificate, path, as_json)
+        _show(certificate, path, at, as_json)
         return certificate
 
     if refine:
@@ -245,7 +250,7 @@ def sound(
         checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes, parts)
     else:
         certificate = certified(checkpoint, begun)
-    _write(certificate, checkpoint, own, as_json, figure, report)
+    _write(certificate, checkpoint, at, own, as_json, figure, report)
 
 
 @app.command()
@@ -259,6 +264,7 @@ def check(
     cost: Cost = None,
     controls: Controls = None,
     program: Program = None,
+    at: At = None,
     debug: Debug = False,
 ) -> None:
     """Whether a kept proof proves the sound claim: its leaves are bounded anew, without a search."""
@@ -267,14 +273,15 @@ def check(
     from lyapnet.certification.tables import certificate_table, proof_progress
 
     controller = load_controller(
-        checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
+        checkpoint, at, system=system, network=network, cost=cost, controls=controls, program=program
     )
     with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
         result = checked(controller, proof, workers, progress)
     if as_json:
         print(json.dumps(result, allow_nan=False))
     else:
-        Console(highlight=False, markup=False).print(certificate_table(f"{proof}, {checkpoint}", result, LABELS))
+        table = certificate_table(f"{proof}, {titled(checkpoint, at)}", result, LABELS)
+        Console(highlight=False, markup=False).print(table)
     raise typer.Exit(result["verdict"] != "certified")
 
 
@@ -284,24 +291,24 @@ def _record(certificate: Any, draws: Any) -> None:
     certificate.caveat = draws.record(certificate.kind, options["seed"], options["samples"], certificate.verdict)
 
 
-def _show(certificate: Any, checkpoint: Path, as_json: bool) -> None:
+def _show(certificate: Any, checkpoint: Path, at: list[str] | None, as_json: bool) -> None:
     """The certificate as a table, unless JSON is asked for."""
     from lyapnet.certification.tables import certificate_table
 
     if not as_json:
-        table = certificate_table(str(checkpoint), certificate.result, certificate.labels)
+        table = certificate_table(titled(checkpoint, at), certificate.result, certificate.labels)
         Console(highlight=False, markup=False).print(table)
 
 
 def _write(
-    certificate: Any, checkpoint: Path, own: dict[str, str | None], as_json: bool, figure: Path | None,
-    report: Path | None,
+    certificate: Any, checkpoint: Path, at: list[str] | None, own: dict[str, str | None], as_json: bool,
+    figure: Path | None, report: Path | None,
 ) -> None:  # fmt: skip
     """The certificate as JSON, and its figure and report, where they are asked for."""
     from lyapnet.certification.report import write_outputs
 
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))
-    command = certificate.command(str(checkpoint), **own)
+    command = certificate.command(str(checkpoint), at or [], **own)
     for path in write_outputs(certificate, checkpoint, command, figure, report):
         Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

@@ -17,7 +17,7 @@ from lyapnet.cli.options import (
     Program,
     System,
     load_controller,
-    member_of,
+    titled,
 )
 from lyapnet.errors import UsageError
 
@@ -51,7 +51,7 @@ def evaluate(
     once for each state: the next evaluation of any controller of the task reads it.
     """
     from lyapnet.evaluation.measurement import evaluation
-    from lyapnet.evaluation.robustness import robustness
+    from lyapnet.evaluation.robustness import nominal, robustness
     from lyapnet.evaluation.tables import evaluation_table, robustness_table
 
     if table is not None and not table.parent.is_dir():
@@ -59,25 +59,25 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = load_controller(
-        checkpoint, system=system, network=network, cost=cost, controls=controls, program=program
+        checkpoint, at, system=system, network=network, cost=cost, controls=controls, program=program
     )
-    controller = member_of(controller, at) if at else controller
     notes = Console(stderr=True, highlight=False, markup=False)
     with notes.status("measuring …") as status:
         measured = evaluation(
             controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
         )
         result = measured.result()
+        count = min(samples, 64)
         if disturbed:
-            count = min(samples, 64)
             rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]
     if as_json:
         print(json.dumps(result))
     else:
-        Console(highlight=False, markup=False).print(evaluation_table(str(checkpoint), result))
+        Console(highlight=False, markup=False).print(evaluation_table(titled(checkpoint, at), result))
         if disturbed:
-            Console(highlight=False, markup=False).print(robustness_table(result["robustness"], min(samples, 64)))
+            member = nominal(controller) if controller.system.constants else {}
+            Console(highlight=False, markup=False).print(robustness_table(result["robustness"], count, member))
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)

@@ -28,15 +28,20 @@ def parts_given(checkpoint: Path, **own: str | None) -> Any:
     return parts_named(config_of(read_checkpoint(checkpoint), checkpoint), named) if named else Parts()
 
 
-def load_controller(checkpoint: Path, **own: str | None) -> Any:
-    """The controller of a checkpoint, with the user's own parts."""
+def load_controller(checkpoint: Path, at: list[str] | None = None, **own: str | None) -> Any:
+    """The controller of a checkpoint, with the user's own parts; of a family, that of one member if `at` names it."""
     import torch
 
     from lyapnet.controller import load
 
     controller = load(checkpoint, **vars(parts_given(checkpoint, **own)))
     torch.set_num_threads(controller.config.training.threads)
-    return controller
+    return member_of(controller, at) if at else controller
+
+
+def titled(checkpoint: Path, at: list[str] | None) -> str:
+    """What a table calls a controller."""
+    return f"{checkpoint}, {', '.join(at)}" if at else str(checkpoint)
 
 
 def member_of(controller: Any, at: list[str]) -> Any:
@@ -47,4 +52,6 @@ def member_of(controller: Any, at: list[str]) -> Any:
         parameters = {name: float(value) for name, _, value in (each.partition("=") for each in at)}
     except ValueError as error:
         raise UsageError(f"Expected --at NAME=VALUE with a number, got {' '.join(at)}; as in --at mass=0.9.") from error
+    if len(parameters) < len(at):
+        raise UsageError(f"Expected --at once for each parameter, got {' '.join(at)}; leave one of them out.")
     return controller.with_(**parameters)

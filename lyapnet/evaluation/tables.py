@@ -1,5 +1,6 @@
 """What evaluations show in a terminal."""
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.table import Column, Table
@@ -64,11 +65,13 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 
-def robustness_table(rows: list[dict[str, Any]], samples: int) -> Table:
-    """What a controller costs where its assumptions fail."""
+def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float]) -> Table:
+    """What a controller costs where its assumptions fail; of a family, in the task of one member."""
+    named = ", ".join(f"{name} = {value:g}" for name, value in member.items())
+    title = f"{samples} states each" + f" of the member {named}" * bool(named)
     headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
     columns = [Column(heading, justify="right") for heading in headings]
-    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{samples} states each")
+    table = Table("disturbance", *columns, title=f"what the controller does not know of\n{title}")
     for row in rows:
         keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
         cost, *others = (measured_or_not(key, row[key]) for key in keys)

@@ -82,7 +82,7 @@ def plan_run(
     require_parts(config, parts, config.experiment)
     module = build_module(config, parts)
     if not resume:
-        _start_from(module, finetune)
+        _start_from(config, module, finetune)
         run, lock = new_run(config, finetune)
         return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
@@ -132,22 +132,31 @@ def _start_as(run: Run, config: Config, module: TrainingModule) -> None:
     written = run.folder / CONFIG
     if written.exists():
         _require_same_experiment(config, load_config(written), written)
-    _start_from(module, run.finetuned_from)
+    _start_from(config, module, run.finetuned_from)
 
 
-def _start_from(module: TrainingModule, checkpoint: Path | None) -> None:
+def _start_from(config: Config, module: TrainingModule, checkpoint: Path | None) -> None:
     """Put the weights of a checkpoint into every member, if there is one to fine-tune from."""
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)
         if content[KEY].get("config") is not None:
             given = config_of(content, checkpoint)  # refuses what this version does not understand
-            _note_another_target(given.target, module.members[0].problem, checkpoint)
+            if [*given.family] != [*config.family]:  # V takes them by their places
+                names, own = (", ".join(family) or "none" for family in (given.family, config.family))
+                raise UsageError(
+                    f"Expected a family in {names}, as of {str(checkpoint)!r}, got one in {own}; give the same names "
+                    "in the same order, or start anew without --finetune."
+                )
+            if not config.family:
+                _note_another_target(given.target, module.members[0].problem, checkpoint)
         for member in module.members:
             load_value_function(member.V, content, checkpoint)
 
 
 def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:
     changed = [key for key in differing_keys(config, stored) if not key.startswith(CHANGEABLE_ON_RESUME)]
+    if [*config.family] != [*stored.family]:
+        changed = changed or ["order in family"]
     if changed:
         raise UsageError(
             f"Expected the config of {str(origin)!r}, got another {', '.join(changed)}; resuming continues the "

@@ -11,6 +11,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
+    from lyapnet.constraints import AllOf, Ball, Constraints, StateLimits
     from lyapnet.controller import Controller, load
     from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
+    "constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
     "controller": ["Controller", "load"],
     "cost": ["Cost", "ObstacleCost", "PeriodicCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
@@ -44,7 +46,10 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
 
 __all__ = [
     "SYSTEMS",
+    "AllOf",
+    "Ball",
     "Box",
+    "Constraints",
     "ControlAffineSystem",
     "ControlBox",
     "ControlSet",
@@ -63,6 +68,7 @@ __all__ = [
     "QuadraticCost",
     "Rollout",
     "SontagPolicy",
+    "StateLimits",
     "Table",
     "TargetCost",
     "Tolerances",

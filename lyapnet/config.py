@@ -11,6 +11,7 @@ from typing import Any
 
 from omegaconf import MISSING, OmegaConf
 
+from lyapnet.constraints import CONSTRAINTS
 from lyapnet.cost import COSTS
 from lyapnet.networks import ACTIVATIONS, NETWORKS
 from lyapnet.policy import POLICIES
@@ -99,6 +100,22 @@ class ControlsConfig:
         user_class=True,
     )  # fmt: skip
     parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
+
+
+@dataclass
+class ConstraintsConfig:
+    """h(x) ≤ 0, the states that closed loops may enter: limits of states, balls, or a class of the user's own."""
+
+    lower: dict[str, float] = option({}, "Least values of states, by name.")
+    upper: dict[str, float] = option({}, "Greatest values, likewise.")
+    outside: list[dict[str, Any]] = option([], "Balls to stay out of, each as {center: {state: …}, radius: …}.")
+    inside: list[dict[str, Any]] = option([], "Balls to stay in, likewise.")
+    name: str = option(
+        "listed", "listed: those above; or module:Class of your own, besides.", choices=tuple(CONSTRAINTS),
+        user_class=True,
+    )  # fmt: skip
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
+    margin: float = option(0.02, "Of h, within which training pays for coming close.", above=0)
 
 
 @dataclass
@@ -199,6 +216,7 @@ class Config:
     system: SystemConfig = field(default_factory=SystemConfig)
     cost: CostConfig = field(default_factory=CostConfig)
     controls: ControlsConfig = field(default_factory=ControlsConfig)
+    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
     target: list[float] | None = option(None, "x*, the state that the cost is about; null: its own goal.")

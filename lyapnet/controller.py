@@ -25,6 +25,7 @@ from lyapnet.build import (
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, SystemConfig, config_from_plain
+from lyapnet.constraints import Constraints
 from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
 from lyapnet.family import AtParameters, FamilySystem
@@ -77,7 +78,7 @@ class Controller:
         self.program = ValueProgram() if program is None else program
         self._warned = False  # of parameters of a family that V was not told
         self.V = V.requires_grad_(False).eval()
-        self._rollout = Rollout(problem, HJBPolicy(problem, V), gradient="backprop") if rollout is None else rollout
+        self._rollout = rollout or Rollout(problem, HJBPolicy(problem, V), gradient="backprop")
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
         policy = self.closed_loop.policy
@@ -279,6 +280,7 @@ def load(
     network: type[ValueFunction] | None = None,
     cost: Cost | None = None,
     controls: ControlSet | None = None,
+    constraints: Constraints | None = None,
     program: Program | None = None,
     device: str | torch.device = "cpu",
     beyond: str | None = None,
@@ -289,7 +291,7 @@ def load(
 
     Args:
         path: a .ckpt file of a run.
-        system, cost, controls, program: each is needed where the run's own is not a registered one, and replaces it.
+        system, cost, controls, constraints, program: each where the run's own is not a registered one, or replaced.
         network: likewise, the class of a network that is not one of NETWORKS.
         device: where the tensors go.
         beyond: the law after T: hold, that of t = T; receding, that of t = 0; riccati, the linear-quadratic regulator
@@ -301,7 +303,7 @@ def load(
     """
     content = read_checkpoint(path, device)
     config = config_of(content, path)
-    parts = Parts(system=system, cost=cost, controls=controls, network=network, program=program)
+    parts = Parts(system, cost, controls, constraints, network, program)
     require_parts(config, parts, path)
     _require_dimension(config, system, path)
     problem = build_problem(config, parts)

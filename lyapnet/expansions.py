@@ -28,6 +28,7 @@ STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
 NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
 HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
+ROUNDING = 1e-12  # of the largest eigenvalue of Q_uu, below which the others are lost in it
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
 
 
@@ -286,6 +287,7 @@ def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:
     """Q_uu with eigenvalues of no less than a floor, and with damping added; what overflowed is zero."""
     values, vectors = torch.linalg.eigh(Q_uu.where(Q_uu.isfinite(), 0))
     values = values.clamp_min(0).maximum(floor[..., None])
+    values = values.maximum(ROUNDING * values[..., -1:])
     values = values + (damping[..., None] if isinstance(damping, Tensor) else damping)
     return (vectors * values[..., None, :]) @ vectors.mT
 

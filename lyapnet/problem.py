@@ -7,8 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lyapnet.constraints import Constraints
 from lyapnet.contracts import called, check_function, copied
-from lyapnet.cost import Cost
+from lyapnet.cost import Cost, PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
@@ -47,7 +48,7 @@ class Horizon:
 
 
 class Problem(nn.Module):
-    """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U, subject to ẋ = f(x) + g(x)u, for every x₀ ∈ X₀.
+    """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U subject to ẋ = f(x) + g(x)u, h(x) ≤ 0, for all x₀ ∈ X₀.
 
     Args:
         system: f and g.
@@ -55,13 +56,20 @@ class Problem(nn.Module):
         controls: U.
         initial_states: X₀.
         horizon: T, and its steps.
+        constraints: h; None: there are none.
 
     Raises:
         ValueError: X₀ has another dimension than the system.
     """
 
     def __init__(
-        self, system: ControlAffineSystem, cost: Cost, controls: ControlSet, initial_states: Box, horizon: Horizon
+        self,
+        system: ControlAffineSystem,
+        cost: Cost,
+        controls: ControlSet,
+        initial_states: Box,
+        horizon: Horizon,
+        constraints: Constraints | None = None,
     ):
         super().__init__()
         if initial_states.dimension != system.n:
@@ -70,7 +78,7 @@ class Problem(nn.Module):
                 f"{initial_states.dimension}; give one for each."
             )
         self.system, self.cost, self.controls = system, cost, controls
-        self.initial_states, self.horizon = initial_states, horizon
+        self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
 
     @property
     def goal(self) -> State:
@@ -92,8 +100,19 @@ class Problem(nn.Module):
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts exchanged."""
-        own = {name: getattr(self, name) for name in ("system", "cost", "controls", "initial_states", "horizon")}
-        return Problem(**{**own, **parts})
+        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
+        return Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+
+    def relaxed(self, weight: float = 0.0) -> "Problem":
+        """The problem that training solves, whose cost keeps closed loops off the constraints; itself without any.
+
+        Args:
+            weight: of the penalty, in cost per second at h = 0; training from a config finds its own.
+        """
+        if self.constraints is None:
+            return self
+        cost = PenaltyCost(self.cost, self.constraints, self.constraints.margin, weight)
+        return self.replaced(cost=cost.to(self.initial_states.lower))
 
     def check(self) -> None:
         """Hold f, g, the cost and the controls against their contracts on states of X₀, in float64.
@@ -116,6 +135,7 @@ class Problem(nn.Module):
         ):
             check_function(symbol, function, [x[:TRIED]], shape)
         cost.check(x)
+        own._check_constraints(x)
         b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
         if not torch.allclose(system.dynamics(x, b), ControlAffineSystem.dynamics(system, x, b), rtol=1e-6):
             raise UsageError(
@@ -128,6 +148,22 @@ class Problem(nn.Module):
             raise UsageError(
                 f"Expected {type(own.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
                 f"{tuple(u.shape)} or a control outside; correct it."
+            )
+
+    def _check_constraints(self, x: State) -> None:
+        """Hold h against its contract, and some states of X₀ against h."""
+        if self.constraints is None:
+            return
+        constraints, name = self.constraints, type(self.constraints).__name__
+        check_function(f"h(x) of {name}", constraints, [x[:TRIED]], (len(constraints.names),))
+        h = constraints(x)
+        outside = (h > 0).any(-1)
+        if bool(outside.any()):
+            first = int(torch.nonzero(outside)[0])
+            raise UsageError(
+                f"Expected X₀ within the constraints, got {float(outside.double().mean()):.1%} of its states outside, "
+                f"as {x[first].tolist()}, which violates {constraints.names[int(h[first].argmax())]!r}; shrink "
+                "initial_states, or widen the constraints."
             )
 
     def check_value_function(self, V: nn.Module) -> None:
@@ -161,7 +197,8 @@ class Problem(nn.Module):
         counts for those who start at rest too.
         """
         own = copied(self)
-        box, cost, m = own.initial_states, own.cost, own.system.m
+        box, m = own.initial_states, own.system.m
+        cost = own.cost.cost if isinstance(own.cost, PenaltyCost) else own.cost  # what training adds is its own
         generator = torch.Generator().manual_seed(0)
         x = box.sample(3, generator)
         thin = torch.where(box.widths > 0, 0.0, torch.where(box.center == 0, 1.0, box.center.abs()))
@@ -174,6 +211,8 @@ class Problem(nn.Module):
             }  # fmt: skip
         if cost.rest is not None:
             numbers["u*"] = cost.rest.expand(3, m)
+        if own.constraints is not None:
+            numbers["h"] = own.constraints(x)
         if own.controls.limits is not None:
             for side, limit in zip(LIMITS, own.controls.limits, strict=True):
                 numbers[side] = limit.to(x).expand(1, m)
@@ -188,6 +227,8 @@ class Problem(nn.Module):
         unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
         if "u*" in record:
             own = {"u*": unsaid["u*"], **own}
+        if "h" in record:
+            own = {"h": [[0.0]] * 3, **own}
         return [name for name, value in own.items() if not _alike(record.get(name, unsaid.get(name)), value)]
 
 

@@ -303,7 +303,7 @@ def test_task_without_an_oracle_has_no_gap_to_report():
     assert result["optimal_cost_mean"] is result["cost_ratio"] is result["value_error"] is None
     assert result["optimum_failures"] is None
     assert result["no_optimum"].startswith(
-        "Expected rollout.method=euler for the optimum of a nonlinear or limited task, got rk4; "
+        "Expected rollout.method=euler for the optimum of a nonlinear, limited or constrained task, got rk4; "
     )
     assert result["cost_mean"] > 0
 

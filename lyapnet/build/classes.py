@@ -13,6 +13,7 @@ import torch
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config
+from lyapnet.constraints import CONSTRAINTS, Constraints
 from lyapnet.contracts import initialised, remedy
 from lyapnet.cost import COSTS, Cost
 from lyapnet.errors import LyapnetError, UsageError, did_you_mean, raised
@@ -29,6 +30,7 @@ class Parts:
     system: ControlAffineSystem | None = None
     cost: Cost | None = None
     controls: ControlSet | None = None
+    constraints: Constraints | None = None
     network: type[ValueFunction] | None = None
     program: Program | None = None
 
@@ -38,6 +40,7 @@ REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
     "system": (SYSTEMS, ControlAffineSystem),
     "cost": (COSTS, Cost),
     "controls": (CONTROL_SETS, ControlSet),
+    "constraints": (CONSTRAINTS, Constraints),
     "network": (NETWORKS, ValueFunction),
     "program": (PROGRAMS, Program),
 }

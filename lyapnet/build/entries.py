@@ -41,3 +41,15 @@ def require_length(key: str, length: int, system: ControlAffineSystem, expected:
     if length != expected:
         names = ", ".join(system.state_names if expected == system.n else system.control_names)
         raise UsageError(f"Expected {key} with {expected} entries ({names}), got {length}; give one for each.")
+
+
+def index_of(name: str, key: str, system: ControlAffineSystem) -> int:
+    """The index of a state by its name.
+
+    Raises:
+        UsageError: there is none of that name; names the key.
+    """
+    if name not in system.state_names:
+        names = ", ".join(system.state_names)
+        raise UsageError(f"Expected {key} among {names}, got {name!r}; name states of the system.")
+    return list(system.state_names).index(name)

@@ -29,6 +29,7 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
         "system": lambda: build_system(config.system),
         "cost": lambda: build_cost(config.cost),
         "controls": lambda: instance_of(config.controls, "controls"),
+        "constraints": lambda: instance_of(config.constraints, "constraints"),
         "network": lambda: class_of(config, "network"),
         "program": lambda: build_program(config),
     }

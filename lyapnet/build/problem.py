@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
-from lyapnet.build.entries import repeated, require_length, rows
+from lyapnet.build.constraints import ball_of, build_constraints
+from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
 from lyapnet.build.target import about_target
 from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
@@ -35,7 +36,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
     parts, dtype = parts or Parts(), DTYPES[config.training.precision]
     with float64_defaults():
         # in float64 for the checks below, and copies: the caller's own parts keep their precision
-        system, cost, controls = (copy.deepcopy(initialised(p)) for p in (parts.system, parts.cost, parts.controls))
+        given = (parts.system, parts.cost, parts.controls, parts.constraints)
+        system, cost, controls, constraints = (copy.deepcopy(initialised(part)) for part in given)
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         with section("initial_states"):
@@ -55,6 +57,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
+        problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         return problem.to(dtype)
 
@@ -92,7 +95,7 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
 
 def _going_round(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
     """The cost with some angles that go round; it must not know on which side of the goal they are."""
-    angles = [_index(name, "cost.periodic", system) for name in names]
+    angles = [index_of(name, "cost.periodic", system) for name in names]
     for weight in (cost.Q, cost.Q_T):
         beside = weight[angles] * (1 - torch.eye(system.n)[angles])
         if beside.any():
@@ -103,25 +106,11 @@ def _going_round(names: Sequence[str], cost: QuadraticCost, system: ControlAffin
 def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
     """The cost with the obstacles of a config."""
     for k, given in enumerate(config.obstacles):
-        center = given.get("center")
-        numbers = [*center.values()] if isinstance(center, Mapping) else []
-        admitted = all(type(number) in (int, float) for number in [given.get("radius"), given.get("weight"), *numbers])
-        if given.keys() != {"center", "radius", "weight"} or not numbers or not admitted:
-            raise UsageError(
-                f"Expected cost.obstacles, each as {{center: {{{system.state_names[0]}: 1}}, radius: 0.3, weight: 9}}, "
-                f"got {given}; give all three."
-            )
-        states = [_index(name, f"cost.obstacles[{k}].center", system) for name in given["center"]]
+        center, radius = ball_of(given, "cost.obstacles", {"center", "radius", "weight"}, system)
+        states = [index_of(name, f"cost.obstacles[{k}].center", system) for name in center]
         with section("cost.obstacles"):
-            cost = ObstacleCost(cost, states, list(given["center"].values()), given["radius"], given["weight"])
+            cost = ObstacleCost(cost, states, list(center.values()), radius, given["weight"])
     return cost
-
-
-def _index(name: str, key: str, system: ControlAffineSystem) -> int:
-    if name not in system.state_names:
-        names = ", ".join(system.state_names)
-        raise UsageError(f"Expected {key} among {names}, got {name!r}; name states of the system.")
-    return list(system.state_names).index(name)
 
 
 def _control_weight(R: Any, system: ControlAffineSystem) -> Any:

@@ -1,9 +1,11 @@
 """The condition that a sound certificate proves, as a function of (t, x)."""
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, gradients, time_derivative
+from lyapnet.constraints import Constraints
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.rollout import ClosedLoop
@@ -17,9 +19,10 @@ class DecreaseCondition(nn.Module):
         closed_loop: the system, its cost, and a control law that V defines.
         alpha: α in (0, 1], the share of the running cost that V pays for.
         delta: δ ≥ 0, in cost per second; with δ > 0 there is room around the goal, where all else vanishes.
+        constraints: h; c ≤ 0 is asked for where h(x) ≤ 0 alone.
     """
 
-    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float):
+    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float, constraints: Constraints | None = None):
         super().__init__()
         if not 0 < alpha <= 1:
             raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
@@ -28,6 +31,7 @@ class DecreaseCondition(nn.Module):
         if closed_loop.V is None:
             raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
+        self.constraints = constraints
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.parts(t, x)[0]
@@ -37,6 +41,12 @@ class DecreaseCondition(nn.Module):
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
         fall = time_derivative(self.V, loop.system, t, x, u)
         return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
+
+    def excluded(self, x: State) -> Bool[Tensor, "*batch"]:
+        """Whether a constraint excludes a state."""
+        if self.constraints is None:
+            return torch.zeros(x.shape[:-1], dtype=torch.bool)
+        return self.constraints.worst(x) > 0
 
     def height(self, t: Time, x: State) -> PerState:
         """W(t, x) = V(t, x) − δt: where Ẇ ≤ 0, sublevel sets of W hold what starts in them."""
@@ -71,14 +81,15 @@ def own_operations(V: ValueFunction, domain: tuple[Corner, Corner]) -> OwnOperat
 
 
 def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
-    """(c, W, Ẇ) with bounds on boxes, where the V_t and V_x of V̇ are those of V's own operations.
+    """(c, W, Ẇ), and h where there are constraints, with bounds on boxes; V̇ is that of V's own operations.
 
     So c ≤ 0 proves that V falls, whatever gradient V declares; the control law is the one that runs.
     """
     declared = condition.V
     try:
         condition.V = own_operations(declared, domain)
-        return BoundedFunction(lambda t, x: condition.parts(t, x), domain)
+        h = condition.constraints
+        return BoundedFunction(lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain)
     finally:
         condition.V = declared
 

@@ -100,6 +100,8 @@ def _ascend(
 
 
 def _values(condition: DecreaseCondition, points: Points) -> tuple[PerState, PerState]:
+    """(c, W); c is −∞ where a constraint excludes the state, so that no counterexample lies there."""
     with torch.no_grad():
         t, x = points[:, 0], points[:, 1:]
-        return condition(t, x), condition.height(t, x)
+        c = condition(t, x)
+        return torch.where(condition.excluded(x), -torch.inf, c), condition.height(t, x)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lyapnet.certification import Counterexample, SampledClaim, SoundClaim
 from lyapnet.certification.tables import floored
+from lyapnet.constraints import Constraints
 from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
 from lyapnet.evaluation.figures import widest_axes
 from lyapnet.sets import Box
@@ -72,15 +73,16 @@ def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
 
     A state that fails in more than one event counts for the first of them.
     """
-    decrease, terminal, cost, success = claim.held.unbind(-1)
+    decrease, terminal, cost, constraints, success = claim.held.unbind(-1)
     parts, left = [(claim.states[success], "success", SKY, ".")], ~success
     limits = claim.tolerances
     failed = (
+        ("violates a constraint", GREY, "D"),
         (f"‖x(T)‖ > {limits.radius}", PURPLE, "v"),
         ("V does not fall", ORANGE, "s"),
         (f"J > {1 + limits.cost:g} V(0, x₀)", VERMILION, "x"),
     )
-    for style, held in zip(failed, (terminal, decrease, cost), strict=True):
+    for style, held in zip(failed, (constraints, terminal, decrease, cost), strict=True):
         parts.append((claim.states[left & ~held], *style))
         left = left & held
     return [part for part in parts if len(part[0])]
@@ -89,7 +91,14 @@ def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
 # Funnels
 
 
-def funnel(claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str]) -> Figure:
+def funnel(
+    claim: SoundClaim,
+    V: Value,
+    initial_states: Box,
+    goal: State,
+    labels: Sequence[str],
+    constraints: Constraints | None = None,
+) -> Figure:
     """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
 
     One state is drawn over time; two at five times; more at t = 0 and t = T in slices through the goal, along the pairs
@@ -97,6 +106,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels
 
     Args:
         V, initial_states, goal, labels: of the states that the claim is about.
+        constraints: what they exclude is hatched.
     """
     seen = [k for k in range(claim.states.dimension) if k not in claim.left_out]
     dimension = len(seen)
@@ -110,7 +120,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels
         if dimension == 1:
             _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
         else:
-            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, handles)
+            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, handles, constraints)
     legend_below(figure, [*handles.values()], columns=2 if len(pairs) == 1 else 4)
     amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
     share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
@@ -120,7 +130,7 @@ def funnel(claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels
 
 def _draw_slice(
     panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
-    pair: tuple[int, int], handles: dict[str, Artist],
+    pair: tuple[int, int], handles: dict[str, Artist], constraints: Constraints | None,
 ) -> None:  # fmt: skip
     """One slice; what is new in it is added to the handles of the legend."""
     i, j = pair
@@ -135,6 +145,9 @@ def _draw_slice(
         proved = level <= claim.rho + claim.delta * t
         _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
         handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
+    if constraints is not None:
+        _draw_excluded(panel, axes, numpy_of(constraints.worst(states)).T, handles)
+        _draw_violation(panel, claim, pair, handles)
     through = bool(((initial_states.lower <= goal) & (initial_states.upper >= goal))[others].all())
     name = "X₀" if through else "X₀, projected"
     box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
@@ -151,6 +164,25 @@ def _draw_slice(
     panel.set(xlim=axes[0][[0, -1]], ylim=axes[1][[0, -1]], xlabel=labels[i], ylabel=labels[j])
     if others:
         panel.set_title(f"slice: {_held([_name(labels[k]) for k in others], goal[others])}", fontsize=8)
+
+
+def _draw_excluded(panel: Axes, grid: Sequence[np.ndarray], worst: np.ndarray, handles: dict[str, Artist]) -> None:
+    """Where some h > 0, hatched."""
+    if worst.max() > 0:
+        levels = [0, max(1.0, 2 * float(worst.max()))]
+        panel.contourf(*grid, worst, levels=levels, colors=["none"], hatches=["////"])
+        panel.contour(*grid, worst, levels=[0], colors=["black"], linewidths=0.8)
+        name = "excluded by a constraint"
+        handles.setdefault(name, Patch(facecolor="none", edgecolor="black", hatch="////", label=name))
+
+
+def _draw_violation(panel: Axes, claim: SoundClaim, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
+    """Where the closed loop begins that violates a constraint."""
+    if claim.violation is not None:
+        name = f"a closed loop from here violates one, t = {claim.violation.t:.3g} s"
+        x, y = (claim.violation.x0[k] for k in pair)
+        (point,) = panel.plot(x, y, "P", color=VERMILION, markersize=6, label=name, linestyle="none")
+        handles.setdefault(name, point)
 
 
 def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]]:

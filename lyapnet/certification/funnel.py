@@ -9,13 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import faces
+from lyapnet.certification.boxes import corners, faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
 from lyapnet.certification.condition import DecreaseCondition, OwnOperations, bounded_condition, require_own_gradient
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
+from lyapnet.certification.crossing import Violation, crossing_level, find_violation
 from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict
+from lyapnet.constraints import names_of
 from lyapnet.contracts import check_function, copied
 from lyapnet.errors import Interrupted, UsageError, signals_taken
 from lyapnet.graphs.bounds import BoundedFunction
@@ -26,7 +28,7 @@ from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
-LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, at the most …
+LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, and at constraints, at the most …
 LEAST, SHARE_OF_LEVELS = 1.0, 0.3  # … in seconds at the least, and of the budget
 NOTHING = 1e-200  # bounds of zero have the least room for rounding
 SHARE_OF_FINISH = 0.15  # of what is left, for the share of X₀ and κ
@@ -40,8 +42,9 @@ class SoundClaim:
 
         V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
 
-    and W > ρ on the boundary of D. Hence each closed loop that starts in D with V(0, x₀) ≤ ρ keeps V(t, x(t)) ≤ ρ + δt,
-    stays in D up to T, and has
+    and W > ρ on the boundary of D. With constraints that is so where h(x) ≤ 0, and W > ρ wherever h_j(x) = 0 and
+    ∇h_jᵀ(f + gu) ≥ 0, so that no closed loop with W ≤ ρ comes to violate one. Hence each closed loop that starts in D
+    with h(x₀) ≤ 0 and V(0, x₀) ≤ ρ keeps h(x(t)) ≤ 0 and V(t, x(t)) ≤ ρ + δt, stays in D up to T, and has
 
         α ∫ℓ dt ≤ V(0, x₀) − V(T, x(T)) + δT,
         J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max of φ(x) − V(T, x)/α where W(T, x) ≤ ρ.
@@ -72,10 +75,15 @@ class SoundClaim:
     left_out: list[int]  # ignorable states, on which nothing depends: D has no bounds for them, and is drawn at 0
     fingerprint: str = ""  # of (V̇ + αℓ − δ, W) as it was traced: the operations and numbers that the claim is about
     proof_seconds: float = 0.0  # those of the boxes alone
+    constraints: Sequence[str] = ()  # what h(x) ≤ 0 asks for
+    crossing: float = float("inf")  # a lower bound of W where a closed loop could come to violate one
+    violation: Violation | None = None  # of a closed loop from X₀
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that a funnel holds all of X₀."""
+        """On the claim that a funnel holds all of X₀, and that no closed loop from there violates a constraint."""
+        if self.violation is not None:
+            return "falsified"
         if self.rho >= self.wanted:
             return "certified"
         found = self.counterexample
@@ -90,6 +98,8 @@ class SoundClaim:
             return "seconds spent: allow more, or go on with a kept proof"
         if self.counterexample is not None:
             return "the condition fails close to what X₀ needs"
+        if self.crossing <= self.wanted:
+            return "closed loops of the funnel that X₀ needs may cross a constraint"
         return "the funnel meets the boundary of D: choose a larger set"
 
     def guaranteed_cost(self, value: PerState) -> PerState:
@@ -123,14 +133,15 @@ def sound_claim(
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget = time.monotonic(), budget or Budget()
-    condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta)
+    problem = copied(problem)
+    condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints)
     duration, goal = problem.horizon.duration, problem.goal.double()
     _freeze(condition, _over_time(problem.initial_states, duration))
-    left_out = ignorable_states(condition.closed_loop)
+    left_out = ignorable_states(condition.closed_loop, problem.constraints)
     initial_states = _without(problem.initial_states, left_out)
     x_low, x_high = initial_states.lower, initial_states.upper
     _require_continuous(condition.V, x_low, x_high)
-    levels = Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
+    levels = _for_levels(budget)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *_at(0.0, x_low, x_high), levels)
     constants = condition.closed_loop.system.constants
     states = states or enclosing_box(condition.height, initial_states, goal, duration, wanted, constants)
@@ -141,23 +152,27 @@ def sound_claim(
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
+    crossing = crossing_level(condition, domain, _for_levels(budget), just_above(needed))
     set_up = time.monotonic() - started
-    level = min(needed, just_below(rim))
+    level = min(needed, just_below(min(rim, crossing)))
     proof = _proof(condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay)
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed and budget.left:  # proved, and so searched, was less than what X₀ needs
         found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
-    inside, excess = 0.0, float("inf")
-    if rho > -float("inf"):
-        finish = Budget(budget.left, chunk=budget.chunk)
-        inside = 1.0 if rho >= wanted else _share(condition.V, x_low, x_high, rho, finish)
-        excess = _terminal_excess(condition, states, duration, rho, finish)
+    names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
+    share = 1.0 if rho >= wanted else _share(condition.V, x_low, x_high, rho, budget)
+    excess = _terminal_excess(condition, states, duration, rho, budget)
     return SoundClaim(
-        alpha, delta, duration, states, rho, wanted, _largest_seen(condition.V, initial_states), inside, excess,
+        alpha, delta, duration, states, rho, wanted, _largest_seen(condition.V, initial_states), share, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint, proof.seconds,
+        proof.fingerprint, proof.seconds, names, crossing, violation,
     )  # fmt: skip
+
+
+def _for_levels(budget: Budget) -> Budget:
+    """The share of a budget for levels."""
+    return Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
 
 
 def _proof(
@@ -218,24 +233,24 @@ def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float)
 
 def _largest_seen(V: Value, initial_states: Box) -> float:
     """The largest V(0, ·) among the corners of X₀ and 10 000 of its states."""
-    free = torch.nonzero(initial_states.widths > 0).flatten()[:12]  # as many corners as 4096
-    corners = initial_states.center.repeat(2 ** len(free), 1)
-    for k, i in enumerate(free):
-        upper = torch.arange(len(corners)).bitwise_right_shift(k) % 2 == 1
-        corners[:, i] = torch.where(upper, initial_states.upper[i], initial_states.lower[i])
-    states = torch.cat([corners, initial_states.sample(10_000, torch.Generator().manual_seed(0))])
+    states = torch.cat([corners(initial_states), initial_states.sample(10_000, torch.Generator().manual_seed(0))])
     with torch.no_grad():
         return float(V(states.new_zeros(len(states)), states).max())
 
 
 def _share(V: Value, x_low: State, x_high: State, rho: float, budget: Budget) -> float:
     """A lower bound of the share by volume of X₀ with V(0, ·) ≤ ρ."""
+    if rho == -float("inf"):
+        return 0.0
     lower, upper = _at(0.0, x_low, x_high)
-    return share_below(V, lower[0], upper[0], rho, budget)
+    return share_below(V, lower[0], upper[0], rho, Budget(budget.left, chunk=budget.chunk))
 
 
 def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
-    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ."""
+    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ; infinite where there is no ρ."""
+    if rho == -float("inf"):
+        return float("inf")
+    budget = Budget(budget.left, chunk=budget.chunk)
     V, cost, alpha = condition.V, condition.closed_loop.cost, condition.alpha
     end = _at(duration, states.lower.double(), states.upper.double())
     return -minimum(lambda t, x: V(t, x) / alpha - cost.terminal(x), *end, budget, condition.height, rho, unit=abs(rho))

@@ -2,14 +2,15 @@
 
 import torch
 
+from lyapnet.constraints import Constraints
 from lyapnet.cost import innermost, is_quadratic
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.graphs.tracing import trace
 from lyapnet.rollout.closed_loop import ClosedLoop
 
 
-def ignorable_states(closed_loop: ClosedLoop) -> list[int]:
-    """The indices of states on which neither f, g, ℓ, φ nor V and u depend.
+def ignorable_states(closed_loop: ClosedLoop, constraints: Constraints | None = None) -> list[int]:
+    """The indices of states on which neither f, g, ℓ, φ nor V and u depend, nor h.
 
     A state that is not a number makes nan of everything computed with it, so what stays finite does not depend on it. A
     jump would hide it, as nan > 0 is false and the sign of nan is 0: with jumps, no state is taken for ignorable.
@@ -18,6 +19,7 @@ def ignorable_states(closed_loop: ClosedLoop) -> list[int]:
         return []
     n = closed_loop.system.n
     found = [i for i in range(n) if not _depends_on(closed_loop, i)]
+    found = [i for i in found if constraints is None or constraints.ignores(i, n)]
     return found if len(found) < n else []  # something has to bound a funnel
 
 

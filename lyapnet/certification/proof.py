@@ -71,8 +71,8 @@ def prove(
     """Prove c ≤ 0 and Ẇ ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
     Counterexamples are sought first, by samples and by ascent from the worst of them, then boxes of lowest W are
-    bounded. A box is dropped where both hold on all of it or W > level on all of it, and else cut in two. A
-    counterexample that turns up among their centres lowers the level, and the search goes on under it.
+    bounded. A box is dropped where both hold on all of it, or W > level or some h > 0 on all of it, and else cut in
+    two. A counterexample that turns up among their centres lowers the level, and the search goes on under it.
 
     Args:
         condition: in float64.
@@ -130,10 +130,12 @@ class WhereItHolds(Question):
     worst: Counterexample | None = None
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        c, W, rise = self.bounded.forms(boxes.lower, boxes.upper)
+        c, W, rise, *h = self.bounded.forms(boxes.lower, boxes.upper)
         (_, c_high), (W_low, _), (_, rise_high) = c.interval(), W.interval(), rise.interval()
         boxes = boxes._replace(key=torch.maximum(W_low, boxes.key))
         chosen = ~((c_high <= 0) & (rise_high <= 0)) & (boxes.key <= self.level)
+        for constraints in h:
+            chosen &= ~(constraints.interval()[0] > 0).any(-1)
         return boxes[chosen], axis_to_cut(self.bounded, c, boxes, chosen)
 
     def look_at(self, boxes: Boxes) -> None:

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from lyapnet.certification.certificates import Certificate
 from lyapnet.certification.tables import certificate_rows
 from lyapnet.config import Config
+from lyapnet.constraints import names_of
 from lyapnet.controller import Controller, parameters_of
 from lyapnet.cost import MadeOfAnother, QuadraticCost
 from lyapnet.errors import UsageError
@@ -98,6 +99,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
         "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
         "cost": _cost(controller, config),
         "controls": _controls(controller, config),
+        "constraints": list(names_of(controller.problem.constraints)),
         "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
         "horizon": {"steps": horizon.steps, "dt": horizon.dt, "duration": horizon.duration},
         "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},
@@ -123,6 +125,7 @@ def markdown(report: dict[str, Any]) -> str:
         "system": f"{report['system']['name']}{f': {parameters}' if parameters else ''}",
         "cost": ", ".join(f"{name} = {value}" for name, value in report["cost"].items()),
         "controls": ", ".join(f"{name} = {value}" for name, value in report["controls"].items()) or "without limits",
+        **({"constraints": "; ".join(report["constraints"])} if report["constraints"] else {}),
         "horizon": f"{horizon['steps']} steps of {horizon['dt']:g} s, T = {horizon['duration']:g} s",
         "closed loop": f"policy {report['rollout']['policy']}, integrator {report['rollout']['method']}",
         "network": f"{report['network']['name']}, {report['network']['parameters']} parameters",

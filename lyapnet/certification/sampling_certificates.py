@@ -8,6 +8,7 @@ from lyapnet.certification import figures
 from lyapnet.certification.certificates import Certificate
 from lyapnet.certification.statistical import SampledClaim, StatisticalClaim, sampled_claim, statistical_claim
 from lyapnet.certification.tables import floored
+from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.random_streams import CERTIFICATION, stream
 
@@ -23,6 +24,7 @@ class SampledCertificate(Certificate):
         "decrease_share": "condition holds along the closed loop",
         "terminal_share": "‖x(T)‖ within the radius",
         "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
+        "constraints_share": "constraints kept",
         "all_share": "all that is asked for",
         "confidence": "confidence",
         "draws": "draws of this checkpoint, other seeds included",
@@ -30,6 +32,7 @@ class SampledCertificate(Certificate):
         "decrease_lower_bound": "condition holds on at least",
         "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
         "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
+        "constraints_lower_bound": "constraints kept on at least",
         "probability_lower_bound": "all that is asked for on at least",
         "required_share": "share of X₀ that the verdict is about",
         "failure": "a state that fails",
@@ -43,7 +46,7 @@ class SampledCertificate(Certificate):
         return {
             "samples": claim.samples,
             **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
-            "tolerances": asdict(claim.tolerances),
+            "tolerances": {name: value for name, value in asdict(claim.tolerances).items() if name != "constraints"},
             "failure": claim.failures[0].tolist() if len(claim.failures) else None,
         }
 
@@ -64,8 +67,9 @@ class SampledCertificate(Certificate):
             "radius": "‖x(T)‖ ≤ {:g}",
             "cost": "J(x₀) ≤ {:g} V(0, x₀)",
         }
-        numbers = {**limits, "cost": 1 + limits["cost"]}
-        return [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
+        numbers, constraints = {**limits, "cost": 1 + limits["cost"]}, names_of(self.controller.problem.constraints)
+        asked = [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
+        return [*asked, *([f"h(xₙ) ≤ 0: {'; '.join(constraints)}"] if constraints else [])]
 
     def of_the_verdict(self) -> str:
         why = "one that fails was found" if self.verdict == "falsified" else "no sample fails, which proves nothing"

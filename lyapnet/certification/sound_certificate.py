@@ -39,6 +39,9 @@ class SoundCertificate(Certificate):
         "rho_wanted": "ρ for all of X₀",
         "rho": "largest ρ proved",
         "volume_share": "share of X₀ in that funnel, at least",
+        "constraints": "constraints that no closed loop of the funnel violates",
+        "crossing_level": "V − δt where one could be violated, at least",
+        "violation": "a closed loop from X₀ that violates one",
         "terminal_excess": "κ, cost at T beyond V(T, ·)/α, at most",
         "guaranteed_cost_ratio": "guaranteed cost there / optimum, ratio of the means",
         "counterexample": "counterexample of lowest V − δt",
@@ -56,6 +59,10 @@ class SoundCertificate(Certificate):
     def proved(self) -> dict[str, Any]:
         """The numbers of the claim, without the optimum, which takes an oracle."""
         claim, names = self.claim, self.controller.system.state_names
+        kept = {
+            "constraints": list(claim.constraints) if claim.volume_share else [], "crossing_level": claim.crossing,
+            "violation": None if claim.violation is None else claim.violation._asdict(),
+        } if claim.constraints else {}  # fmt: skip
         return {
             "alpha": claim.alpha, "delta": claim.delta, "duration": claim.duration,
             "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
@@ -64,7 +71,7 @@ class SoundCertificate(Certificate):
             "terminal_excess": claim.terminal_excess if claim.volume_share else None, "reason": claim.reason,
             "boxes": claim.boxes, "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
             "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
-            "fingerprint": claim.fingerprint,
+            "fingerprint": claim.fingerprint, **kept,
         }  # fmt: skip
 
     def in_words(self) -> str:
@@ -73,40 +80,59 @@ class SoundCertificate(Certificate):
             return "No level ρ was proved: nothing is claimed. The conditions below were sought."
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
-            f"model: no closed loop that starts in it leaves the funnel, or D, up to T = {claim.duration:g} s, and its "
-            f"cost is bounded as below. It holds at least {floored(claim.volume_share)} of X₀ by volume. It is about "
-            "the operations that f, g, ℓ, V and u were traced to, of this fingerprint; whatever else their code reads "
-            f"(globals, counters, files) is frozen as it was then.{self.of_parameters}"
+            f"model: no closed loop that starts in it leaves the funnel, or D,{self._or_violates} up to "
+            f"T = {claim.duration:g} s, and its cost is bounded as below. It holds at least "
+            f"{floored(claim.volume_share)} of X₀ by volume. It is about the operations that f, g, ℓ, V and u were "
+            "traced to, of this fingerprint; whatever else their code reads (globals, counters, files) is frozen as it "
+            f"was then.{self.of_parameters}"
         )
+
+    @property
+    def _or_violates(self) -> str:
+        """What else no closed loop of the funnel does."""
+        return f" or violates a constraint ({'; '.join(self.claim.constraints)})," if self.claim.constraints else ""
 
     def in_formulas(self) -> list[str]:
         claim = self.claim
         # unrounded, as proved
         alpha, delta, T = (f"{value!r}".removesuffix(".0") for value in (claim.alpha, claim.delta, claim.duration))
         rho, kappa = (repr(claim.rho), repr(claim.terminal_excess)) if claim.volume_share else ("ρ", "κ")
+        kept = ("  and  h(x) ≤ 0", "  and  h(x(t)) ≤ 0", "  and  h(x₀) ≤ 0") if self.claim.constraints else [""] * 3
         return [
             f"V_t + V_xᵀ(f + g u) + {alpha} ℓ(x, u) ≤ {delta}  "
-            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t",
-            f"V(t, x(t)) ≤ {rho} + {delta} t  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}",
+            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{kept[0]}",
+            f"V(t, x(t)) ≤ {rho} + {delta} t{kept[1]}  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}{kept[2]}",
             f"J(x₀) ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
         ]
 
     def of_the_verdict(self) -> str:
-        found = self.claim.counterexample
+        found, violation = self.claim.counterexample, self.claim.violation
+        if violation is not None:
+            return (
+                "The verdict is on the claim that no closed loop from X₀ violates a constraint: the one from "
+                f"x₀ = {_listed(violation.x0)} does at t = {violation.t:.6g} s, {violation.constraint}, by h = "
+                f"{violation.h:.3g} (Runge-Kutta steps of a quarter of Δt)."
+            )
         why = {
             "certified": "it does",
             "falsified": "the condition fails inside the funnel that this would take",
             "unknown": "undecided within the budget",
         }[self.verdict]
-        x = "" if found is None else f"({', '.join(f'{entry:.6g}' for entry in found.x)})"
-        where = "" if found is None else f" At t = {found.t:.6g} s, x = {x} it fails by {found.condition:.3g}."
+        where = ""
+        if found is not None:
+            where = f" At t = {found.t:.6g} s, x = {_listed(found.x)} it fails by {found.condition:.3g}."
         return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:
-        controller = self.controller
+        controller, problem = self.controller, self.controller.problem
+        labels = controller.system.state_labels
         return figures.funnel(
-            self.claim, controller.V, controller.initial_states, controller.problem.goal, controller.system.state_labels
+            self.claim, controller.V, problem.initial_states, problem.goal, labels, problem.constraints
         )
+
+
+def _listed(x: Sequence[float]) -> str:
+    return f"({', '.join(f'{entry:.6g}' for entry in x)})"
 
 
 def sound_certificate(

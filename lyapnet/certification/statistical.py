@@ -1,7 +1,7 @@
 """Claims about a controller from closed-loop rollouts of sampled initial states: a share, and an exact bound of it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool
@@ -9,7 +9,6 @@ from scipy.special import betaincinv
 from torch import Tensor
 
 from lyapnet.certification.verdict import Verdict
-from lyapnet.cost import Cost
 from lyapnet.errors import DivergenceError
 from lyapnet.problem import Problem
 from lyapnet.programs import EVENTS, Tolerances
@@ -89,7 +88,7 @@ class StatisticalClaim(SampledClaim):
 
     @property
     def probability_lower_bound(self) -> float:
-        """The bound for the three events together."""
+        """The bound for all events together."""
         return self.lower_bounds["all"]
 
     @property
@@ -133,7 +132,7 @@ def sampled_claim(
 
     Args:
         rollout: under a control law that a V defines.
-        problem: whose X₀ and goal are meant.
+        problem: whose X₀, goal and constraints are meant.
         batch: states that are rolled out at once, which bounds the memory.
 
     Raises:
@@ -143,7 +142,8 @@ def sampled_claim(
         raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
     require_memory("samples", samples, NUMBER * samples * problem.system.n, "draw fewer")
     x0 = problem.initial_states.sample(samples, generator)
-    held = torch.cat([_events(rollout, part, tolerances, problem.cost) for part in x0.split(batch)])
+    tolerances = replace(tolerances, constraints=problem.constraints is not None)
+    held = torch.cat([_events(rollout, part, tolerances, problem) for part in x0.split(batch)])
     return SampledClaim(x0.cpu(), held, tolerances)
 
 
@@ -178,7 +178,7 @@ FEWEST = 16  # states that are counted as failures together where one of them di
 
 
 def _events(
-    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, cost: Cost
+    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, problem: Problem
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
@@ -191,12 +191,15 @@ def _events(
     except DivergenceError:
         if len(x0) <= FEWEST:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
-        return torch.cat([_events(rollout, half, tolerances, cost) for half in x0.tensor_split(2)])
+        return torch.cat([_events(rollout, half, tolerances, problem) for half in x0.tensor_split(2)])
     values = trajectory.require_value()
-    decrease = terminal = torch.ones_like(values[0], dtype=torch.bool)
+    decrease = terminal = constraints = torch.ones_like(values[0], dtype=torch.bool)
     if tolerances.decrease is not None:
         decrease = satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease)
     if tolerances.radius is not None:
-        terminal = torch.linalg.vector_norm(cost.from_goal(trajectory.x[-1]), dim=-1) <= tolerances.radius
-    single = torch.stack([decrease, terminal, trajectory.cost <= (1 + tolerances.cost) * values[0]], -1)
+        terminal = torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1) <= tolerances.radius
+    if problem.constraints is not None:
+        constraints = problem.constraints.worst(trajectory.x).amax(0) <= 0
+    cost = trajectory.cost <= (1 + tolerances.cost) * values[0]
+    single = torch.stack([decrease, terminal, cost, constraints], -1)
     return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

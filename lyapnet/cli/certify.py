@@ -14,7 +14,19 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import At, Checkpoint, Controls, Cost, Debug, Network, Program, System, load_controller, titled
+from lyapnet.cli.options import (
+    At,
+    Checkpoint,
+    Constraints,
+    Controls,
+    Cost,
+    Debug,
+    Network,
+    Program,
+    System,
+    load_controller,
+    titled,
+)
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
 
@@ -111,6 +123,7 @@ def sampled(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
     program: Program = None,
     at: At = None,
     debug: Debug = False,
@@ -121,7 +134,10 @@ def sampled(
     from lyapnet.certification.sampling_certificates import sampled_certificate
 
     require_writable(figure, report)
-    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    own = {
+        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
+        "program": program,
+    }  # fmt: skip
     certificate = sampled_certificate(load_controller(checkpoint, at, **own), samples, radius, seed)
     _record(certificate, draws_of(checkpoint, at, **own, radius=radius))
     _show(certificate, checkpoint, at, as_json)
@@ -149,6 +165,7 @@ def statistical(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
     program: Program = None,
     at: At = None,
     debug: Debug = False,
@@ -159,7 +176,10 @@ def statistical(
     from lyapnet.certification.sampling_certificates import statistical_certificate
 
     require_writable(figure, report)
-    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    own = {
+        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
+        "program": program,
+    }  # fmt: skip
     controller = load_controller(checkpoint, at, **own)
     draws = draws_of(checkpoint, at, **own, radius=radius)
     made = 1 + draws.others(seed, samples)
@@ -210,6 +230,7 @@ def sound(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
     program: Program = None,
     at: At = None,
     debug: Debug = False,
@@ -229,7 +250,10 @@ def sound(
     if states is not None:
         parse_set(states)
     require_writable(figure, report, keep)
-    own = {"system": system, "network": network, "cost": cost, "controls": controls, "program": program}
+    own = {
+        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
+        "program": program,
+    }  # fmt: skip
     notes = Console(stderr=True, highlight=False, markup=False)
 
     def certified(path: Path, started: float | None = None) -> Any:
@@ -263,6 +287,7 @@ def check(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
     program: Program = None,
     at: At = None,
     debug: Debug = False,
@@ -273,7 +298,14 @@ def check(
     from lyapnet.certification.tables import certificate_table, proof_progress
 
     controller = load_controller(
-        checkpoint, at, system=system, network=network, cost=cost, controls=controls, program=program
+        checkpoint,
+        at,
+        system=system,
+        network=network,
+        cost=cost,
+        controls=controls,
+        constraints=constraints,
+        program=program,
     )
     with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
         result = checked(controller, proof, workers, progress)

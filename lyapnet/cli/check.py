@@ -30,7 +30,7 @@ def check(
     resolved = dataclasses.replace(load_config(config, overrides or []), seeds=1)
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
-    learner = build_learner(resolved, build_problem(resolved, parts), parts)
+    learner = build_learner(resolved, build_problem(resolved, parts).relaxed(), parts)
     with Console(stderr=True).status("start …") as status:
         facts = facts_of(learner, lambda stage: status.update(f"start: {stage} …"))
     console = Console(highlight=False, markup=False)

@@ -10,6 +10,7 @@ from rich.console import Console
 from lyapnet.cli.options import (
     At,
     Checkpoint,
+    Constraints,
     Controls,
     Cost,
     Debug,
@@ -41,6 +42,7 @@ def evaluate(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
     program: Program = None,
     at: At = None,
     debug: Debug = False,
@@ -59,7 +61,14 @@ def evaluate(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
     controller = load_controller(
-        checkpoint, at, system=system, network=network, cost=cost, controls=controls, program=program
+        checkpoint,
+        at,
+        system=system,
+        network=network,
+        cost=cost,
+        controls=controls,
+        constraints=constraints,
+        program=program,
     )
     notes = Console(stderr=True, highlight=False, markup=False)
     with notes.status("measuring …") as status:
@@ -88,11 +97,15 @@ def evaluate(
 def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation") -> str:
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
+    from lyapnet.evaluation.path_figure import has_plane, paths
 
+    trajectory, problem = controller.rollout(measured.table.x0[:12]), controller.problem
     drawn = {
-        "trajectories": figures.trajectories(controller.rollout(measured.table.x0[:12]), controller.problem),
-        "value_slices": figures.value_slices(controller.value, controller.problem),
+        "trajectories": figures.trajectories(trajectory, problem),
+        "value_slices": figures.value_slices(controller.value, problem),
     }
+    if has_plane(problem):
+        drawn["paths"] = paths(trajectory, problem)
     if measured.result()["cost_ratio"] is not None:
         drawn["optimality"] = figures.optimality(measured.table)
     folder.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ System = Annotated[str | None, typer.Option(help="module:Class of a system of yo
 Network = Annotated[str | None, typer.Option(help="module:Class of a network of your own.")]
 Cost = Annotated[str | None, typer.Option(help="module:Class of a cost of your own.")]
 Controls = Annotated[str | None, typer.Option(help="module:Class of a control set of your own.")]
+Constraints = Annotated[str | None, typer.Option(help="module:Class of constraints of your own.")]
 At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),

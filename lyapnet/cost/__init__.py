@@ -2,6 +2,7 @@
 
 from lyapnet.cost.base import Cost
 from lyapnet.cost.made_of_another import MadeOfAnother, ObstacleCost, PeriodicCost, TargetCost, innermost
+from lyapnet.cost.penalty import PenaltyCost
 from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
@@ -11,6 +12,7 @@ __all__ = [
     "Cost",
     "MadeOfAnother",
     "ObstacleCost",
+    "PenaltyCost",
     "PeriodicCost",
     "QuadraticCost",
     "TargetCost",

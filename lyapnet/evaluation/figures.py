@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from torch import Tensor
 
+from lyapnet.constraints import StateLimits, parts_of
 from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, numpy_of
 from lyapnet.evaluation.states import StateTable
 from lyapnet.problem import Problem
@@ -143,7 +144,7 @@ def _draw_line_region(
 
 
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
-    """States, controls and their limits, and V with the cost still to come, over time, of a batch (b,) of loops.
+    """States, controls, the limits of both, and V with the cost still to come, over time, of a batch (b,) of loops.
 
     Dotted: the goal, where it is one, and the control that costs nothing. Parameters of a family have no panel.
     """
@@ -165,6 +166,10 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
         panel.plot(t[: len(values_over_time)], values_over_time, color=color, linewidth=0.9)
         panel.axhline(height, color=GREY, linewidth=0.6, linestyle=":")
         panel.set_ylabel(label.replace(" (", "\n("), fontsize=8)
+    for part in parts_of(problem.constraints):
+        if isinstance(part, StateLimits):
+            for i, height in zip(part.states.tolist(), part.limits.tolist(), strict=True):
+                panels[drawn.index(i)].axhline(height, color=VERMILION, linewidth=0.9, linestyle="--")
     for limit in problem.controls.limits or ():
         for panel, height in zip(panels[len(drawn) : len(curves)], limit.expand(system.m).tolist(), strict=True):
             if math.isfinite(height):

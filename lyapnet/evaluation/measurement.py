@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
@@ -40,7 +41,10 @@ class Evaluation(NamedTuple):
         terminal = {labels[i]: float(errors[i]) for i in labels if i not in system.constants}
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
         limits = self.table.use_of_limits(system.control_names)
-        used = {"at_limits": limits} if limits else {}
+        used: dict[str, Any] = {"at_limits": limits} if limits else {}
+        if self.table.violated is not None:
+            used["violated_fraction"] = float(self.table.violated.double().mean())
+            used["constraints"] = self.table.violations(names_of(self.problem.constraints))
         return {**self.table.summary(), **paper, "terminal_errors": terminal, **used, **counts, **self._note()}
 
     def write(self, path: Path) -> None:
@@ -58,6 +62,9 @@ class Evaluation(NamedTuple):
             "hinge": table.hinge, "decreasing": table.decreasing.int(), "terminal_error": table.terminal_error,
             **{f"terminal {name}": x for name, x in zip(states, table.terminal_state.unbind(-1), strict=True)},
         }  # fmt: skip
+        if table.worst is not None:
+            names = names_of(self.problem.constraints)
+            columns |= dict(zip((f"worst h, {name}" for name in names), table.worst.unbind(-1), strict=True))
         values = zip(*(column.tolist() for column in columns.values()), self.notes, strict=True)
         rows = [dict(zip([*columns, "no_optimum"], row, strict=True)) for row in values]
         path.write_text(csv_text(rows), encoding="utf-8")

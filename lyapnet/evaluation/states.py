@@ -30,6 +30,8 @@ class StateTable:
     terminal_state: State  # x_N
     terminal_error: PerState  # ‖x_N − goal‖
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
+    worst: Tensor | None = None  # (b, k): max_n h(x_n), where there are constraints
+    worst_time: Tensor | None = None  # (b, k): when
 
     def rows(self, chosen: slice) -> "StateTable":
         """The table of some of the states."""
@@ -68,6 +70,20 @@ class StateTable:
         keys = ("lower", "upper", "states")
         return {name: dict(zip(keys, own, strict=True)) for name, own in zip(names, shares, strict=True)}
 
+    def violations(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Of each constraint: the share of states whose closed loop violates it, the worst h, and when that is."""
+        if self.worst is None or self.worst_time is None:
+            return {}
+        shares, (worst, of) = (self.worst > 0).double().mean(0).tolist(), self.worst.max(0)
+        times = self.worst_time.gather(0, of[None])[0].tolist()
+        columns = zip(names, shares, worst.tolist(), times, strict=True)
+        return {name: {"violated": share, "worst": h, "time": t} for name, share, h, t in columns}
+
+    @property
+    def violated(self) -> Tensor | None:
+        """Whether each closed loop violates some constraint, (b,); None where there are none."""
+        return None if self.worst is None else (self.worst > 0).any(-1)
+
     def against_optimum(self) -> dict[str, float | None]:
         """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""
         optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
@@ -88,6 +104,7 @@ def measure(
         optimal_cost: J* of each, where it is known.
     """
     values = trajectory.require_value()
+    worst, worst_time = _worst(problem, trajectory)
     return StateTable(
         x0=trajectory.x[0],
         cost=trajectory.cost,
@@ -99,7 +116,17 @@ def measure(
         terminal_state=trajectory.x[-1],
         terminal_error=torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1),
         at_limits=_at_limits(problem.controls, trajectory.u),
+        worst=worst,
+        worst_time=worst_time,
     )
+
+
+def _worst(problem: Problem, trajectory: Trajectory) -> tuple[Tensor | None, Tensor | None]:
+    """max_n h(x_n) of each trajectory and constraint, and when it is."""
+    if problem.constraints is None:
+        return None, None
+    worst, node = problem.constraints(trajectory.x).max(0)
+    return worst, trajectory.t[node]
 
 
 def _at_limits(controls: ControlSet, u: ControlPath) -> Tensor | None:

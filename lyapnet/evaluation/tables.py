@@ -24,10 +24,13 @@ ROWS = {
 }
 
 
+VIOLATED = {"violated_fraction": "constraints violated, share of states"}  # where there are some
+
+
 def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     """What a controller reaches, as evaluation.Evaluation.result has it."""
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
-    for key, label in ROWS.items():
+    for key, label in _rows(result).items():
         if result[key] is None:
             table.add_row(label, "–")
         else:
@@ -39,6 +42,8 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
             f"{name} at its lower, upper limit: share of steps (of states that meet one)",
             f"{share['lower']:.1%}, {share['upper']:.1%} ({share['states']:.0%})",
         )
+    for name, found in result.get("constraints", {}).items():
+        table.add_row(f"{name}: greatest h, when", f"{found['worst']:.4g}, {found['time']:.4g} s")
     table.caption = _caption([result])
     return table
 
@@ -48,7 +53,7 @@ def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
     seeds = result["seeds"]
     table = Table("measure", *(Column(name, no_wrap=True) for name in ("mean ± spread", "least (seed)", "most (seed)")))
     table.title = f"{title}\n{len(seeds)} seeds, {seeds[0]['samples']} unseen states of X₀ each"
-    for key, label in ROWS.items():
+    for key, label in _rows(seeds[0]).items():
         if key not in result["mean"]:
             table.add_row(label, "–", "–", "–")
             continue
@@ -57,6 +62,10 @@ def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
         table.add_row(label, f"{mean} ± {spread}", *(f"{measured(key, end[key])} ({end['seed']})" for end in ends))
     table.caption = _caption(seeds)
     return table
+
+
+def _rows(result: dict[str, Any]) -> dict[str, str]:
+    return {**ROWS, **VIOLATED} if "violated_fraction" in result else ROWS
 
 
 def _caption(results: list[dict[str, Any]]) -> Text | None:

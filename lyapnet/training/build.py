@@ -38,7 +38,7 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
         UsageError: as build_problem and its like; or the seeds cannot train as one batch.
     """
     parts = parts_of(config) if parts is None else parts
-    problem, options = build_problem(config, parts), _optimizer_options(config.training)
+    problem, options = build_problem(config, parts).relaxed(), _optimizer_options(config.training)
     if config.seeds == 1:
         one = build_learner(config, problem, parts)
         module = ValueModule(problem, one.V, one.program, one.rollout, one.pointwise, options, config.seed)

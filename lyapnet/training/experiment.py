@@ -26,6 +26,7 @@ from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
 from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
+from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
 from lyapnet.training.start import Start, choose_start, has_place_for_start, silent
 from lyapnet.training.trainer import build_trainer
@@ -97,6 +98,8 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
     started = time.perf_counter()
     try:
+        if plan.module.penalty is not None and plan.resume_from is None:
+            _relax(plan, console, trainer.is_global_zero)
         with _compiling_beside_start(plan, trainer):
             start = _choose_start(plan, console, trainer.is_global_zero) if _seeks_start(plan) else None
             trainer = _train(plan, trainer, console, start)
@@ -136,6 +139,18 @@ def _compiling_beside_start(plan: Plan, trainer: L.Trainer) -> AbstractContextMa
 
 def _seeks_start(plan: Plan) -> bool:
     return plan.resume_from is None and plan.run.finetuned_from is None
+
+
+def _relax(plan: Plan, console: Console, told: bool) -> None:
+    """Set the penalty that stands for constraints, and say what it keeps."""
+    with console.status("constraints …") if told else nullcontext() as status:
+        report = silent if status is None else lambda stage: status.update(f"constraints: {stage} …")
+        relaxation = find_relaxation(plan.module.members[0].problem, report)
+    assert plan.module.penalty is not None
+    plan.module.penalty.weight.fill_(relaxation.weight)
+    if told:
+        plan.run.note(relaxation=relaxation.as_json())
+        console.print(str(relaxation), soft_wrap=True)
 
 
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:

@@ -5,11 +5,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64, riccati
 from lyapnet.policy import SampledPolicy
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
+from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.start import CALM, Report, choose_start, silent
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
@@ -24,10 +26,18 @@ class Fact(NamedTuple):
 
 
 def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
-    """The facts of a learner's problem; its V is left at the best start. `report` is told what is being done."""
+    """The facts of a learner's problem; V and the penalty of constraints are left where training begins.
+
+    Args:
+        report: is told what is being done.
+    """
     problem = learner.problem
     exact = in_float64(problem)
     facts = [_task(exact), _goal(exact), *_linearisation(exact), stiffness(exact, learner.rollout)]
+    if isinstance(problem.cost, PenaltyCost):
+        relaxation = find_relaxation(problem, report)
+        problem.cost.weight.fill_(relaxation.weight)
+        facts.append(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
     start = choose_start([learner], report)
     if start is None:
         return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from lyapnet.drawing import pixels
 from lyapnet.errors import DivergenceError
 from lyapnet.evaluation import figures
+from lyapnet.evaluation.path_figure import has_plane, paths
 from lyapnet.random_streams import FIGURES, stream
 from lyapnet.training.curves import with_loggers
 from lyapnet.training.learner import Learner
@@ -43,11 +44,12 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
     x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
     with torch.no_grad():
         sample = learner.rollout(x0)
-    return {
+    drawn = {
         "certified_region": figures.certified_region(learner.rollout, problem),
         "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),
     }
+    return {**drawn, "paths": paths(sample, problem)} if has_plane(problem) else drawn
 
 
 def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:

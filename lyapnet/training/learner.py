@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.cost import PenaltyCost
+from lyapnet.errors import UsageError
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, ProgramOutput
@@ -27,6 +29,9 @@ class Learner(nn.Module):
         pointwise: the program's condition off the closed loops, if that is a term too.
         seed: of the points at which that condition is asked for.
         label: tells it apart in messages and names of files; "" for the only one.
+
+    Raises:
+        UsageError: constraints without what keeps closed loops off them.
     """
 
     def __init__(
@@ -40,6 +45,11 @@ class Learner(nn.Module):
         label: str = "",
     ):
         super().__init__()
+        if problem.constraints is not None and not isinstance(problem.cost, PenaltyCost):
+            raise UsageError(
+                "Expected a relaxed problem for training with constraints, got the problem itself; pass "
+                "problem.relaxed(weight=…), w in cost per second, or train from a config, which finds w."
+            )
         self.problem, self.V, self.rollout = problem, V, rollout
         self.program, self.pointwise, self.seed, self.label = program, pointwise, seed, label
         self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
@@ -95,11 +105,12 @@ class Learner(nn.Module):
         """What the curves show of the last validation, by name; without what is not known."""
         assert self.validation is not None
         summary = self.validation.summary()
-        ratio = summary["cost_ratio"]
+        ratio, violated = summary["cost_ratio"], self.validation.violated
         scalars = {
             "constraint_loss/val": summary["constraint_loss"],
             "trajectory_cost/val": summary["cost_mean"],
             "optimality_gap/val": None if ratio is None else ratio - 1,
+            "violated_fraction/val": None if violated is None else float(violated.double().mean()),
             **{
                 f"{name}/val": summary[name]
                 for name in (

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from lyapnet import __version__
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.cost import PenaltyCost
 from lyapnet.errors import CheckpointError, CompilationError, DivergenceError, UsageError
 from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Problem
@@ -163,6 +164,17 @@ class TrainingModule(L.LightningModule):
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
 
+    @property
+    def penalty(self) -> PenaltyCost | None:
+        """What keeps closed loops off the constraints, where the problem has some."""
+        cost = self.members[0].problem.cost
+        return cost if isinstance(cost, PenaltyCost) else None
+
+    def _state(self) -> dict[str, Any]:
+        """What a checkpoint says of the training besides weights."""
+        state = {"version": __version__, "rate_share": self.rate_share}
+        return state if self.penalty is None else {**state, "penalty": float(self.penalty.weight)}
+
     @classmethod
     def load_from_checkpoint(cls, checkpoint_path: str | Path, *args: Any, **kwargs: Any) -> Any:
         """Lightning's, of a file whose digest holds and in which nothing is executed.
@@ -175,10 +187,15 @@ class TrainingModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Add what `lyapnet.load` needs, as plain data, and the share of the learning rate."""
-        checkpoint[KEY] = {**self.metadata, "version": __version__, "rate_share": self.rate_share}
+        checkpoint[KEY] = {**self.metadata, **self._state()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on no faster than the checkpoint's training did, and where this one had to go back, more slowly."""
+        """Go on no faster than the checkpoint's training did, and where this one had to go back, more slowly.
+
+        Constraints have the penalty that they had.
+        """
+        if self.penalty is not None:
+            self.penalty.weight.fill_(checkpoint.get(KEY, {}).get("penalty", 0.0))
         stored = checkpoint.get(KEY, {}).get("rate_share", 1.0)
         self.rate_share = min(self.rate_share, stored)
         for state in checkpoint.get("optimizer_states", []):
@@ -318,7 +335,7 @@ class EnsembleModule(TrainingModule):
 
     def save_member(self, member: Learner, path: Path) -> None:
         weights = {f"V.{name}": tensor for name, tensor in member.V.state_dict().items()}
-        kept = {**member.metadata, "version": __version__, "rate_share": self.rate_share}
+        kept = {**member.metadata, **self._state()}
         write_checkpoint({"state_dict": weights, "global_step": self.global_step, KEY: kept}, path)
 
     def compile_for(self, batch_size: int) -> None:

@@ -38,23 +38,26 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> 
     x0 = x0.double().cpu()[: _affordable(problem)]
     few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
-    optimum = optimal_trajectories(problem, few, _cheapest([path_under(exact, law, few) for law in laws]).u)
+    optimum = optimal_trajectories(problem, few, cheapest([path_under(exact, law, few) for law in laws]).u)
     optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR]))
     if len(others):
         columns = nearest(others, few).unbind(1)
-        u = _cheapest([_along(exact, optimum, column, others) for column in columns]).u
+        u = cheapest([_along(exact, optimum, column, others) for column in columns]).u
         optimum = _joined(optimum, optimal_trajectories(problem, others, u))
     return _followed(exact, optimum)
 
 
-def minima(optimum: Optimum) -> Optimum:
+def minima(problem: Problem, optimum: Optimum) -> Optimum:
     """Those with an expansion: where a trajectory that was not improved is no minimum, V_xx grows without bound.
+
+    With constraints V_xx is that of the penalty too, and hence larger where it is paid.
 
     Source: Bryson, Ho, Applied Optimal Control, 1975, § 6.3 (conjugate points).
     """
     curvature = optimum.expansion.hessian.abs().amax((0, -2, -1)).nan_to_num(torch.inf)
     finite = optimum.path.cost.isfinite() & curvature.isfinite()
-    kept = finite & (curvature <= WILD * curvature[finite].median()) if finite.any() else finite
+    wild = WILD if problem.constraints is None else WILD**3
+    kept = finite & (curvature <= wild * curvature[finite].median()) if finite.any() else finite
     path = Path(optimum.path.x[:, kept], optimum.path.u[:, kept], optimum.path.cost[kept])
     return Optimum(path, optimum.expansion.member(kept))
 
@@ -78,7 +81,7 @@ def _followed(exact: Problem, optimum: Optimum) -> Optimum:
     x0 = optimum.path.x[0]
     for _ in range(ROUNDS if len(x0) > 1 else 0):
         paths = [_along(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
-        best = _cheapest(paths)
+        best = cheapest(paths)
         improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()
         if not len(improved):
             break
@@ -91,7 +94,7 @@ def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
     return path_under(exact, greedy_law(exact, optimum.expansion.member(which)), x0)
 
 
-def _cheapest(paths: Sequence[Path]) -> Path:
+def cheapest(paths: Sequence[Path]) -> Path:
     """Of each state, that of several trajectories which costs least."""
     x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
     best, each = cost.argmin(0), torch.arange(cost.shape[1])

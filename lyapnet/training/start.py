@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.expansions import (
+    TRIES,
     Expansion,
     at_rest,
     greedy_law,
@@ -29,7 +30,7 @@ from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
-CLOSE, FEW = 1e-5, 16  # share of the cost by which no step may improve on a law that leaves nothing to fit, from FEW
+CLOSE, FEW = 1e-5, 16  # share of the cost by which nothing may improve on a law that leaves nothing to fit, from FEW
 CALM = "V = 0"
 
 Report = Callable[[str], None]
@@ -110,10 +111,13 @@ def has_place_for_start(learners: Sequence[Learner]) -> bool:
 
 
 def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:
-    """Whether a step of differential dynamic programming gains on the law of an expansion, from any of some states."""
+    """Whether differential dynamic programming gains on the law of an expansion, from any of some states.
+
+    Of all its damping one step at least has to be tried.
+    """
     x0 = x0.double().cpu()
     path = path_under(in_float64(problem), greedy_law(in_float64(problem), expansion), x0)
-    better = optimal_trajectories(problem, x0, path.u, iterations=1).path.cost
+    better = optimal_trajectories(problem, x0, path.u, iterations=TRIES + 1).path.cost
     return not bool((path.cost - better <= CLOSE * better.abs()).all())
 
 
@@ -132,7 +136,7 @@ def _fitted(
     problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"optima from {OPTIMA} states of X₀")
     states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
-    optimum = minima(optima_for(problem, expansions, states))
+    optimum = minima(problem, optima_for(problem, expansions, states))
     found = len(optimum.path.cost)
     if not found:
         return []

@@ -120,6 +120,7 @@ def test_one_state_is_drawn_over_time():
 
 def sampled(held, states=None, limits=None):
     held = torch.tensor(held)
+    held = torch.cat([held, *([torch.ones_like(held[:, :1])] * (held.shape[1] < 4))], -1)
     held = torch.cat([held, held.all(-1, keepdim=True)], -1)
     states = cube(1.0, 2).sample(len(held), torch.Generator().manual_seed(0)) if states is None else states
     return SampledClaim(states, held, limits or Tolerances(0.1, 1e-2, 0.05))
@@ -141,6 +142,12 @@ def test_each_state_is_drawn_once_and_as_what_became_of_it():
     assert shown.keys() == {"success: 2", "‖x(T)‖ > 0.1: 1", "V does not fall: 1", "J > 1.05 V(0, x₀): 1"}
     for name, rows in (("success: 2", [0, 4]), ("‖x(T)‖ > 0.1: 1", [1]), ("V does not fall: 1", [2])):
         assert torch.equal(shown[name], one.states[rows])
+
+
+def test_a_violation_is_drawn_as_one():
+    one = sampled([[True] * 3 + [False], [False] * 4, [True] * 4])
+    shown = points(draw(sampled_states(one, cube(1.0, 2), LABELS, "")))
+    assert {name: len(states) for name, states in shown.items()} == {"success: 1": 1, "violates a constraint: 2": 2}
 
 
 def controller():

@@ -120,7 +120,7 @@ def claimed(cls, claim, seed=3):
 
 
 def sampled_claim(successes, limits, cls=SampledClaim, samples=100, **more):
-    held = (torch.arange(samples) < successes)[:, None].expand(samples, 4)
+    held = (torch.arange(samples) < successes)[:, None].expand(samples, 5)
     return cls(torch.zeros(samples, 2), held, limits, **more)
 
 

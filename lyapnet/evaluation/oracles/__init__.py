@@ -32,8 +32,8 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
 
     With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear`, R
-    a matrix and U = ℝᵐ, else by direct transcription, within the limits of U. With any other integrator it is that of
-    the continuous task, by the Riccati equation alone.
+    a matrix, U = ℝᵐ and nothing constrained, else by direct transcription, within the limits of U and h(x) ≤ 0. With
+    any other integrator it is that of the continuous task, by the Riccati equation alone.
 
     Raises:
         OracleError: there is none; says why, and what to do.
@@ -45,13 +45,14 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
             f"{type(problem.controls).__name__}; costs stand alone."
         )
     system, cost, horizon = problem.system, problem.cost, problem.horizon
-    if not problem.controls.limited and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
+    free = problem.constraints is None and not problem.controls.limited
+    if free and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         return RiccatiOracle(solve(system, cost, horizon))
     if method != "euler":
         raise OracleError(
-            f"Expected rollout.method=euler for the optimum of a nonlinear or limited task, got {method}; the "
-            "transcription has Euler's steps."
+            "Expected rollout.method=euler for the optimum of a nonlinear, limited or constrained task, got "
+            f"{method}; the transcription has Euler's steps."
         )
     if importlib.util.find_spec("casadi") is None:
         raise OracleError(

@@ -21,16 +21,18 @@ from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
+VIOLATED = 1e-6  # h that is still taken for zero
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
 
 
 class Transcription(Oracle):
-    """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu).
+    """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu)
+    and h(x_n) ≤ 0 for n ≥ 1.
 
     The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
     the goal, random curves, the controls that the caller knows, and the optima of its neighbours in the batch. The
     least cost counts, as a rollout of its controls in torch has it, and is kept on disk. What no start leads to, or
-    the rollout does not confirm, is NaN.
+    the rollout does not confirm, is NaN. Controls that violate a constraint are none to compare with.
 
     Args:
         problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
@@ -47,21 +49,31 @@ class Transcription(Oracle):
         self.problem = copied(problem)
         system, horizon = self.problem.system, self.problem.horizon
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
-        graphs = traced(self.step, (x, u)), traced(self.end, (x,))
+        graphs = [traced(self.step, (x, u)), traced(self.end, (x,))]
         step, end = symbolic(graphs[0], (x, u)), symbolic(graphs[1], (x,))
         require_equal(step, self.step, (x, u))
         require_equal(end, self.end, (x,))
+        inside = None
+        if self.problem.constraints is not None:
+            graphs.append(traced(self.inside, (x,)))
+            inside = symbolic(graphs[2], (x,))
+            require_equal(inside, self.inside, (x,))
         self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
         limits = self.problem.controls.limits
-        self._solver = _solver(step, end, horizon.steps, iterations, self.problem.controls.limited)
-        self._riccati = riccati(self.problem) if self.problem.controls.limited else None
+        bounded = self.problem.controls.limited or inside is not None
+        self._solver = _solver(step, end, inside, horizon.steps, iterations, bounded)
+        self._riccati = riccati(self.problem) if bounded else None
         assert limits is not None  # oracle_of asks before
         free = np.full(system.n * horizon.steps, np.inf)
         self._bounds = [
             np.concatenate([np.tile(side.expand(system.m).numpy(), horizon.steps), sign * free])
             for side, sign in zip(limits, (-1, 1), strict=True)
         ]
+        # the defects of the steps vanish, and h ≤ 0
+        more = 0 if inside is None else horizon.steps * inside.size1_out(0)
+        defects = np.zeros(system.n * horizon.steps)
+        self._held = [np.concatenate([defects, np.full(more, side)]) for side in (-np.inf, 0.0)]
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
@@ -71,6 +83,11 @@ class Transcription(Oracle):
     def end(self, x: State) -> tuple[PerState]:
         """(φ(x_N),)."""
         return (self.problem.cost.terminal(x),)
+
+    def inside(self, x: State) -> tuple[Tensor]:
+        """(h(x_n),)."""
+        assert self.problem.constraints is not None
+        return (self.problem.constraints(x),)
 
     def rollout(self, x0: State, u: ControlPath) -> tuple[StatePath, PerState]:
         """(x, J_N) under given controls, by the torch system."""
@@ -98,15 +115,19 @@ class Transcription(Oracle):
         return Optima(optima.cost.to(x0), optima.reasons, None if optima.u is None else optima.u.to(x0))
 
     def _replayed(self, states: Tensor, controls: Sequence[Tensor | None]) -> list[Candidate | None]:
-        """The trajectories of the controls that there are, and that keep the state finite."""
+        """The trajectories of the controls that there are, and that keep the state finite and within constraints."""
         candidates: list[Candidate | None] = [None] * len(states)
         some = [i for i, u in enumerate(controls) if u is not None]
         if some:
             u = torch.stack([controls[i] for i in some], 1)  # pyright: ignore[reportArgumentType]
             with torch.no_grad():
                 x, J = self.rollout(states[some], u)
-            for i, path, control, cost in zip(some, x.unbind(1), u.unbind(1), J.tolist(), strict=True):
-                if math.isfinite(cost) and torch.isfinite(path).all():
+                admitted = torch.isfinite(x).all(-1).all(0) & J.isfinite()
+                if self.problem.constraints is not None:
+                    admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= VIOLATED
+            columns = (x.unbind(1), u.unbind(1), J.tolist(), admitted.tolist())
+            for i, path, control, cost, good in zip(some, *columns, strict=True):
+                if good:
                     candidates[i] = Candidate(path[1:].numpy(), control.numpy(), cost)
         return candidates
 
@@ -154,7 +175,8 @@ class Transcription(Oracle):
         lower, upper = self._bounds
         guess = np.concatenate([start.u.ravel(), start.x.ravel()])
         scale = self._scale(torch.from_numpy(x0))
-        result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=0, ubg=0)
+        least, greatest = self._held
+        result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=least, ubg=greatest)
         status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()
@@ -195,7 +217,14 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
     return ""
 
 
-def _solver(step: casadi.Function, end: casadi.Function, steps: int, iterations: int, limited: bool) -> casadi.Function:
+def _solver(
+    step: casadi.Function,
+    end: casadi.Function,
+    inside: casadi.Function | None,
+    steps: int,
+    iterations: int,
+    limited: bool,
+) -> casadi.Function:
     """IPOPT for the transcribed task, with exact sparse derivatives.
 
     Variables are (u, x), parameters x₀ and what J is divided by.
@@ -205,7 +234,9 @@ def _solver(step: casadi.Function, end: casadi.Function, steps: int, iterations:
     following, step_cost = step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
     J = casadi.sum2(step_cost) + end(x[:, -1])
     variables, scale = casadi.veccat(u, x), casadi.MX.sym("scale")
-    problem = {"x": variables, "p": casadi.vertcat(x0, scale), "f": J / scale, "g": casadi.vec(following - x)}
+    zero = casadi.vec(following - x)
+    held = zero if inside is None else casadi.veccat(zero, inside.map(steps)(x))
+    problem = {"x": variables, "p": casadi.vertcat(x0, scale), "f": J / scale, "g": held}
     # within the limits themselves, and with a barrier of which nothing is seen in J
     exact = {"ipopt.bound_relax_factor": 0.0, "ipopt.tol": 1e-10} if limited else {}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}

@@ -1,0 +1,84 @@
+"""From a config to its state constraints."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from lyapnet.build.classes import instance_of, section
+from lyapnet.build.entries import index_of
+from lyapnet.config import ConstraintsConfig
+from lyapnet.constraints import CONSTRAINTS, AllOf, Ball, Constraints, OfFirstStates, StateLimits
+from lyapnet.errors import UsageError
+from lyapnet.family import FamilySystem
+from lyapnet.problem import Problem
+from lyapnet.systems import ControlAffineSystem
+
+
+def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constraints | None) -> Constraints | None:
+    """The constraints of a config in a problem that has none yet, those that it lists first; None for none at all.
+
+    Args:
+        own: the user's, in the place of those that the config names.
+
+    Raises:
+        UsageError: an entry does not fit the system.
+    """
+    system = problem.system
+    with section("constraints"):
+        parts: list[Constraints] = [*_limits(config, problem), *_balls(config, system)]
+        if own is None and config.name not in CONSTRAINTS:
+            own = instance_of(config, "constraints")
+        if own is not None:
+            own = own.double()
+            parts.append(OfFirstStates(own, system.system.n) if isinstance(system, FamilySystem) else own)
+        if not parts:
+            return None
+        constraints = parts[0] if len(parts) == 1 else AllOf(parts)
+        constraints.margin = config.margin
+        return constraints
+
+
+def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:
+    """The limits of states as one part, if there are some; what counts as 1 is how far they are from the goal.
+
+    For a limit that the goal is at, it is how far X₀ reaches from it.
+    """
+    system, goal, columns = problem.system, problem.goal, []
+    reach = problem.initial_states.reach_from(goal)
+    for key, side, given in (("lower", -1.0, config.lower), ("upper", 1.0, config.upper)):
+        for name, limit in given.items():
+            i = index_of(name, f"constraints.{key}", system)
+            far = abs(limit - float(goal[i])) or float(reach[i]) or 1.0
+            sign, unit = "≤" if side > 0 else "≥", system.state_units[i]
+            columns.append((i, limit, side, far, f"{name} {sign} {limit:g} {unit}".strip()))
+    return [StateLimits(*zip(*columns, strict=True))] if columns else []
+
+
+def _balls(config: ConstraintsConfig, system: ControlAffineSystem) -> list[Constraints]:
+    balls: list[Constraints] = []
+    for key in ("outside", "inside"):
+        for k, given in enumerate(getattr(config, key)):
+            center, radius = ball_of(given, f"constraints.{key}", {"center", "radius"}, system)
+            states = [index_of(name, f"constraints.{key}[{k}].center", system) for name in center]
+            where = ", ".join(f"{name} = {value:g}" for name, value in center.items())
+            balls.append(Ball(states, [*center.values()], radius, key == "inside", f"{key} {radius:g} around {where}"))
+    return balls
+
+
+def ball_of(
+    given: Mapping[str, Any], key: str, keys: set[str], system: ControlAffineSystem
+) -> tuple[dict[str, float], float]:
+    """The centre, by names of states, and the radius of an entry that has these keys, all of whose others are numbers.
+
+    Raises:
+        UsageError: it is another one; says how it should be.
+    """
+    center = given.get("center")
+    numbers = [*center.values()] if isinstance(center, Mapping) else []
+    others = [given.get(name) for name in sorted(keys - {"center"})]
+    admitted = all(type(number) in (int, float) for number in [*others, *numbers])
+    if given.keys() != keys or not numbers or not admitted:
+        shown = "".join(f", {name}: {value}" for name, value in {"radius": 0.3, "weight": 9}.items() if name in keys)
+        raise UsageError(
+            f"Expected {key}, each as {{center: {{{system.state_names[0]}: 1}}{shown}}}, got {given}; give all of them."
+        )
+    return {str(name): float(value) for name, value in (center or {}).items()}, float(given["radius"])

@@ -1,0 +1,102 @@
+"""Where closed loops could violate a constraint: the level of V below which none does, and closed loops that do."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.calculus import gradients
+from lyapnet.certification.boxes import corners
+from lyapnet.certification.branch_and_bound import Budget, minimum
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.errors import DivergenceError, UsageError
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
+from lyapnet.problem import Horizon, Problem
+from lyapnet.rollout import Rollout
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.types import Corner, PerState, State, Time
+
+SHELL = 1e-2  # 0 ≤ h ≤ SHELL, in which h = 0 is looked for
+LOOPS, FINER, SURE = (
+    1000,
+    4,
+    1e-6,
+)  # closed loops, steps in each Δt, and h that is taken for more than an error of theirs
+
+
+class Violation(NamedTuple):
+    """A state of X₀ whose closed loop violates a constraint, as Runge-Kutta steps have it."""
+
+    x0: list[float]
+    t: float
+    constraint: str
+    h: float
+
+
+def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], budget: Budget, enough: float) -> float:
+    """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ where that is empty.
+
+    A closed loop that starts with h ≤ 0 and keeps W below it keeps h ≤ 0: if some h_j became positive along it, then
+    h_j = 0 and ḣ_j ≥ 0 at the last time before at which h_j = 0.
+
+    Args:
+        enough: a level beyond which nothing is asked.
+
+    Raises:
+        UsageError: h has kinks or jumps, where it has no gradient.
+
+    Source: Blanchini, "Set invariance in control", Automatica 1999 (Nagumo's theorem).
+    """
+    constraints = condition.constraints
+    if constraints is None:
+        return float("inf")
+    own = BoundedFunction(lambda t, x: (constraints(x),), domain)
+    if unsmooth := own.operators & {*KINKS, *JUMPS, *CHOICES}:
+        raise UsageError(
+            f"Expected smooth constraints, got {' and '.join(sorted(map(str, unsmooth)))}; write a maximum as several "
+            "components."
+        )
+    loop, (lower, upper) = condition.closed_loop, (side[None] for side in domain)
+
+    def crossing(j: int, t: Time, x: State) -> PerState:
+        """At most 0 where 0 ≤ h_j ≤ SHELL and ḣ_j ≥ 0."""
+
+        def h(t: Time, x: State) -> Tensor:
+            return (own.graph(t, x)[0] if x.ndim == 1 else constraints(x))[..., j]
+
+        rate = (gradients(h, t, x)[1] * loop.system.dynamics(x, loop.policy(t, x))).sum(-1)
+        outside = (h(t, x) - SHELL / 2).abs() - (1 + 1e-6) * SHELL / 2
+        return torch.maximum(outside, -rate)
+
+    levels = [
+        minimum(condition.height, lower, upper, budget, lambda t, x, j=j: crossing(j, t, x), 0.0, enough)
+        for j in range(len(constraints.names))
+    ]
+    return min(levels)
+
+
+def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.Generator | None) -> Violation | None:
+    """The worst violation of a constraint among closed loops from corners and samples of X₀, if there is one."""
+    constraints, horizon = problem.constraints, problem.horizon
+    if constraints is None:
+        return None
+    x0 = torch.cat([corners(problem.initial_states), problem.initial_states.sample(LOOPS, generator)])
+    finer = problem.replaced(horizon=Horizon(FINER * horizon.steps, horizon.dt / FINER))
+    try:
+        with torch.no_grad():
+            trajectory = Rollout(finer, closed_loop.policy, "rk4", "backprop")(x0)
+    except DivergenceError:
+        return None
+    h = constraints(trajectory.x)
+    worst = int(h.argmax())
+    node, i, j = _unravelled(worst, h.shape)
+    if float(h[node, i, j]) <= SURE:
+        return None
+    return Violation(x0[i].tolist(), float(trajectory.t[node]), constraints.names[j], float(h[node, i, j]))
+
+
+def _unravelled(index: int, shape: Sequence[int]) -> tuple[int, int, int]:
+    _, b, k = shape
+    return index // (b * k), index // k % b, index % k

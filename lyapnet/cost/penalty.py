@@ -1,0 +1,39 @@
+"""The price of coming close to what constraints exclude, which training pays in their place."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.cost.base import Cost
+from lyapnet.cost.made_of_another import MadeOfAnother
+from lyapnet.types import PerState, State
+
+
+class PenaltyCost(MadeOfAnother):
+    """Another cost, and w Σ_j max(0, 1 + h_j(x)/m)³ per second, for constraints h(x) ≤ 0: w at h = 0, zero from −m on.
+
+    It is twice continuously differentiable, as the value function then is. With w large enough for the task the
+    optimum keeps within h ≤ 0, at less cost than if h ≤ −m were asked for.
+
+    Args:
+        cost: what is paid besides.
+        constraints: h, x ↦ (*batch, k).
+        margin: m, in the unit of h.
+        weight: w.
+
+    Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalties), with the constraint moved by m.
+    """
+
+    weight: Float[Tensor, ""]  # w, in cost per second
+
+    def __init__(self, cost: Cost, constraints: nn.Module, margin: float, weight: float = 0.0):
+        super().__init__(cost)
+        self.constraints, self.margin = constraints, margin
+        self.register_buffer("weight", torch.tensor(float(weight)), persistent=False)
+
+    def state(self, x: State) -> PerState:
+        close = torch.relu(1 + self.constraints(x) / self.margin)
+        return self.cost.state(x) + self.weight * (close**3).sum(-1)
+
+    def ignores(self, i: int, n: int) -> bool:
+        return self.cost.ignores(i, n) and bool(self.constraints.ignores(i, n))  # pyright: ignore[reportCallIssue]

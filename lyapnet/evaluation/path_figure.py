@@ -1,0 +1,73 @@
+"""Closed loops drawn in a plane of two states, around what they have to stay out of."""
+
+from collections.abc import Iterator
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from lyapnet.constraints import Ball, parts_of
+from lyapnet.cost import Cost, MadeOfAnother, ObstacleCost
+from lyapnet.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.problem import Problem
+from lyapnet.rollout import Trajectory
+
+
+def has_plane(problem: Problem) -> bool:
+    """Whether there is a disk, of a constraint or of the cost, in a plane of two states."""
+    return _plane(problem) is not None
+
+
+def paths(trajectory: Trajectory, problem: Problem) -> Figure:
+    """The closed loops (b,) of a batch in the plane of the first disk that a constraint or the cost has.
+
+    Disks that must not be entered, or left, are filled; those of the cost, whose weight at the edge is a seventh of the
+    centre's, are dotted.
+    """
+    plane = _plane(problem)
+    assert plane is not None
+    i, j = plane
+    figure = Figure(figsize=(5.6, 4.8), layout="constrained")
+    panel = figure.subplots()
+    _draw_disks(panel, problem, plane)
+    x = numpy_of(trajectory.x)
+    for k, path in enumerate(x.swapaxes(0, 1)):
+        panel.plot(path[:, i], path[:, j], color=BLUE, linewidth=0.9, label=None if k else "closed loop")
+    panel.plot(x[0, :, i], x[0, :, j], "o", color=BLUE, markersize=3)
+    panel.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10, label="goal", linestyle="none")
+    low, size = (side[[i, j]].tolist() for side in (problem.initial_states.lower, problem.initial_states.widths))
+    panel.add_patch(Rectangle((low[0], low[1]), *size, fill=False, edgecolor="black", linewidth=0.8, label="X₀"))
+    panel.set_xlabel(problem.system.state_labels[i])
+    panel.set_ylabel(problem.system.state_labels[j])
+    panel.set_aspect("equal", adjustable="datalim")
+    legend_below(figure, panel, columns=5)
+    return figure
+
+
+def _draw_disks(panel: Axes, problem: Problem, plane: tuple[int, int]) -> None:
+    styles = {
+        "outside": {"facecolor": ORANGE, "alpha": 0.45, "edgecolor": "black", "label": "not to be entered"},
+        "inside": {"fill": False, "edgecolor": "black", "linestyle": "--", "label": "not to be left"},
+        "cost": {"fill": False, "edgecolor": GREY, "linestyle": ":", "label": "obstacle of the cost"},
+    }
+    for kind, states, center, radius in _disks(problem):
+        if states == plane:
+            panel.add_patch(Circle((center[0], center[1]), radius, **styles[kind]))
+            styles[kind].pop("label", None)  # one entry of the legend
+
+
+def _plane(problem: Problem) -> tuple[int, int] | None:
+    planes = [states for _, states, _, _ in _disks(problem) if len(states) == 2]
+    return planes[0] if planes else None
+
+
+def _disks(problem: Problem) -> Iterator[tuple[str, tuple[int, ...], list[float], float]]:
+    """(kind, states, centre, radius) of the balls of the constraints and of the cost."""
+    for part in parts_of(problem.constraints):
+        if isinstance(part, Ball):
+            yield "outside" if part.side > 0 else "inside", (*part.states.tolist(),), part.center.tolist(), part.radius
+    cost: Cost = problem.cost
+    while isinstance(cost, MadeOfAnother):
+        if isinstance(cost, ObstacleCost):
+            yield "cost", (*cost.states.tolist(),), cost.centre.tolist(), cost.radius
+        cost = cost.cost

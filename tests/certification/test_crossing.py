@@ -1,0 +1,150 @@
+"""Where closed loops may violate constraints: against closed forms, and closed loops that do."""
+
+import pytest
+import torch
+
+from lyapnet.certification import Budget, DecreaseCondition, sound_claim
+from lyapnet.certification.crossing import crossing_level, find_violation
+from lyapnet.certification.sound_certificate import SoundCertificate
+from lyapnet.constraints import Ball, Constraints, StateLimits
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from lyapnet.sets import Box
+from lyapnet.systems import DoubleIntegrator
+from tests.certification.planted import cost, domain, loop, problem, riccati, stationary
+from tests.problems import Formula, hjb_loop
+
+ENOUGH = 1e6  # far above what is asked for here
+
+
+def position(limit, side=1.0):
+    return StateLimits([0], [side * limit], [side], [1.0], [f"position within {limit}"])
+
+
+def speed(limit):
+    return StateLimits([1], [limit], [1.0], [1.0], ["speed"])
+
+
+def level(constraints, delta=0.0, enough=ENOUGH):
+    condition = DecreaseCondition(loop(riccati()), 0.9, delta, constraints)
+    return crossing_level(condition, domain(), Budget(5), enough)
+
+
+def test_the_level_of_a_limit_of_the_position():
+    """h = x − b crosses with v ≥ 0, where xᵀPx is least at v = 0: P₁₁b²; beyond the shell it only grows."""
+    P, b = torch.as_tensor(riccati()), 1.2
+    expected = float(P[0, 0]) * b**2
+    assert expected * (1 - 5e-3) <= level(position(b)) <= expected
+    assert expected * (1 - 5e-3) <= level(position(b, side=-1.0)) <= expected
+    assert level(position(0.9)) < 0.6 * expected
+    assert level(position(b), delta=0.5) == pytest.approx(expected - 0.5 * 2.0, rel=5e-3), "W = V − δt, at T"
+
+
+def test_the_level_of_a_limit_of_the_speed():
+    """h = v − b crosses with u = −(p₁₂x + p₂₂v) ≥ 0, so that x ≤ −p₂₂b/p₁₂: xᵀPx is least at its end or minimum."""
+    P, b = torch.as_tensor(riccati()), 0.3
+    p11, p12, p22 = P[0, 0], P[0, 1], P[1, 1]
+    x = torch.minimum(-p22 * b / p12, -p12 * b / p11)
+    expected = float(p11 * x**2 + 2 * p12 * x * b + p22 * b**2)
+    assert expected * (1 - 3e-2) <= level(speed(b)) <= expected * (1 + 1e-9)
+
+
+def test_what_no_closed_loop_reaches_has_no_level():
+    outside = Ball([0, 1], [0.0, 9.0], 0.5, inside=False)
+    assert level(outside) == float("inf"), "the ball lies beyond D"
+    assert level(position(1.2), enough=1.0) >= 1.0, "no more is asked for"
+
+
+class Bent(Constraints):
+    """|x| ≤ 1: not smooth."""
+
+    names = ("bent",)
+
+    def forward(self, x):
+        return x[..., :1].abs() - 1
+
+
+class Lying(Constraints):
+    """x ≤ 1.2 with a gradient that is not its own."""
+
+    names = ("lying",)
+
+    def forward(self, x):
+        return _Backwards.apply(x)
+
+
+class _Backwards(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x):
+        return x[..., :1] - 1.2
+
+    @staticmethod
+    def backward(ctx, gradient):
+        return torch.cat([-gradient, torch.zeros_like(gradient)], -1)
+
+
+def test_constraints_have_gradients_and_these_are_their_own():
+    with pytest.raises(UsageError, match=r"smooth constraints, got aten.abs.default; write a maximum as several"):
+        level(Bent())
+    P = torch.as_tensor(riccati())
+    as_it_says = 1.2**2 * float(P[0, 0] - P[0, 1] ** 2 / P[1, 1])  # the least xᵀPx with x = b and v ≤ 0
+    assert as_it_says < 0.6 * level(Lying()) < 0.6 * float(P[0, 0]) * 1.2**2
+
+
+def claim(constraints, **options):
+    task = problem().replaced(constraints=constraints)
+    return sound_claim(loop(riccati()), task, **{"alpha": 0.9, "delta": 0.02, "budget": Budget(20), **options})
+
+
+def certificate(constraints):
+    task = problem().replaced(constraints=constraints)
+    closed_loop = loop(riccati())
+    return SoundCertificate(Controller(task, closed_loop.V), claim(constraints), {"seconds": 30.0})
+
+
+def test_a_safe_set_is_proved_and_another_falsified():
+    """From the corner of X₀ the position rises to 1.06 m; the funnel that X₀ needs reaches 1.31 m."""
+    safe, unsafe, between = claim(position(1.35)), claim(position(1.03)), claim(position(1.2))
+    assert safe.verdict == "certified"
+    assert safe.violation is None
+    assert safe.constraints == ("position within 1.35",)
+    assert safe.crossing > safe.wanted
+    assert unsafe.verdict == "falsified"
+    assert unsafe.violation.constraint == "position within 1.03"
+    assert unsafe.violation.h > 0
+    assert between.verdict == "unknown", "no closed loop violates it, but the level of V does not tell"
+    assert between.rho <= between.crossing < between.wanted
+    assert "may cross a constraint" in between.reason
+    assert 0 < between.volume_share < 1
+
+
+def test_a_violation_is_one():
+    task = problem().replaced(constraints=position(1.03))
+    found = find_violation(loop(riccati()), task, torch.Generator().manual_seed(0))
+    x0 = torch.tensor(found.x0)
+    assert task.initial_states.contains(x0)
+    A = torch.tensor([[0.0, 1.0], [0.0, 0.0]]) - torch.tensor([[0.0], [1.0]]) @ torch.as_tensor(riccati())[1:]
+    x = torch.matrix_exp(A * found.t) @ x0
+    assert float(x[0] - 1.03) == pytest.approx(found.h, rel=1e-4)
+    assert find_violation(loop(riccati()), problem().replaced(constraints=position(1.35)), None) is None
+
+
+def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
+    """V rises on one side of a bump at a speed that no closed loop reaches from below, within the level of X₀."""
+    quadratic, place = stationary(riccati()), torch.tensor([-0.2, 0.72])
+    bumped = Formula(lambda t, x: quadratic(t, x) + 0.05 * torch.exp(-1500 * ((x - place) ** 2).sum(-1)))
+    closed_loop = hjb_loop(DoubleIntegrator(), cost(), bumped)
+    task, box = problem().replaced(initial_states=Box([-0.25, -0.25], [0.25, 0.25])), Box([-0.8, -1.2], [0.8, 1.2])
+    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(20)).verdict == "falsified"
+    slow = task.replaced(constraints=speed(0.65))
+    assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(20)).verdict == "certified"
+
+
+def test_the_report_says_what_is_kept():
+    proved, failed = certificate(position(1.35)), certificate(position(1.03))
+    assert "or violates a constraint (position within 1.35), up to T = 2 s" in proved.in_words()
+    assert "h(x(t)) ≤ 0" in proved.in_formulas()[1]
+    assert "h(x₀) ≤ 0" in proved.in_formulas()[1]
+    assert proved.numbers()["constraints"] == ["position within 1.35"]
+    assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.of_the_verdict()
+    assert failed.numbers()["violation"]["constraint"] == "position within 1.03"

@@ -9,6 +9,7 @@ from torch.testing import assert_close
 import lyapnet
 from lyapnet.build import Parts, build_problem
 from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.comparison.reference_problems import bounded_problem
 from lyapnet.config import config_from_plain, load_config
 from lyapnet.constraints import AllOf, Ball, Constraints, OfFirstStates, StateLimits, parts_of
 from lyapnet.cost import PenaltyCost
@@ -254,6 +255,11 @@ def test_a_lightning_module_wants_the_relaxed_problem():
     with pytest.raises(UsageError, match=r"pass problem.relaxed\(weight=…\)"):
         ValueModule(problem, V, lyapnet.ValueProgram())
     assert ValueModule(problem.relaxed(0.5), V, lyapnet.ValueProgram()).penalty is not None
+
+
+def test_an_environment_refuses_what_its_reward_does_not_know():
+    with pytest.raises(UsageError, match="without state constraints for an environment"):
+        bounded_problem(problem_of(constrained(**SPEED)), 5.0)
 
 
 def test_paths_around_a_disk():

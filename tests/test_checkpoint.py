@@ -189,6 +189,19 @@ def test_flipped_bits_are_never_used_in_silence(digest, trained, tmp_path):
         assert torch.load(bad, weights_only=True).keys() >= trained.keys(), "the twin: torch itself takes it"
 
 
+def test_an_entry_that_says_it_is_a_folder_is_refused(trained, tmp_path):
+    """Without a digest: torch would read what was in memory for its tensor. The checksums hold."""
+    good, bad = tmp_path / "good.ckpt", tmp_path / "bad.ckpt"
+    torch.save(trained, good)
+    whole = bytearray(good.read_bytes())
+    entry = whole.rindex(b"PK\x01\x02", 0, whole.rindex(b"/data/3"))
+    whole[entry + 38] = 0x10
+    bad.write_bytes(whole)
+    assert zipfile.ZipFile(bad).testzip() is None
+    assert used(good, good) == (True, True)
+    assert used(bad, good) == (False, False)
+
+
 CHANGES = {
     "a weight": lambda c: c["state_dict"][next(iter(c["state_dict"]))].view(-1)[0].add_(1e-15),
     "a sign of zero": lambda c: c["optimizer_states"][0]["param_groups"][0].update(weight_decay=-0.0),

@@ -27,7 +27,7 @@ from lyapnet.training import pretraining, start
 from lyapnet.training.optima import minima
 from lyapnet.training.start import take
 from tests.configs import objects
-from tests.problems import CONF
+from tests.problems import CONF, problem_of
 
 MASSES = {
     "experiment": "masses",
@@ -382,8 +382,9 @@ def test_optima_that_are_no_minimum_are_left_out():
     x, cost = torch.arange(b).double()[None, :, None].expand(N + 1, b, n), torch.ones(b)
     cost[5] = math.inf
     optimum = Optimum(Path(x, torch.zeros(N, b, 1), cost), Expansion(x, torch.zeros(N + 1, b), x, H))
-    kept = minima(optimum)
+    problem = problem_of(SYSTEMS["double_integrator"]())
+    kept = minima(problem, optimum)
     assert kept.path.x[0, :, 0].tolist() == [0, 3, 4]
     assert kept.expansion.hessian.shape == (N + 1, 3, n, n)
     nothing = Optimum(optimum.path._replace(cost=torch.full((b,), math.inf)), optimum.expansion)
-    assert minima(nothing).path.x.shape[1] == 0
+    assert minima(problem, nothing).path.x.shape[1] == 0

@@ -155,6 +155,8 @@ class Problem(nn.Module):
         if self.constraints is None:
             return
         constraints, name = self.constraints, type(self.constraints).__name__
+        if not constraints.names:
+            raise UsageError(f"Expected {name}.names with a name for each component of h(x), got none; declare them.")
         check_function(f"h(x) of {name}", constraints, [x[:TRIED]], (len(constraints.names),))
         h = constraints(x)
         outside = (h > 0).any(-1)

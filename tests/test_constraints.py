@@ -1,5 +1,6 @@
 """State constraints: against formulas and closed forms; through optimum, training, evaluation and checkpoints."""
 
+import dataclasses
 import math
 
 import pytest
@@ -15,6 +16,7 @@ from lyapnet.constraints import AllOf, Ball, Constraints, OfFirstStates, StateLi
 from lyapnet.cost import PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation import evaluate
+from lyapnet.evaluation.measurement import evaluation
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.evaluation.path_figure import has_plane, paths
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati
@@ -229,6 +231,20 @@ def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     assert lyapnet.load(run.best, constraints=Tube()).problem.constraints.names == ("tube",)
     by_hand = problem_of(INTEGRATOR, parts=Parts(constraints=Tube(3.0)))
     assert by_hand.constraints.reach == 3.0
+
+
+def test_no_number_is_a_violation(run):
+    table = evaluation(lyapnet.load(run.best), 8, optimum=False).table
+    broken = dataclasses.replace(table, worst=torch.where(torch.arange(8)[:, None] < 2, torch.nan, -1.0))
+    assert broken.violated.sum() == 2
+    assert broken.violations(["one"])["one"]["violated"] == 0.25
+
+
+def test_constraints_have_names():
+    tube = Tube()
+    tube.names = ()
+    with pytest.raises(UsageError, match=r"Tube.names with a name for each component"):
+        problem_of(INTEGRATOR, parts=Parts(constraints=tube))
 
 
 def test_another_constraint_is_noticed():

@@ -15,6 +15,7 @@ from lyapnet.certification.funnel import sound_claim
 from lyapnet.certification.kept_proofs import KeptProof, about, read_content, refusing
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.sound_certificate import SoundCertificate
+from lyapnet.contracts import copied
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.files import plain
@@ -65,7 +66,8 @@ def _require_claim(controller: Controller, path: Path, alpha: float, delta: floa
     Raises:
         UsageError: it is one; or as bounded_condition.
     """
-    condition = DecreaseCondition(copy.deepcopy(controller.closed_loop).double().requires_grad_(False), alpha, delta)
+    loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
+    condition = DecreaseCondition(loop, alpha, delta, problem.constraints)
     times = torch.tensor([[0.0], [controller.horizon.duration]], dtype=torch.float64)
     lower, upper = torch.cat([times[0], states.lower]), torch.cat([times[1], states.upper])
     if states.dimension == controller.system.n:  # sound_claim says so else

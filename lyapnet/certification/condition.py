@@ -75,9 +75,27 @@ class OwnOperations(ValueFunction):
         return super().value_and_state_gradient(t, x) if own else self.declared.value_and_state_gradient(t, x)
 
 
+class OwnConstraints(Constraints):
+    """Constraints as the torch operations that they run at one x, traced once; on batches, the declared ones."""
+
+    def __init__(self, constraints: Constraints, domain: tuple[Corner, Corner]):
+        super().__init__()
+        traced = BoundedFunction(lambda t, x: (constraints(x),), domain)
+        self.declared, self.graph, self.operators = constraints, traced.graph, traced.operators
+        self.names = constraints.names
+
+    def forward(self, x: State) -> Tensor:
+        return self.graph(x.new_zeros(()), x)[0] if x.ndim == 1 else self.declared(x)
+
+
 def own_operations(V: ValueFunction, domain: tuple[Corner, Corner]) -> OwnOperations:
     """V as its operations, traced unless it is so already."""
     return V if isinstance(V, OwnOperations) else OwnOperations(V, domain)
+
+
+def own_constraints(constraints: Constraints, domain: tuple[Corner, Corner]) -> OwnConstraints:
+    """Constraints as their operations, traced unless they are so already."""
+    return constraints if isinstance(constraints, OwnConstraints) else OwnConstraints(constraints, domain)
 
 
 def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
@@ -88,7 +106,7 @@ def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner
     declared = condition.V
     try:
         condition.V = own_operations(declared, domain)
-        h = condition.constraints
+        h = None if condition.constraints is None else own_constraints(condition.constraints, domain)
         return BoundedFunction(lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain)
     finally:
         condition.V = declared

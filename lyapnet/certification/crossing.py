@@ -9,9 +9,8 @@ from torch import Tensor
 from lyapnet.calculus import gradients
 from lyapnet.certification.boxes import corners
 from lyapnet.certification.branch_and_bound import Budget, minimum
-from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.errors import DivergenceError, UsageError
-from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
 from lyapnet.problem import Horizon, Problem
 from lyapnet.rollout import Rollout
@@ -49,11 +48,10 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
 
     Source: Blanchini, "Set invariance in control", Automatica 1999 (Nagumo's theorem).
     """
-    constraints = condition.constraints
-    if constraints is None:
+    if condition.constraints is None:
         return float("inf")
-    own = BoundedFunction(lambda t, x: (constraints(x),), domain)
-    if unsmooth := own.operators & {*KINKS, *JUMPS, *CHOICES}:
+    constraints = own_constraints(condition.constraints, domain)
+    if unsmooth := constraints.operators & {*KINKS, *JUMPS, *CHOICES}:
         raise UsageError(
             f"Expected smooth constraints, got {' and '.join(sorted(map(str, unsmooth)))}; write a maximum as several "
             "components."
@@ -64,7 +62,7 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
         """At most 0 where 0 ≤ h_j ≤ SHELL and ḣ_j ≥ 0."""
 
         def h(t: Time, x: State) -> Tensor:
-            return (own.graph(t, x)[0] if x.ndim == 1 else constraints(x))[..., j]
+            return constraints(x)[..., j]
 
         rate = (gradients(h, t, x)[1] * loop.system.dynamics(x, loop.policy(t, x))).sum(-1)
         outside = (h(t, x) - SHELL / 2).abs() - (1 + 1e-6) * SHELL / 2

@@ -11,7 +11,13 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import corners, faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
-from lyapnet.certification.condition import DecreaseCondition, OwnOperations, bounded_condition, require_own_gradient
+from lyapnet.certification.condition import (
+    DecreaseCondition,
+    OwnOperations,
+    bounded_condition,
+    own_constraints,
+    require_own_gradient,
+)
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.crossing import Violation, crossing_level, find_violation
 from lyapnet.certification.ignorable_states import ignorable_states
@@ -257,8 +263,10 @@ def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float,
 
 
 def _freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None:
-    """Trace V once, for every question that is asked of it, after a look at what it is."""
+    """Trace V and h once, for every question that is asked of them, after a look at what they are."""
     own = OwnOperations(condition.V, sample)
+    if condition.constraints is not None:
+        condition.constraints = own_constraints(condition.constraints, sample)
     _check_states(condition, sample)
     condition.V = own
 

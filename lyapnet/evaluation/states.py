@@ -74,15 +74,15 @@ class StateTable:
         """Of each constraint: the share of states whose closed loop violates it, the worst h, and when that is."""
         if self.worst is None or self.worst_time is None:
             return {}
-        shares, (worst, of) = (self.worst > 0).double().mean(0).tolist(), self.worst.max(0)
+        shares, (worst, of) = (~(self.worst <= 0)).double().mean(0).tolist(), self.worst.max(0)
         times = self.worst_time.gather(0, of[None])[0].tolist()
         columns = zip(names, shares, worst.tolist(), times, strict=True)
         return {name: {"violated": share, "worst": h, "time": t} for name, share, h, t in columns}
 
     @property
     def violated(self) -> Tensor | None:
-        """Whether each closed loop violates some constraint, (b,); None where there are none."""
-        return None if self.worst is None else (self.worst > 0).any(-1)
+        """Whether each closed loop violates a constraint, or has no number for it, (b,); None where there are none."""
+        return None if self.worst is None else ~(self.worst <= 0).all(-1)
 
     def against_optimum(self) -> dict[str, float | None]:
         """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""

@@ -118,6 +118,37 @@ def test_a_safe_set_is_proved_and_another_falsified():
     assert 0 < between.volume_share < 1
 
 
+def test_a_kept_proof_is_about_its_constraints(tmp_path):
+    kept, options = tmp_path / "proof", {"alpha": 0.9, "delta": 0.02}
+    whole = claim(position(1.35), keep=kept)
+    again = claim(position(1.35), keep=kept, replay=True, budget=Budget(60))
+    assert whole.verdict == again.verdict == "certified"
+    assert whole.fingerprint == again.fingerprint
+    with pytest.raises(UsageError):
+        claim(position(1.4), keep=kept, **options)
+    with pytest.raises(UsageError):
+        claim(None, keep=kept, **options)
+
+
+class Counting(Constraints):
+    """x ≤ 1.35 at first, and then anything."""
+
+    names = ("counting",)
+    calls = 0
+
+    def forward(self, x):
+        self.calls += 1
+        return x[..., :1] / 1.35 - (1 if self.calls < 60 else 9)
+
+
+def test_constraints_that_change_with_the_calls_are_refused_or_what_they_were():
+    try:
+        found = claim(Counting())
+    except UsageError:
+        return
+    assert found.crossing <= claim(position(1.35)).crossing * 1.01
+
+
 def test_a_violation_is_one():
     task = problem().replaced(constraints=position(1.03))
     found = find_violation(loop(riccati()), task, torch.Generator().manual_seed(0))

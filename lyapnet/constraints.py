@@ -30,7 +30,8 @@ class Constraints(nn.Module, ABC):
 
     def ignores(self, i: int, n: int) -> bool:
         """Whether h does not depend on x_i, of n states: not a number in x_i makes nan of what depends on it."""
-        like = next((each for each in self.buffers() if each.is_floating_point()), torch.zeros(()))
+        numbers = [*self.buffers(), *self.parameters()]
+        like = next((each for each in numbers if each.is_floating_point()), torch.zeros(()))
         x = 0.1 + 0.01 * torch.arange(n, dtype=torch.float64).sqrt()
         x[i] = torch.nan
         return not bool(self(x.to(like)).isnan().any())

@@ -302,3 +302,17 @@ def test_what_is_said_before_training_names_the_penalty():
     assert facts["constraints"].startswith("penalty of ")
     assert "optima from 24 states keep them, at 1." in facts["constraints"]
     assert float(learner.problem.cost.weight) > 0
+
+
+def test_what_constraints_with_parameters_ignore():
+    class Learned(Constraints):
+        names = ("learned",)
+
+        def __init__(self):
+            super().__init__()
+            self.layer = torch.nn.Linear(1, 1)
+
+        def forward(self, x):
+            return self.layer(x[..., :1])
+
+    assert [Learned().double().ignores(i, 2) for i in range(2)] == [False, True]

@@ -10,12 +10,13 @@ from lyapnet.calculus import gradients
 from lyapnet.certification.boxes import corners
 from lyapnet.certification.branch_and_bound import Budget, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
+from lyapnet.constraints import Constraints
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
 from lyapnet.problem import Horizon, Problem
 from lyapnet.rollout import Rollout
 from lyapnet.rollout.closed_loop import ClosedLoop
-from lyapnet.types import Corner, PerState, State, Time
+from lyapnet.types import Corner, Corners, PerState, State, Time
 
 SHELL = 1e-2  # 0 ≤ h ≤ SHELL, in which h = 0 is looked for
 LOOPS, FINER, SURE = (
@@ -71,6 +72,23 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
     levels = [
         minimum(condition.height, lower, upper, budget, lambda t, x, j=j: crossing(j, t, x), 0.0, enough)
         for j in range(len(constraints.names))
+    ]
+    return min(levels)
+
+
+def beginning_level(
+    condition: DecreaseCondition, states: tuple[Corners, Corners], budget: Budget, enough: float
+) -> float:
+    """A lower bound of W where some h_j ≥ SURE on X₀, at t = 0; ∞ where X₀ is proved to keep the constraints.
+
+    States of X₀ that violate one may lie between all that are sampled.
+    """
+    if condition.constraints is None:
+        return float("inf")
+    h: Constraints = condition.constraints
+    levels = [
+        minimum(condition.height, *states, budget, lambda t, x, j=j: SURE - h(x)[..., j], 0.0, enough)
+        for j in range(len(h.names))
     ]
     return min(levels)
 

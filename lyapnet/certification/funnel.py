@@ -19,7 +19,7 @@ from lyapnet.certification.condition import (
     require_own_gradient,
 )
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
-from lyapnet.certification.crossing import Violation, crossing_level, find_violation
+from lyapnet.certification.crossing import Violation, beginning_level, crossing_level, find_violation
 from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict
@@ -105,7 +105,7 @@ class SoundClaim:
         if self.counterexample is not None:
             return "the condition fails close to what X₀ needs"
         if self.crossing <= self.wanted:
-            return "closed loops of the funnel that X₀ needs may cross a constraint"
+            return "closed loops of the funnel that X₀ needs may cross a constraint, or begin beyond it"
         return "the funnel meets the boundary of D: choose a larger set"
 
     def guaranteed_cost(self, value: PerState) -> PerState:
@@ -138,8 +138,7 @@ def sound_claim(
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
-    started, budget = time.monotonic(), budget or Budget()
-    problem = copied(problem)
+    started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints)
     duration, goal = problem.horizon.duration, problem.goal.double()
     _freeze(condition, _over_time(problem.initial_states, duration))
@@ -158,7 +157,8 @@ def sound_claim(
     needed = just_above(wanted)
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
-    crossing = crossing_level(condition, domain, _for_levels(budget), just_above(needed))
+    begin = beginning_level(condition, _at(0.0, x_low, x_high), _for_levels(budget), just_above(needed))
+    crossing = min(begin, crossing_level(condition, domain, _for_levels(budget), just_above(needed)))
     set_up = time.monotonic() - started
     level = min(needed, just_below(min(rim, crossing)))
     proof = _proof(condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay)
@@ -283,6 +283,9 @@ def _check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -
 
     t, x = points[:, 0], points[:, 1:]
     check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False)
+    if condition.constraints is not None:
+        k = len(condition.constraints.names)
+        check_function("h(x) with a number for each name", condition.constraints, [x], (k,), differentiable=False)
     with torch.no_grad():
         own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
         if not _close(own, condition.V(t, x)):

@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from lyapnet.certification import Budget, DecreaseCondition, sound_claim
-from lyapnet.certification.crossing import crossing_level, find_violation
+from lyapnet.certification.checking import check
+from lyapnet.certification.condition import bounded_condition, own_constraints
+from lyapnet.certification.crossing import beginning_level, crossing_level, find_violation
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.constraints import Ball, Constraints, StateLimits
 from lyapnet.controller import Controller
@@ -179,3 +181,70 @@ def test_the_report_says_what_is_kept():
     assert proved.numbers()["constraints"] == ["position within 1.35"]
     assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.of_the_verdict()
     assert failed.numbers()["violation"]["constraint"] == "position within 1.03"
+
+
+class Fickle(Constraints):
+    """x ≤ 1.35 in batches, and never kept by one state."""
+
+    names = ("fickle",)
+
+    def forward(self, x):
+        return 1 + x[..., :1] ** 2 if x.ndim == 1 else x[..., :1] - 1.35
+
+
+class Forgotten(Constraints):
+    """Two limits under one name."""
+
+    names = ("x ≤ 1.35",)
+
+    def forward(self, x):
+        return torch.stack([x[..., 0] - 1.35, x[..., 0] - 1.03], -1)
+
+
+@pytest.mark.parametrize(("hostile", "message"), [(Fickle(), "each state by itself"), (Forgotten(), "for each name")])
+def test_constraints_are_one_function_with_a_name_for_each_number(hostile, message):
+    with pytest.raises(UsageError, match=message):
+        claim(hostile)
+
+
+def test_constraints_are_traced_once():
+    """What excludes states is what is not to be crossed."""
+    declared = position(1.35)
+    own = own_constraints(declared, domain())
+    declared.limits.fill_(-100.0)
+    condition = DecreaseCondition(loop(riccati()), 0.9, 0.0, own)
+    *_, h = bounded_condition(condition, domain()).bounds(*(torch.tensor([[0.0, 1.0, 0.0]]).double(),) * 2)
+    assert float(h[1]) < 0
+    assert own_constraints(own, domain()) is own
+
+
+def test_states_of_X0_between_the_samples_are_held_against_constraints():
+    """A sliver of X₀ that is 2e-6 wide is excluded."""
+
+    class Sliver(Constraints):
+        names = ("sliver",)
+
+        def forward(self, x):
+            return (x[..., :1] - 0.9 - 1e10 * (x[..., 1:] - 0.1234) ** 2) / 1.0
+
+    task = problem()
+    at = tuple(torch.tensor([[0.0, *side]]).double() for side in ((-1.0, -0.7), (1.0, 0.7)))
+    sliver = task.replaced(constraints=Sliver())
+    assert find_violation(loop(riccati()), sliver, torch.Generator().manual_seed(0)) is None
+    least = [
+        beginning_level(DecreaseCondition(loop(riccati()), 0.9, 0.0, h), at, Budget(5), ENOUGH)
+        for h in (Sliver(), position(1.0), None)
+    ]
+    P, x = torch.as_tensor(riccati()), torch.tensor([0.9, 0.1234]).double()
+    assert least[0] <= float(x @ P @ x) * 1.01
+    assert least[1:] == [float("inf"), float("inf")], "X₀ may reach to a limit"
+
+
+def test_a_kept_proof_is_checked_with_its_constraints(tmp_path):
+    V, kept = loop(riccati()).V, tmp_path / "proof"
+    assert claim(position(1.35), keep=kept).verdict == "certified"
+    verdicts = [
+        check(Controller(problem().replaced(constraints=h), V), kept)["verdict"]
+        for h in (position(1.35), position(1.36), None)
+    ]
+    assert verdicts == ["certified", "refused", "refused"]

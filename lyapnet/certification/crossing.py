@@ -1,6 +1,7 @@
 """Where closed loops could violate a constraint: the level of V below which none does, and closed loops that do."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from lyapnet.calculus import gradients
 from lyapnet.certification.boxes import corners
 from lyapnet.certification.branch_and_bound import Budget, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
-from lyapnet.constraints import Constraints
+from lyapnet.constraints import Constraints, names_of
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
 from lyapnet.problem import Horizon, Problem
@@ -19,11 +20,8 @@ from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.types import Corner, Corners, PerState, State, Time
 
 SHELL = 1e-2  # 0 ≤ h ≤ SHELL, in which h = 0 is looked for
-LOOPS, FINER, SURE = (
-    1000,
-    4,
-    1e-6,
-)  # closed loops, steps in each Δt, and h that is taken for more than an error of theirs
+LOOPS, FINER = 1000, 4  # closed loops, and steps in each Δt
+SURE = 1e-6  # h that is more than an error of theirs
 
 
 class Violation(NamedTuple):
@@ -69,11 +67,7 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
         outside = (h(t, x) - SHELL / 2).abs() - (1 + 1e-6) * SHELL / 2
         return torch.maximum(outside, -rate)
 
-    levels = [
-        minimum(condition.height, lower, upper, budget, lambda t, x, j=j: crossing(j, t, x), 0.0, enough)
-        for j in range(len(constraints.names))
-    ]
-    return min(levels)
+    return _least(condition, (lower, upper), crossing, budget, enough)
 
 
 def beginning_level(
@@ -86,11 +80,19 @@ def beginning_level(
     if condition.constraints is None:
         return float("inf")
     h: Constraints = condition.constraints
-    levels = [
-        minimum(condition.height, *states, budget, lambda t, x, j=j: SURE - h(x)[..., j], 0.0, enough)
-        for j in range(len(h.names))
-    ]
-    return min(levels)
+    return _least(condition, states, lambda j, t, x: SURE - h(x)[..., j], budget, enough)
+
+
+def _least(
+    condition: DecreaseCondition,
+    boxes: tuple[Corners, Corners],
+    where: Callable[[int, Time, State], PerState],
+    budget: Budget,
+    enough: float,
+) -> float:
+    """A lower bound of W on the parts of boxes where where(j, t, x) ≤ 0 for some constraint j."""
+    components = range(len(names_of(condition.constraints)))
+    return min(minimum(condition.height, *boxes, budget, partial(where, j), 0.0, enough) for j in components)
 
 
 def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.Generator | None) -> Violation | None:
@@ -106,13 +108,7 @@ def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.G
     except DivergenceError:
         return None
     h = constraints(trajectory.x)
-    worst = int(h.argmax())
-    node, i, j = _unravelled(worst, h.shape)
+    node, i, j = (int(k) for k in torch.unravel_index(h.argmax(), h.shape))
     if float(h[node, i, j]) <= SURE:
         return None
     return Violation(x0[i].tolist(), float(trajectory.t[node]), constraints.names[j], float(h[node, i, j]))
-
-
-def _unravelled(index: int, shape: Sequence[int]) -> tuple[int, int, int]:
-    _, b, k = shape
-    return index // (b * k), index // k % b, index % k

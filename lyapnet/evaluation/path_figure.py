@@ -21,8 +21,8 @@ def has_plane(problem: Problem) -> bool:
 def paths(trajectory: Trajectory, problem: Problem) -> Figure:
     """The closed loops (b,) of a batch in the plane of the first disk that a constraint or the cost has.
 
-    Disks that must not be entered, or left, are filled; those of the cost, whose weight at the edge is a seventh of the
-    centre's, are dotted.
+    Disks that must not be entered are filled, those that must not be left dashed; those of the cost, whose weight at
+    the edge is a seventh of the centre's, are dotted.
     """
     plane = _plane(problem)
     assert plane is not None

@@ -57,7 +57,10 @@ training: {iterations: 3, batch_size: 8}
 evaluation: {validation_states: 4, test_states: 4}
 """
 STEPS, DT = 8, 0.1
-pytestmark = pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning")  # Lightning's own, of torch
+pytestmark = [  # Lightning's own, of torch, and on machines with more than three cores
+    pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning"),
+    pytest.mark.filterwarnings("ignore:.*does not have many workers"),
+]
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Horizon, Problem
 from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import Rollout
+from lyapnet.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
@@ -46,6 +46,7 @@ class Disturbance(NamedTuple):
     problem: Problem  # with the plant
     policy: nn.Module  # u(t, x), which knows nothing of it
     x0: State
+    method: str  # how the closed loop is integrated
 
 
 class DisturbanceRow(NamedTuple):
@@ -82,15 +83,16 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
     Those are: initial states up to 20 % outside X₀ and none inside; each positive physical parameter of the system 20 %
     lower and higher, gravity aside, while the policy and the cost keep the old one; noise of 1 % on the state that the
-    policy reads; and half the Δt. Of a family it is the task of one member, `nominal`; and where V can be told a
-    parameter, there is also the task of the member that has it.
+    policy reads; half the Δt; and no Δt at all: u(t, x) at every t, by an adaptive integrator, against the optimum by
+    steps of fourth order over half the Δt. Of a family it is the task of one member, `nominal`; and where V can be told
+    a parameter, there is also the task of the member that has it.
     """
     family = dict[str, float]() if not controller.system.constants else nominal(controller)
     whole, controller = controller, controller.with_(**family) if family else controller
     X0 = controller.initial_states
     x0 = X0.sample(samples, stream(seed, TEST))
     problem = controller.problem
-    undisturbed = Disturbance("none", problem, controller.closed_loop.policy, x0)
+    undisturbed = Disturbance("none", problem, controller.closed_loop.policy, x0, controller.method)
     yield undisturbed
     yield undisturbed._replace(name=f"x₀ up to {BEYOND:.0%} outside X₀", x0=_outside(X0, samples, stream(seed, TEST)))
     known = controller.parameters
@@ -103,11 +105,14 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
             if name in family and knows(whole.config, name, value * (1 + share)):
                 told = whole.with_(**{**family, name: value * (1 + share)})
                 policy = told.closed_loop.policy
-                yield Disturbance(f"{name.replace('_', ' ')} {share:+.0%}, told", told.problem, policy, x0)
+                named = f"{name.replace('_', ' ')} {share:+.0%}, told"
+                yield undisturbed._replace(name=named, problem=told.problem, policy=policy)
     policy = NoisyPolicy(undisturbed.policy, NOISE * magnitude(controller, x0), stream(seed, TEST))
     yield undisturbed._replace(name=f"noise of {NOISE:.0%} on the state", policy=policy)
     halved = Horizon(2 * problem.horizon.steps, problem.horizon.dt / 2)
-    yield undisturbed._replace(name="half the Δt", problem=problem.replaced(horizon=halved))
+    finer = problem.replaced(horizon=halved)
+    yield undisturbed._replace(name="half the Δt", problem=finer)
+    yield undisturbed._replace(name="continuous time", problem=finer, method=ADAPTIVE_METHODS[0])
 
 
 def nominal(family: Controller) -> dict[str, float]:
@@ -141,15 +146,15 @@ def robustness(
     rows = []
     for disturbance in disturbances(controller, samples, seed):
         say(disturbance.name)
-        rows.append(_row(controller, disturbance, optimum))
+        rows.append(_row(disturbance, optimum))
     return rows
 
 
-def _row(controller: Controller, disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
-    name, problem, policy, x0 = disturbance
+def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
+    name, problem, policy, x0, method = disturbance
     try:
         with torch.no_grad():
-            trajectory = Rollout(problem, policy, controller.method, "backprop")(x0)
+            trajectory = Rollout(problem, policy, method, "backprop")(x0)
     except DivergenceError:
         return DisturbanceRow(name, None, None, None, None, None)
     cost = float(trajectory.cost.mean())
@@ -158,7 +163,7 @@ def _row(controller: Controller, disturbance: Disturbance, optimum: bool) -> Dis
     if not optimum:
         return without_optimum
     try:
-        optima = oracle_of(problem, controller.method).solve(x0, trajectory.u)
+        optima = oracle_of(problem, method).solve(x0, trajectory.u)
     except OracleError:
         return without_optimum
     return without_optimum._replace(

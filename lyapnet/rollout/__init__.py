@@ -10,7 +10,7 @@ from lyapnet.rollout.integration import (
     Rollout,
     Trajectory,
 )
-from lyapnet.rollout.runge_kutta import TABLEAUX
+from lyapnet.rollout.runge_kutta import TABLEAUX, held_step
 
 __all__ = [
     "ADAPTIVE_METHODS",
@@ -22,4 +22,5 @@ __all__ = [
     "DiscreteAdjoint",
     "Rollout",
     "Trajectory",
+    "held_step",
 ]

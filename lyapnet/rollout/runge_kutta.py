@@ -19,9 +19,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lyapnet.linear_algebra import apply, multiply
+from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.types import (
+    Control,
     Jacobians,
+    PerState,
     Scalar,
     StageControls,
     StageInputMatrices,
@@ -51,6 +54,16 @@ TABLEAUX = {
         ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0)), (1 / 8, 3 / 8, 3 / 8, 1 / 8), (0.0, 1 / 3, 2 / 3, 1.0)
     ),
 }
+
+
+def held_step(problem: Problem, tableau: ButcherTableau, x: State, u: Control) -> tuple[State, PerState]:
+    """(x', ∫ℓ): one step of Δt with u held."""
+    dt, slopes, rates = problem.horizon.dt, [], []
+    for row in tableau.a:
+        X = x + dt * _combine(row, slopes) if any(row) else x
+        slopes.append(problem.system.dynamics(X, u))
+        rates.append(problem.cost.running(X, u))
+    return x + dt * _combine(tableau.b, slopes), dt * _combine(tableau.b, rates)
 
 
 class Step(nn.Module):

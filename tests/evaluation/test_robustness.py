@@ -2,12 +2,16 @@
 
 import pytest
 import torch
+from scipy.linalg import solve_continuous_are
 from torch.testing import assert_close
 
+from lyapnet.controller import Controller
+from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation import robustness
 from lyapnet.evaluation.robustness import disturbances
 from lyapnet.rollout import Rollout
-from tests.problems import untrained
+from lyapnet.systems import DoubleIntegrator
+from tests.problems import Quadratic, problem_of, untrained
 
 SMALL = ["network.hidden=[4,4]", "horizon.steps=20"]
 
@@ -75,6 +79,16 @@ def test_rows_are_ratios_to_the_optimum_of_the_disturbed_task(controller):
     rollout = Rollout(by_name(controller, 20)["mass +20%"].problem, controller.closed_loop.policy, gradient="backprop")
     assert heavier.cost_mean == pytest.approx(float(rollout(x0).cost.mean()), rel=1e-12)
     assert heavier.cost_mean != pytest.approx(undisturbed.cost_mean, rel=1e-6)
+
+
+def test_the_law_of_continuous_time_is_optimal_in_the_row_of_that_name():
+    """Where φ is the steady state of the Riccati equation, V is that at all times."""
+    system, Q, R = DoubleIntegrator(), torch.diag(torch.tensor([10.0, 0.1])), torch.eye(1)
+    P = torch.from_numpy(solve_continuous_are(system.A, system.B, Q, R))
+    steady = Controller(problem_of(system, QuadraticCost(Q, R, P), 100, 0.04), Quadratic(P))
+    rows = {row.disturbance: row for row in robustness.robustness(steady, 20)}
+    assert rows["continuous time"].cost_ratio == pytest.approx(1, abs=1e-6)
+    assert rows["none"].cost_ratio > 1.001
 
 
 def test_a_loop_that_diverges_is_a_row_too(controller, monkeypatch):

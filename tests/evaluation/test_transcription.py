@@ -12,7 +12,7 @@ from lyapnet.build import build_problem
 from lyapnet.config import load_config
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import OracleError
-from lyapnet.evaluation.oracles import discrete_riccati, oracle_of
+from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of
 from lyapnet.evaluation.oracles.multistart import Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.problem import Horizon
@@ -55,6 +55,28 @@ def test_optimum_of_a_linear_task_is_riccatis(n, m):
     # twin: a slightly different model has another optimum
     other = discrete_riccati(Linear(1.001 * system.A, system.B), cost, horizon)
     assert not torch.allclose(optima.cost, other.value(0, x0), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("midpoint", 2), ("rk4", 2)])
+def test_optima_approach_that_of_continuous_time(method, order):
+    """Holding u over a step costs O(Δt²), whatever the order of the steps."""
+    problem, x0 = linear_problem(2, 1), torch.randn(3, 2)
+    system, cost, horizon = problem.system, problem.cost, problem.horizon
+    best = continuous_riccati(system, cost, horizon).value(0, x0)
+    off = []
+    for k in (2, 4):
+        finer = problem.replaced(horizon=Horizon(k * horizon.steps, horizon.dt / k))
+        off.append((Transcription(finer, method).solve(x0).cost / best - 1).abs().mean())
+    assert float(torch.log2(off[0] / off[1])) == pytest.approx(order, abs=0.2)
+    assert off[1] < (0.05 if order == 1 else 1e-3)
+
+
+def test_a_rollout_by_other_steps_is_compared_with_the_optimum_of_those():
+    problem = transcription_of("pendulum_swingup", "horizon.steps=20")[0].problem
+    x0 = problem.initial_states.sample(2).double()
+    optima = {method: oracle_of(problem, method).solve(x0) for method in ("euler", "rk4", "dopri5")}
+    assert_close(optima["rk4"].cost, optima["dopri5"].cost, rtol=1e-12, atol=0)
+    assert not torch.allclose(optima["rk4"].cost, optima["euler"].cost, rtol=1e-4)
 
 
 def test_one_step_and_any_leading_shape():

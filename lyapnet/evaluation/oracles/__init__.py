@@ -12,6 +12,7 @@ from lyapnet.evaluation.oracles.riccati import (
     discrete_riccati,
 )
 from lyapnet.problem import Problem
+from lyapnet.rollout import ADAPTIVE_METHODS
 from lyapnet.systems import is_linear
 
 __all__ = [
@@ -31,9 +32,10 @@ __all__ = [
 def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
 
-    With Euler it is the optimum of the discretised task, J_N*: by the Riccati equation where the system is `Linear`, R
-    a matrix, U = ℝᵐ and nothing constrained, else by direct transcription, within the limits of U and h(x) ≤ 0. With
-    any other integrator it is that of the continuous task, by the Riccati equation alone.
+    Where the system is `Linear`, R a matrix, U = ℝᵐ and nothing constrained, it is Riccati's: that of the discretised
+    task, J_N*, with Euler, and that of the continuous task with any other integrator. Else it is found by direct
+    transcription, within the limits of U and h(x) ≤ 0: with the steps of that integrator, rk4 for an adaptive one, and
+    u held over each. In continuous time a law that does not hold u may so cost less, by O(Δt²).
 
     Raises:
         OracleError: there is none; says why, and what to do.
@@ -49,18 +51,13 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     if free and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         return RiccatiOracle(solve(system, cost, horizon))
-    if method != "euler":
-        raise OracleError(
-            "Expected rollout.method=euler for the optimum of a nonlinear, limited or constrained task, got "
-            f"{method}; the transcription has Euler's steps."
-        )
     if importlib.util.find_spec("casadi") is None:
         raise OracleError(
             "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."
         )
     from lyapnet.evaluation.oracles.transcription import Transcription  # needs the extra
 
-    return Transcription(problem)
+    return Transcription(problem, "rk4" if method in ADAPTIVE_METHODS else method)
 
 
 def optimal_cost(problem: Problem, method: str = "euler") -> Oracle | None:

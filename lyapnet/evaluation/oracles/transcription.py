@@ -19,6 +19,7 @@ from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, i
 from lyapnet.expansions import riccati
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
+from lyapnet.rollout import TABLEAUX, held_step
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 VIOLATED = 1e-6  # h that is still taken for zero
@@ -27,7 +28,7 @@ BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and ho
 
 class Transcription(Oracle):
     """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu)
-    and h(x_n) ≤ 0 for n ≥ 1.
+    and h(x_n) ≤ 0 for n ≥ 1; by another Runge-Kutta method, of the cost and along the steps that it makes with u held.
 
     The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
     the goal, random curves, the controls that the caller knows, and the optima of its neighbours in the batch. The
@@ -36,6 +37,7 @@ class Transcription(Oracle):
 
     Args:
         problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
+        method: of the steps, a key of TABLEAUX.
         iterations: of IPOPT from one start, at most.
 
     Raises:
@@ -45,8 +47,8 @@ class Transcription(Oracle):
     implementation of an interior-point filter line-search algorithm", Mathematical Programming 2006 (IPOPT).
     """
 
-    def __init__(self, problem: Problem, iterations: int = 500):
-        self.problem = copied(problem)
+    def __init__(self, problem: Problem, method: str = "euler", iterations: int = 500):
+        self.problem, self.tableau = copied(problem), TABLEAUX[method]
         system, horizon = self.problem.system, self.problem.horizon
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         graphs = [traced(self.step, (x, u)), traced(self.end, (x,))]
@@ -76,9 +78,8 @@ class Transcription(Oracle):
         self._held = [np.concatenate([defects, np.full(more, side)]) for side in (-np.inf, 0.0)]
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
-        """(x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
-        problem, dt = self.problem, self.problem.horizon.dt
-        return x + dt * problem.system.dynamics(x, u), dt * problem.cost.running(x, u)
+        """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
+        return held_step(self.problem, self.tableau, x, u)
 
     def end(self, x: State) -> tuple[PerState]:
         """(φ(x_N),)."""

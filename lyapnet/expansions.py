@@ -239,48 +239,49 @@ class _Steps(NamedTuple):
 
 
 def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: _Steps, damping: Tensor | None) -> _Backward:
-    n, F_z = x.shape[-1], steps.F_z
+    """V_n(δ) = ½ (1, δ)ᵀW_n(1, δ), W = [[2c, pᵀ], [p, H]], from W_N on: one matrix holds all that is known of V."""
+    n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
-    jumps = steps.F.detach() - x[1:]
-    c, p, H = _terminal(problem, x[-1])
-    nodes, gains = [(c, p, H)], []
-    for k in reversed(range(len(F_z))):
-        moved = jumps[k]
-        c = c + (p * moved).sum(-1) + (moved * (H @ moved[..., None])[..., 0]).sum(-1) / 2 + steps.paid[k]
-        p = p + (H @ moved[..., None])[..., 0]
-        Q_z = steps.l_z[k] + (F_z[k].mT @ p[..., None])[..., 0]
-        Q_zz = steps.l_zz[k] + F_z[k].mT @ H @ F_z[k]
-        Q_u, Q_uu, Q_ux = Q_z[..., n:], Q_zz[..., n:, n:], Q_zz[..., n:, :n]
+    one = torch.eye(1, 1 + steps.z.shape[-1]).to(x).expand(*steps.paid.shape, 1, -1)
+    M = torch.cat([one, torch.cat([(steps.F.detach() - x[1:])[..., None], steps.F_z], -1)], -2)
+    L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
+    W = _quadratic(*_terminal(problem, x[-1]))
+    nodes, gains = [W], []
+    for k in reversed(range(len(M))):
+        Q = L[k] + M[k].mT @ W @ M[k]
+        Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
         raised = _raised(Q_uu, FLOOR * least[k], 0 if damping is None else damping * least[k])
-        ff, K = _gains(problem, u[k], raised, Q_u, Q_ux)
-        uff = (Q_uu @ ff[..., None])[..., 0]
-        c = c + (Q_u * ff).sum(-1) + (ff * uff).sum(-1) / 2
-        p = Q_z[..., :n] + (K.mT @ (Q_u + uff)[..., None])[..., 0] + (Q_ux.mT @ ff[..., None])[..., 0]
-        H = Q_zz[..., :n, :n] + K.mT @ Q_uu @ K + K.mT @ Q_ux + Q_ux.mT @ K
-        H = (H + H.mT) / 2
-        nodes.append((c, p, H))
-        gains.append((ff, K))
-    (value, gradient, hessian), (ff, K) = (
-        [torch.stack(column[::-1]) for column in zip(*rows, strict=True)] for rows in (nodes, gains)
-    )
-    return _Backward(ff, K, Expansion(x, value, gradient, hessian))
+        gain = _gains(problem, u[k], raised, Q_ua)
+        W = Q[..., : 1 + n, : 1 + n] + gain.mT @ (Q_ua + Q_uu @ gain) + Q_ua.mT @ gain
+        W = (W + W.mT) / 2
+        nodes.append(W)
+        gains.append(gain)
+    W, gain = torch.stack(nodes[::-1]), torch.stack(gains[::-1])
+    return _Backward(gain[..., 0], gain[..., 1:], Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:]))
 
 
-def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_u: Control, Q_ux: Tensor) -> tuple[Control, Tensor]:
-    """k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U, and K, in which controls that a limit holds have no part.
+def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:
+    """[[2c, pᵀ], [p, H]]: c + pᵀz + ½ zᵀHz as one matrix."""
+    first = torch.cat([2 * c[..., None], p], -1)
+    return torch.cat([first[..., None, :], torch.cat([p[..., None], H], -1)], -2)
+
+
+def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
+    """(k, K) from Q_ua = (Q_u, Q_ux): k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U; controls that a limit holds have
+    no part in K.
 
     Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
     """
     if not problem.controls.limited:
-        gain = -torch.linalg.solve(Q_uu, torch.cat([Q_u[..., None], Q_ux], -1))
-        return gain[..., 0], gain[..., 1:]
+        return -torch.linalg.solve(Q_uu, Q_ua)
+    Q_u, Q_ux = Q_ua[..., 0], Q_ua[..., 1:]
     to = problem.controls.minimise(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
     k = to - u
     slope = Q_u + (Q_uu @ k[..., None])[..., 0]
     further = problem.controls.project(to - slope.sign() * (1 + to.abs()))
     share = ((further != to) | (slope == 0)).to(Q_uu)  # 1 for a control that is free, 0 for one that a limit holds
     A = share[..., :, None] * Q_uu * share[..., None, :] + torch.diag_embed(1 - share)
-    return k, -torch.linalg.solve(A, share[..., None] * Q_ux)
+    return torch.cat([k[..., None], -torch.linalg.solve(A, share[..., None] * Q_ux)], -1)
 
 
 def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:

@@ -101,6 +101,24 @@ class ExpansionNetwork(ValueFunction):
         return parts[..., 0], parts[..., 1 : 1 + n], H, x - parts[..., 1 + n : 1 + 2 * n]
 
     @torch.no_grad()
+    def take_nothing(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
+        """Start from V = 0, with what is known of its size: N is in units of a spread around a centre.
+
+        Args:
+            t: the nodes (K,).
+            centre: x̄ (n,), the same at all times.
+            curvature: what stands for V_xx in control laws, (K, n, n), symmetric positive semidefinite.
+            spread: of each state, (n,).
+            value: s.
+        """
+        none = torch.zeros(len(t), 1 + self.n).to(centre)
+        parts = [none, centre.expand(len(t), -1), torch.zeros_like(curvature).flatten(1), curvature.flatten(1)]
+        self.expansion.take(t, torch.cat(parts, 1))
+        self.at_goal.fill_(0)
+        self.scale.fill_(value)
+        self.coordinates.copy_(torch.diag(1 / spread.where(spread > 0, 1)))
+
+    @torch.no_grad()
     def take(
         self, t: Tensor, x: Tensor, value: Tensor, gradient: Tensor, hessian: Tensor, curvature: Tensor, spread: Tensor
     ) -> None:

@@ -1,23 +1,27 @@
 """Fitting V to optimal trajectories, before it trains in closed loop: supervised, and seconds long."""
 
-from collections.abc import Callable, Sequence
+import copy
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import FLOOR, Expansion, Optimum, in_float64, path_under
+from lyapnet.expansions import FLOOR, Expansion, Optimum, Path, in_float64, path_under
 from lyapnet.linear_algebra import apply
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
-from lyapnet.types import Control, PerState, State, StatePath
+from lyapnet.types import PerState, State, StatePath
 
 STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
+SOME = 20_000  # examples that tell how wrong an expansion is before a fit
+ROUNDS, GOOD = 4, 1.02  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
-TRUSTED = 0.01  # ½ δᵀ|H|δ, as a share of J̄, up to which an expansion is believed
+TRUSTED, TRUSTED_NEAR = 0.01, 1.0  # ½ δᵀ|H|δ, as a share of J, up to which an expansion is believed
 
 
 class Examples(NamedTuple):
@@ -30,13 +34,22 @@ class Examples(NamedTuple):
     drifted: State  # x_n + Δt f, or x_n + Δt(f + gu*)
     gradient: State  # V_x(t_{n+1}, drifted)
     weight: Tensor  # L⁻¹gᵀ (k, m, n), LLᵀ = 2R + Δt gᵀHg: for what a wrong V_x costs
-    mean_cost: float  # of the trajectories
-    duration: float
+    cost: PerState  # J of the trajectory, or the median of all if that is more
+    duration: float  # T
+
+    @property
+    def columns(self) -> list[Tensor]:
+        """All but T."""
+        return list(self[:-1])
 
     def with_further(self, others: "Examples") -> "Examples":
-        """These and others of the same trajectories."""
-        columns = (torch.cat(both) for both in zip(self[:7], others[:7], strict=True))
-        return Examples(*columns, *self[7:])  # pyright: ignore[reportCallIssue]
+        """These and others of the same problem."""
+        columns = (torch.cat(both) for both in zip(self.columns, others.columns, strict=True))
+        return Examples(*columns, self.duration)  # pyright: ignore[reportCallIssue]
+
+    def to(self, like: Tensor) -> "Examples":
+        """The same in the precision and on the device of a tensor."""
+        return Examples(*(column.to(like) for column in self.columns), self.duration)  # pyright: ignore[reportCallIssue]
 
 
 def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) -> Examples:
@@ -45,12 +58,13 @@ def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) 
     The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
     V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
     """
-    x = _finite(optimum).x
-    return _examples(problem, optimum, [torch.zeros_like(x[:-1]), _towards_neighbours(x, generator)])
+    expansion = _finite(optimum)
+    near = _trusted(expansion, _towards_neighbours(expansion.x, generator), TRUSTED_NEAR)
+    return _examples(problem, optimum, [torch.zeros_like(near), near])
 
 
-def examples_visited(problem: Problem, optimum: Optimum, law: Callable[[int, State], Control]) -> Examples:
-    """A row at each state that a law leads to from where the optimal trajectories begin, as their expansions say.
+def examples_visited(problem: Problem, optimum: Optimum, path: Path) -> Examples:
+    """A row at each state that a law led to from where the optimal trajectories begin, as their expansions say.
 
     A law that V defines leaves the states that V was fitted at, along directions in which V is then free; so the
     states of that very law are examples too. Those too far from the optimum for its expansion are drawn nearer.
@@ -58,27 +72,34 @@ def examples_visited(problem: Problem, optimum: Optimum, law: Callable[[int, Sta
     Source: Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
     learning", AISTATS 2011, for the loop.
     """
-    expansion, mean_cost = _finite(optimum), _mean_cost(optimum)
-    deviation = path_under(in_float64(problem), law, expansion.x[0]).x[:-1] - expansion.x[:-1]
+    expansion = _finite(optimum)
+    deviation = path.x[:-1] - expansion.x[:-1]
+    return _examples(problem, optimum, [_trusted(expansion, deviation, TRUSTED)])
+
+
+def _trusted(expansion: Expansion, deviation: StatePath, share: float) -> StatePath:
+    """Deviations (N, b, n) from trajectories, drawn nearer where ½ δᵀ|H|δ is more than a share of the cost."""
     values, vectors = torch.linalg.eigh(expansion.hessian[:-1])
     quadratic = (apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2
-    share = (TRUSTED * mean_cost / quadratic).sqrt().clamp_max(1)
-    return _examples(problem, optimum, [share[..., None] * deviation])
+    ratio = share * _cost_of(expansion) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
+    return ratio.sqrt().clamp_max(1)[..., None] * deviation
 
 
 def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor]) -> Examples:
     """The rows at some deviations (N, b, n) from the finite trajectories."""
     problem, expansion = in_float64(problem), _finite(optimum)
     parts = zip(*(_columns(problem, expansion, each) for each in deviations), strict=True)
-    return Examples(*(torch.cat(columns) for columns in parts), _mean_cost(optimum), problem.horizon.duration)  # pyright: ignore
+    return Examples(*(torch.cat(columns) for columns in parts), problem.horizon.duration)  # pyright: ignore
 
 
 def _finite(optimum: Optimum) -> Expansion:
     return optimum.expansion.member(optimum.path.cost.isfinite())
 
 
-def _mean_cost(optimum: Optimum) -> float:
-    return float(optimum.path.cost[optimum.path.cost.isfinite()].mean())
+def _cost_of(expansion: Expansion) -> PerState:
+    """What errors of V along each trajectory are held against: its cost, or the median of all if that is more."""
+    cost = expansion.value[0]
+    return cost.clamp_min(float(cost.median()) or float(cost.mean()))
 
 
 def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
@@ -105,36 +126,55 @@ def _columns(problem: Problem, expansion: Expansion, deviation: Tensor) -> list[
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
     target = gradient[1:] + apply(H, drifted - x[1:])
-    t = problem.horizon.times(now)[:, None].expand(value.shape)
-    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], drifted, target, weight)]
+    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(expansion).expand(here.shape)
+    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], drifted, target, weight, cost)]
 
 
 def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
-    """Of some of the examples: the mean of (V − V*)²/J̄², and of T/(2J̄) ‖L⁻¹gᵀ(V_x − V_x*)‖².
+    """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹gᵀ(V_x − V_x*)‖².
 
-    The second is what the held controls of V cost beyond the optimum, to second order, as a share of J̄: a step with
+    The second is what the held controls of V cost beyond the optimum, to second order, as a share of J: a step with
     controls u + e costs ½ Δt eᵀ(2R + Δt gᵀHg)e more.
     """
-    t, x, value, after, drifted, gradient, weight = (column[rows] for column in examples[:7])
+    t, x, value, after, drifted, gradient, weight, cost = (column[rows] for column in examples.columns)
     wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]
-    excess = examples.duration / (2 * examples.mean_cost) * (wrong**2).sum((-2, -1)).mean()
-    return ((V(t, x) - value) ** 2).mean() / examples.mean_cost**2, excess
+    excess = examples.duration / 2 * ((wrong**2).sum((-2, -1)) / cost).mean()
+    return (((V(t, x) - value) / cost) ** 2).mean(), excess
+
+
+def misfit(V: ValueFunction, examples: Examples) -> float:
+    """What a fit lowers, at about SOME of the examples."""
+    some = slice(None, None, max(1, len(examples.t) // SOME))
+    with torch.no_grad():
+        value_error, excess = errors(V, examples.to(next(V.parameters())), some)
+    return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
 
 
 def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:
-    """Lower both errors of V at examples from optimal trajectories, and then where its own law leads too."""
+    """Lower both errors of V at examples from optimal trajectories, and then where its own law leads too.
+
+    The second is repeated, ROUNDS times at most, until the law costs no more than GOOD times the optima. The V whose
+    law cost least stays.
+    """
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
-    times = learner.problem.horizon.times(goal)
-    _lower(learner.V, examples, rows, STEPS[0], RATE[0])
-    visited = examples_visited(learner.problem, optimum, lambda n, x: policy(times[n], x.to(goal)).to(x))
-    _lower(learner.V, examples.with_further(visited), rows, STEPS[1], RATE[1])
+    exact, times, optima = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
+    best, least = learner.V.state_dict(), (0.0, math.inf)
+    for k in range(ROUNDS + 1):
+        _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)])
+        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optima.x[0])
+        now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
+        if now < least:
+            best, least = copy.deepcopy(learner.V.state_dict()), now
+        if k and now[1] <= GOOD * float(optima.value[0].mean()):
+            break
+        examples = examples.with_further(examples_visited(learner.problem, optimum, path))
+    learner.V.load_state_dict(best)
 
 
 def _lower(V: ValueFunction, examples: Examples, generator: torch.Generator, steps: int, rate: float) -> None:
     """Lower both errors at the examples, by Adam."""
     trained = [p for p in V.parameters() if p.requires_grad]
-    columns = [column.to(trained[0]) for column in examples[:7]]
-    examples = Examples(*columns, *examples[7:])  # pyright: ignore[reportCallIssue]
+    examples = examples.to(trained[0])
     optimizer = torch.optim.Adam(trained, rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, rate / 1000)
     for _ in range(steps):

@@ -13,6 +13,7 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.expansions import (
     TRIES,
     Expansion,
+    Optimum,
     at_rest,
     greedy_law,
     in_float64,
@@ -25,12 +26,13 @@ from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
-from lyapnet.training.pretraining import examples_of, fit
+from lyapnet.training.pretraining import Examples, examples_of, fit, misfit
 from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
 CLOSE, FEW = 1e-5, 16  # share of the cost by which nothing may improve on a law that leaves nothing to fit, from FEW
+SPREAD = 0.35  # of the distances from the goal along optima, in units of which a network begins without an expansion
 CALM = "V = 0"
 
 Report = Callable[[str], None]
@@ -71,7 +73,8 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     """Put the best of what is known into the networks of learners of one problem; None where there is no place.
 
     Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws: V = 0, each
-    expansion, and the best expansion with its network fitted to optima from further states of X₀.
+    expansion, and the expansion that is least wrong along optima from further states of X₀, or nothing, with its
+    network fitted to them.
 
     Args:
         report: told what is being done.
@@ -83,19 +86,19 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
     report("the optimum from the centre of X₀")
-    began, expansions = time.perf_counter(), dict[str, Expansion]()
-    tried = [_tried(CALM, learners[0], x0, began)]
+    began, expansions, tried = time.perf_counter(), dict[str, Expansion](), list[Candidate]()
     for name, expansion in expansions_of(problem):
         expansions[name] = expansion
         take(networks[0], problem, expansion, kept, x0)
         tried.append(_tried(name, learners[0], x0, began))
         networks[0].load_state_dict(calm[0])
+    tried.insert(0, _tried(CALM, learners[0], x0, began))
     if expansions:
         base = _best(tried[1:])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
         if _can_be_improved(problem, expansions[base.name], x0[:FEW]):
-            tried += _fitted(learners, list(expansions.values()), base, x0, began, report)
+            tried += _fitted(learners, list(expansions.values()), calm, base, x0, began, report)
     chosen = _best(tried)
     if chosen.name == CALM:
         for network, state in zip(networks, calm, strict=True):
@@ -124,6 +127,7 @@ def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:
 def _fitted(
     learners: Sequence[Learner],
     expansions: Sequence[Expansion],
+    calm: Sequence[dict[str, Tensor]],
     base: Candidate,
     x0: State,
     began: float,
@@ -141,6 +145,7 @@ def _fitted(
     if not found:
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
+    _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
     report(f"fitting V to {found} optima")
     for learner in learners:
         fit(learner, optimum, examples)
@@ -149,6 +154,38 @@ def _fitted(
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
     return [fitted]
+
+
+def _take_least_wrong(
+    learners: Sequence[Learner],
+    expansions: Sequence[Expansion],
+    calm: Sequence[dict[str, Tensor]],
+    optimum: Optimum,
+    examples: Examples,
+    x0: State,
+) -> None:
+    """Put into the networks what a fit to examples begins with: of several expansions, and none, the least wrong one.
+
+    An expansion says much near its own path, and away from it, in a task with limits or several ways to the goal, worse
+    than nothing.
+    """
+    problem, kept, first = learners[0].problem, _kept(learners[0].V), learners[0]
+
+    def put(choice: Expansion | None, learner: Learner, own: dict[str, Tensor]) -> None:
+        network = _network_of(learner.V)
+        network.load_state_dict(own)
+        if choice is None:
+            take_nothing(network, problem, optimum, kept)
+        else:
+            take(network, problem, choice, kept, x0)
+
+    choices, wrong = [*expansions, None], list[float]()
+    for choice in choices:
+        put(choice, first, calm[0])
+        wrong.append(misfit(first.V, examples))
+    best = choices[wrong.index(min(wrong))]
+    for learner, own in zip(learners, calm, strict=True):
+        put(best, learner, own)
 
 
 def _best(candidates: Sequence[Candidate]) -> Candidate:
@@ -183,11 +220,29 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
 def take(network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept: list[int], x0: State) -> None:
     """Start a network from an expansion."""
     expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
-    moves = network.moves.double().cpu()  # of the others, no law asks how V curves in them
-    values, vectors = torch.linalg.eigh(expansion.hessian * moves[:, None] * moves)
-    curvature = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
+    curvature = _curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
     network.take(*(part.to(network.scale) for part in parts))
+
+
+def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, kept: list[int]) -> None:
+    """Start a network from V = 0, in units of where optima lead, what they cost, and how V curves along them."""
+    expansion = optimum.expansion.restricted_to(kept)
+    moves = network.moves.cpu() > 0
+    centre = problem.goal.double().cpu()[kept].where(moves, expansion.x.mean((0, 1)))
+    spread = SPREAD * ((expansion.x - centre) ** 2).mean((0, 1)).sqrt()
+    size = expansion.hessian.abs().amax((0, -2, -1))
+    curvature = _curvature(network, expansion.hessian[:, size <= size.median()].mean(1))
+    cost, like = float(optimum.path.cost.median()), network.scale
+    t = problem.horizon.times(expansion.x)
+    network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
+
+
+def _curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:
+    """The positive part of V_xx in the states that move; of the others, no law asks how V curves in them."""
+    moves = network.moves.double().cpu()
+    values, vectors = torch.linalg.eigh(hessian * moves[:, None] * moves)
+    return (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
 
 
 def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:

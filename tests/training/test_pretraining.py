@@ -61,7 +61,7 @@ def test_the_excess_is_what_wrong_controls_cost(problem):
     _, excess = errors(V, along)
     expected = float(path.cost - optimum.path.cost)
     assert expected > 0.01
-    assert float(excess.detach()) * along.mean_cost == pytest.approx(expected, rel=1e-9)
+    assert float(excess.detach()) * float(along.cost[0]) == pytest.approx(expected, rel=1e-9)
 
 
 def at(x, problem):
@@ -91,7 +91,7 @@ def learner_of(problem, value_scale):
 def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     problem, seen, unseen = swing
     examples, others = (examples_of(problem, optimum, GENERATOR) for optimum in (seen, unseen))
-    learner = learner_of(problem, examples.mean_cost)
+    learner = learner_of(problem, float(examples.cost.mean()))
     before = [float(error.detach()) for error in errors(learner.V, others)]
     fit(learner, seen, examples)
     after = [float(error.detach()) for error in errors(learner.V, others)]
@@ -99,18 +99,70 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     assert after[1] < before[1] / 20
 
 
+def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(swing, monkeypatch):
+    """At most ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
+    problem, seen, _ = swing
+    given, costs = examples_of(problem, seen, GENERATOR), list[float]()
+    mean = float(seen.path.cost.mean())
+
+    def fitted(*pretended):
+        """The cost of the law that is kept, and of each that was tried; the mean cost of each is pretended."""
+        costs.clear()
+
+        def pretending(*arguments):
+            path = path_under(*arguments)
+            costs.append(float(path.cost.mean()))
+            return path._replace(cost=path.cost * pretended[len(costs) - 1] * mean / path.cost.mean())
+
+        monkeypatch.setattr(pretraining, "path_under", pretending)
+        learner = learner_of(problem, mean)
+        fit(learner, seen, given)
+        return float(learner.rollout(seen.path.x[0]).cost.mean().detach())
+
+    kept = fitted(2, 1.5, 1.01)
+    assert len(costs) == 3
+    assert kept == pytest.approx(costs[2], rel=1e-6)
+    kept = fitted(2, 1.5, 1.2, 1.4, 1.3, 1)
+    assert len(costs) == 1 + pretraining.ROUNDS
+    assert kept == pytest.approx(costs[2], rel=1e-6)
+    assert costs[2] != pytest.approx(costs[4], rel=1e-6)
+
+
+def test_near_states_are_no_further_than_their_expansion_is_believed(swing):
+    problem, seen, _ = swing
+    along, near = examples_of(problem, seen, GENERATOR).x.reshape(2, problem.horizon.steps, 12, 2)
+    H, delta = seen.expansion.hessian[:-1], near - along
+    quadratic = (delta[..., None, :] @ H @ delta[..., None])[..., 0, 0].abs() / 2
+    cost = seen.path.cost.clamp_min(float(seen.path.cost.median()))
+    assert bool((quadratic <= (1 + 1e-9) * cost).all())
+
+
+def test_errors_count_against_what_their_own_trajectory_costs(problem):
+    """From a state that is dear, a V that is off by a tenth is off as much as from others; from a cheap one, less."""
+    x0 = torch.tensor([[1.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
+    optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
+    examples, exact = examples_of(problem, optimum, GENERATOR), shifted(problem, 0.0)
+    wrong = Formula(lambda t, x: 1.1 * exact(t, x))
+    off = [errors(wrong, examples, torch.tensor([row]))[0].item() for row in range(3)]
+    assert off == pytest.approx([0.01 * 1e-4, 0.01, 0.01], rel=1e-6)
+
+
 def test_the_states_that_a_law_visits_are_examples(problem):
     """Of a linear problem, whose expansions are exact wherever they are asked."""
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
     law = at_rest(problem)
-    visited = examples_visited(problem, optimum, law)
+    led_path = path_under(problem, law, optimum.path.x[0])
+    visited = examples_visited(problem, optimum, led_path)
     x = visited.x.reshape(problem.horizon.steps, 6, problem.system.n)
-    led, best = path_under(problem, law, optimum.path.x[0]).x[:-1], optimum.path.x[:-1]
+    led, best = led_path.x[:-1], optimum.path.x[:-1]
     share = ((x - best) * (led - best)).sum(-1) / ((led - best) ** 2).sum(-1).clamp_min(1e-12)
     assert_close(x - best, share[..., None] * (led - best))
     assert bool((share[1:] > 0).all())
     assert float(share.min()) < 0.9, "what lies far from the optimum is drawn nearer"
-    assert float(share[1].max()) == pytest.approx(1), "and what lies near it is not"
+    near = examples_visited(
+        problem, optimum, led_path._replace(x=optimum.path.x + 0.01 * (led_path.x - optimum.path.x))
+    )
+    assert_close(near.x.reshape(x.shape), best + 0.01 * (led - best), msg="and what lies near it is not")
     for error in errors(shifted(problem, 0.0), visited):
         assert float(error.detach()) < 1e-20
     assert float(errors(shifted(problem, 0.1), visited)[1].detach()) > 1e-6
@@ -119,8 +171,9 @@ def test_the_states_that_a_law_visits_are_examples(problem):
 
 def test_a_law_that_diverges_leaves_finite_examples(problem):
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(4))
-    visited = examples_visited(problem, optimum, lambda _, x: 1e40 * x[..., :1] * x.norm())
-    assert all(column.isfinite().all() for column in visited[:7])
+    path = path_under(problem, lambda _, x: 1e40 * x[..., :1] * x.norm(), optimum.path.x[0])
+    visited = examples_visited(problem, optimum, path)
+    assert all(column.isfinite().all() for column in visited.columns)
 
 
 def test_only_finite_trajectories_are_examples(problem):
@@ -130,4 +183,4 @@ def test_only_finite_trajectories_are_examples(problem):
     broken[1] = torch.inf
     examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)), GENERATOR)
     assert len(examples.t) == 2 * 2 * problem.horizon.steps
-    assert_close(examples.mean_cost, float(optimum.path.cost[[0, 2]].mean()))
+    assert_close(examples.cost.unique(), optimum.path.cost[[0, 2]].sort().values)

@@ -16,7 +16,7 @@ from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.training.build import build_module
 from lyapnet.training.modules import OptimizerOptions
-from lyapnet.training.start import CALM, choose_start
+from lyapnet.training.start import CALM, choose_start, expansions_of
 
 LINEAR = {
     "experiment": "mine",
@@ -83,8 +83,9 @@ def test_far_from_the_goal_optima_are_the_best_start():
     assert {"the optimum from the centre of X₀", "12 optima from states of X₀"} < costs.keys()
     assert start.chosen.cost == min(costs.values())
     seconds = [candidate.seconds for candidate in start.candidates]
-    assert seconds[0] > 0
-    assert seconds == sorted(seconds)
+    assert seconds[1] > 0
+    assert seconds[1:] == sorted(seconds[1:])
+    assert seconds[2] < seconds[0] < seconds[3], "V = 0 is tried where what is quick to know is known"
     assert costs[CALM] > 10 * start.chosen.cost
     mean = learner.rollout(learner.problem.initial_states.sample(64)).cost.mean()
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
@@ -141,6 +142,22 @@ def test_states_that_V_ignores_are_left_out_of_the_expansion():
     x = learner.problem.initial_states.sample(5)
     assert_close(learner.V(torch.zeros(()), x), whole.V(torch.zeros(()), x[:, :2]), rtol=1e-9, atol=0)
     assert start.chosen.cost == pytest.approx(same.chosen.cost, rel=0.3)
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_a_fit_does_not_begin_with_an_expansion_that_is_worse_than_nothing(wrong, monkeypatch):
+    def bent(problem):
+        for name, expansion in expansions_of(problem):
+            yield name, expansion._replace(hessian=30 * expansion.hessian) if wrong else expansion
+
+    monkeypatch.setattr("lyapnet.training.start.expansions_of", bent)
+    (learner,), start = started(SWING)
+    assert start.chosen.cost < 20
+    assert start.chosen.name == "12 optima from states of X₀" or not wrong
+    t = torch.zeros(())
+    value, slope, *_ = learner.V.expansion(t)
+    assert (value == slope == 0) == wrong
+    assert bool(learner.V.curvature(t).any()), "what stands for V_xx in the law comes from the optima then"
 
 
 def test_fitting_to_optima_is_kept_where_it_is_better_and_taken_back_where_not(monkeypatch):

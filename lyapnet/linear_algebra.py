@@ -41,6 +41,18 @@ def solve(A: Tensor, B: Tensor) -> Tensor:
     return torch.cat([e * first - b * second, a * second - c * first], -2) / (a * e - b * c)
 
 
+def is_positive_definite(A: Tensor) -> Tensor:
+    """Whether each symmetric A (*batch, d, d) has positive pivots; Booleans of shape (*batch,)."""
+    d, definite = A.shape[-1], A[..., 0, 0] > 0
+    if d > UNROLLED:
+        return torch.linalg.cholesky_ex(A).info == 0
+    for _ in range(d - 1):
+        pivot = A[..., :1, :1]
+        A = A[..., 1:, 1:] - A[..., 1:, :1] * A[..., :1, 1:] / torch.where(pivot > 0, pivot, 1.0)
+        definite = definite & (A[..., 0, 0] > 0)
+    return definite
+
+
 class _Inverse(torch.autograd.Function):
     """A ↦ A⁻¹ of symmetric positive definite A, from its lower triangle, entry by entry over the batch.
 

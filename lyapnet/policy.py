@@ -3,13 +3,17 @@
 from typing import NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.expansions import held_control, riccati
 from lyapnet.interpolation import Curve
+from lyapnet.linear_algebra import apply, is_positive_definite, multiply
 from lyapnet.problem import Problem
 from lyapnet.types import Control, PerState, State, Time
+
+DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
+CONVEX = 0.1  # share of 2R by which a step's curvature has to exceed zero
 
 
 class PolicyOutput(NamedTuple):
@@ -119,11 +123,99 @@ class SampledPolicy(ValuePolicy):
             self.riccati = Curve(problem.horizon.times(problem.goal), riccati(problem).hessian.to(problem.goal))
 
     def forward(self, t: Time, x: State) -> Control:
-        after = (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
-        H = self.V.curvature(after) if self.riccati is None else self.riccati(after)
-        assert H is not None
+        after = self._after(t)
         V_x = self.V.value_and_state_gradient(after, self.problem.drifted(x))[1]
-        return held_control(self.problem, x, V_x, H)
+        return held_control(self.problem, x, V_x, self._curvature(after))
+
+    def _after(self, t: Time) -> Time:
+        """t + Δt, within the horizon."""
+        return (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
+
+    def _curvature(self, t: Time) -> Tensor:
+        """H, (*batch, n, n)."""
+        H = self.V.curvature(t) if self.riccati is None else self.riccati(t)
+        assert H is not None
+        return H
 
 
-POLICIES: dict[str, type[ValuePolicy]] = {"hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy}
+class LookaheadPolicy(SampledPolicy):
+    """The same minimiser, of V itself and not of a model of its curvature that is one for all states:
+
+        u = argmin over u ∈ U of Q(u) = Δt uᵀRu + V(t + Δt, x + Δt(f + gu)).
+
+    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = 2R + Δt gᵀV_xx g, or H in the place of V_xx where that
+    is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
+    close to state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit
+    function theorem), up to what the steps leave of Q_u.
+
+    Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
+    Wright, Numerical Optimization, 2006, ch. 3 (the steps).
+    """
+
+    def forward(self, t: Time, x: State) -> Control:
+        u = super().forward(t, x).detach()
+        step = _HeldStep(self.problem, self.V, self._after(t), x)
+        H = self._curvature(step.after)
+        with torch.no_grad():
+            for _ in range(DESCENTS):
+                u = step.descended(u, H)
+        moved = step.newton(u, H)
+        return u + (moved - moved.detach())
+
+
+class _HeldStep:
+    """One step from x with u held: Q(u) = Δt (u − u*)ᵀR(u − u*) + V(t + Δt, x + Δt(f + gu)), and ways down it."""
+
+    def __init__(self, problem: Problem, V: ValueFunction, after: Time, x: State):
+        self.problem, self.V, self.after = problem, V, after
+        self.drifted, self.g, self.R = problem.drifted(x), problem.system.g(x), problem.cost.R(x)
+
+    def descended(self, u: Control, H: Tensor) -> Control:
+        """The best of u and some shares of the Newton step from it."""
+        direction = self.newton(u, H) - u
+        best, least = u, self._paid(u)
+        for share in SHARES:
+            tried = self.problem.controls.project(u + share * direction)
+            paid = self._paid(tried)
+            better = paid < least
+            best, least = torch.where(better[..., None], tried, best), torch.where(better, paid, least)
+        return best
+
+    def newton(self, u: Control, H: Tensor) -> Control:
+        """The minimiser over U of Q to second order around u, with its curvature as a number."""
+        slope, curvature = self._slope(u), self._curved(u.detach(), H)
+        return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
+
+    def _from_rest(self, u: Control) -> Control:
+        rest = self.problem.cost.rest
+        return u if rest is None else u - rest
+
+    def _next(self, u: Control) -> State:
+        return self.drifted + self.problem.horizon.dt * apply(self.g, self._from_rest(u))
+
+    def _paid(self, u: Control) -> PerState:
+        """Q."""
+        v = self._from_rest(u)
+        return self.problem.horizon.dt * (v * apply(self.R, v)).sum(-1) + self.V(self.after, self._next(u))
+
+    def _slope(self, u: Control) -> Control:
+        """Q_u/Δt."""
+        V_x = self.V.value_and_state_gradient(self.after, self._next(u))[1]
+        return 2 * apply(self.R, self._from_rest(u)) + apply(self.g.mT, V_x)
+
+    def _curved(self, u: Control, H: Tensor) -> Tensor:
+        """Q_uu/Δt where that is convex, else with H for V_xx; without a graph."""
+        g, R2 = self.g.detach(), 2 * self.R.detach()
+        with torch.enable_grad():
+            z = self._next(u).detach().requires_grad_()
+            LgV = apply(g.mT, self.V.value_and_state_gradient(self.after, z)[1])
+            rows = [torch.autograd.grad(each.sum(), z, retain_graph=True)[0] for each in LgV.unbind(-1)]
+        own = self.problem.horizon.dt * multiply(torch.stack(rows, -2).detach(), g)
+        own = R2 + (own + own.mT) / 2
+        model = R2 + self.problem.horizon.dt * multiply(g.mT, multiply(H.detach(), g))
+        return torch.where(is_positive_definite(own - CONVEX * R2)[..., None, None], own, model)
+
+
+POLICIES: dict[str, type[ValuePolicy]] = {
+    "hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy, "lookahead": LookaheadPolicy,
+}  # fmt: skip

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.linear_algebra import SMALL, UNROLLED, apply, multiply, solve
+from lyapnet.linear_algebra import SMALL, UNROLLED, apply, is_positive_definite, multiply, solve
 
 batches = pytest.mark.parametrize("batch", [(), (4,), (2, 3)], ids=str)
 
@@ -31,6 +31,16 @@ def test_solve(d, columns, batch):
     agree(solve, torch.linalg.solve, A, B, tolerance=1e-10)
     with pytest.raises(AssertionError):
         agree(lambda A, B: solve(A.mT + 1e-6, B), torch.linalg.solve, A, B, tolerance=1e-10)
+
+
+@batches
+@pytest.mark.parametrize("d", [1, 2, 3, UNROLLED, UNROLLED + 1])
+def test_is_positive_definite(d, batch):
+    half = torch.randn(100, *batch, d, d)
+    A = half + half.mT + 2 * torch.rand(100, *[1] * len(batch), 1, 1) * math.sqrt(d) * torch.eye(d)
+    expected = (torch.linalg.eigvalsh(A) > 0).all(-1)
+    assert torch.equal(is_positive_definite(A), expected)
+    assert 0 < expected.double().mean() < 1, "some are, and some are not"
 
 
 def test_solve_pivots_where_the_first_entry_is_zero():

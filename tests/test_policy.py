@@ -8,10 +8,10 @@ from scipy.linalg import solve_continuous_are
 from torch.testing import assert_close
 
 from lyapnet.calculus import gradients, time_derivative
-from lyapnet.cost import QuadraticCost
+from lyapnet.cost import QuadraticCost, TargetCost
 from lyapnet.networks import PartiallyConvexNetwork, Scaling
 from lyapnet.networks.anchored import GoalAnchor
-from lyapnet.policy import POLICIES, HJBPolicy, SampledPolicy, SontagPolicy
+from lyapnet.policy import POLICIES, HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
 from lyapnet.sets import ControlBox, ControlSet
 from lyapnet.systems import DoubleIntegrator, Linear
 from tests.problems import Formula, problem_of
@@ -241,6 +241,77 @@ def test_the_sampled_law_within_limits_is_the_best_held_control():
     assert problem.controls.contains(u).all()
     assert (paid(u[:, None])[:, 0] <= paid(grid[None]).amin(1) + 1e-12).all()
     assert (paid(0.9 * u[:, None])[:, 0] > paid(u[:, None])[:, 0]).all(), "another control costs more"
+
+
+def steep(t, x):
+    """A wall: no quadratic that is the same for all states is close to it."""
+    return (x**2).sum(-1) + 5 * torch.relu(x[..., 0] + x[..., 1] - 0.5) ** 3
+
+
+@pytest.fixture(params=[None, ControlBox([-3.0], [1.0])], ids=["free", "limited"])
+def held(request):
+    """A problem of one control, and Q(u) of one held step from some states by its definition."""
+    problem = problem_of(DoubleIntegrator(), dt=0.3, controls=request.param)
+
+    def paid(x, u):
+        return 0.3 * (u**2).sum(-1) + steep(None, x + 0.3 * problem.system.dynamics(x, u))
+
+    return problem, paid
+
+
+def test_the_lookahead_law_is_the_best_held_control_where_V_is_steep(held):
+    problem, paid = held
+    x, V, t = torch.rand(200, 2) - 0.5, Formula(steep), torch.tensor(0.0)
+    grid = torch.linspace(-12, 12, 24_001)
+    grid = grid[problem.controls.contains(grid[:, None])]
+    least = paid(x[:, None].expand(-1, len(grid), -1), grid[:, None].expand(200, -1, 1)).amin(1)
+    excess = {law: paid(x, POLICIES[law](problem, V)(t, x).detach()) - least for law in ("lookahead", "sampled")}
+    assert float(excess["lookahead"].max()) < 1e-4
+    assert float(excess["sampled"].max()) > 0.5
+    assert problem.controls.contains(POLICIES["lookahead"](problem, V)(t, x)).all()
+
+
+def test_the_derivative_of_the_lookahead_law_is_that_of_the_minimiser(held):
+    problem, paid = held
+    x, h = torch.rand(50, 2) - 0.5, 1e-6
+    law = LookaheadPolicy(problem, Formula(steep))
+    states = x.clone().requires_grad_()
+    u = law(torch.tensor(0.0), states)
+    slope = torch.autograd.grad(u.sum(), states)[0]
+
+    def minimiser(x):
+        """By bisection of Q_u, which rises."""
+        least, most = (torch.full((len(x), 1), each) for each in (-30.0, 30.0))
+        for _ in range(60):
+            middle = ((least + most) / 2).requires_grad_()
+            rising = torch.autograd.grad(paid(x, middle).sum(), middle)[0] > 0
+            least, most = torch.where(rising, least, middle).detach(), torch.where(rising, middle, most).detach()
+        return problem.controls.project(most)
+
+    exact = torch.stack([(minimiser(x + h * e) - minimiser(x - h * e))[:, 0] / (2 * h) for e in torch.eye(2)], -1)
+    smooth = ((x + 0.3 * problem.system.dynamics(x, u.detach())).sum(-1) - 0.5).abs() > 1e-3
+    assert_close(u.detach(), minimiser(x), rtol=0, atol=5e-3)
+    assert_close(slope[smooth], exact[smooth], rtol=0.02, atol=1e-3)
+    assert float(exact.abs().max()) > 1
+
+
+def test_with_a_quadratic_V_the_lookahead_law_is_the_sampled_one():
+    """About a target too, whose control is not zero; two controls with a coupled R."""
+    system = Linear([[0.0, 1.0], [-1.0, 0.3]], [[1.0, 0.2], [0.0, 1.0]])
+    cost = QuadraticCost(torch.eye(2), [[1.0, 0.4], [0.4, 0.5]], torch.eye(2))
+    P = torch.tensor([[3.0, 1.0], [1.0, 2.0]])
+
+    class Known(Formula):
+        def curvature(self, t):
+            return 2 * P
+
+    for about in (cost, TargetCost(cost, [0.5, 0.2], [0.3, -0.1])):
+        goal = problem_of(system, about).goal
+        V = Known(lambda t, x, goal=goal: ((x - goal) @ P * (x - goal)).sum(-1) + 0.7 * (x - goal).sum(-1))
+        problem = problem_of(system, about, dt=0.3)
+        t, x = torch.tensor(0.1), torch.randn(20, 2)
+        assert_close(LookaheadPolicy(problem, V)(t, x), SampledPolicy(problem, V)(t, x))
+        assert not torch.allclose(LookaheadPolicy(problem, V)(t, x), HJBPolicy(problem, V)(t, x), rtol=1e-2)
 
 
 def test_sontags_formula_is_refused_where_controls_are_limited(V):

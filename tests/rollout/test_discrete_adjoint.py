@@ -172,7 +172,7 @@ VALUES = {
     "terminal": lambda cost: TerminalAnchor(FCN(SCALING, (5,)), cost, HORIZON.duration),
     "user": lambda cost: WithoutFormula(FCN(SCALING, (5, 4))),
 }
-IN_TRACE = {"anchored": "hjb", "fcn": "sontag", "expansion": "sampled"}
+IN_TRACE = {"anchored": "hjb", "fcn": "sontag", "expansion": "sampled", "angles": "lookahead"}
 
 
 @double_integrator
@@ -185,7 +185,7 @@ def test_every_network_under_every_control_law(value, law, system, cost, x0):
     by_law = {name: routes(system, cost, policy(problem_of(system, cost), V)) for name, policy in POLICIES.items()}
     is_exact(by_law[law], x0)
     slopes_of = {name: slopes(backprop, x0) for name, (_, backprop) in by_law.items()}
-    assert all(error(slopes_of[law], other) > 1e-3 for name, other in slopes_of.items() if name != law)
+    assert all(error(slopes_of[law], other) > 1e-4 for name, other in slopes_of.items() if name != law)
 
 
 def test_gradient_by_formula_and_by_autograd_are_the_same(system, cost, V, x0):

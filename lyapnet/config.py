@@ -27,7 +27,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 
 
 # What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
-# and a registered program has the weights that it recommends.
+# a registered program has the weights that it recommends, and with constraints, where V is steep, the law looks ahead.
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
@@ -49,6 +49,9 @@ class ProgramConfig:
     trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
     normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
     cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
+    relative: bool | None = option(
+        None, "Measure that distance against the cost of each trajectory, not against their mean (value only)."
+    )
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
     bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
     parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
@@ -272,7 +275,10 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     sections = {key: content[key] for key in STANDARD if isinstance(content.get(key), Mapping)}
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
-    standard = {key: {**section, **sections.get(key, {})} for key, section in STANDARD.items()}
+    recipe = dict(STANDARD)
+    if content.get("constraints") or any(each.startswith("constraints") for each in overrides):
+        recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
+    standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     program = standard["program"]
     named = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))]
     known = PROGRAMS.get(str(named[-1]))

@@ -330,6 +330,17 @@ def test_four_sections_in_a_file_are_enough(tmp_path, plain):
     assert build_module(config).members[0].rollout.gradient == "discrete"
 
 
+def test_with_constraints_the_standard_law_looks_ahead(plain):
+    task = {"experiment": "mine", **{section: plain[section] for section in FOUR}}
+    limits = {"upper": {"position": 2}}
+    assert config_from_plain({**task, "constraints": limits}).rollout.policy == "lookahead"
+    assert config_from_plain(task, ["constraints.upper.position=2"]).rollout.policy == "lookahead"
+    assert config_from_plain({**task, "constraints": limits}, ["rollout.policy=sampled"]).rollout.policy == "sampled"
+    own = {**task, "constraints": limits, "rollout": {"policy": "hjb"}}
+    assert config_from_plain(own).rollout.policy == "hjb"
+    assert config_from_plain(task).rollout.policy == "sampled"
+
+
 def test_what_a_file_says_comes_on_top_of_the_standard_recipe(plain):
     task = {"experiment": "mine", **{section: plain[section] for section in FOUR}}
     config = config_from_plain({**task, "program": {"name": "lyapunov", "margin": 0.1}, "training": {"batch_size": 7}})

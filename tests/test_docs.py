@@ -1,6 +1,7 @@
 """What the README and the pages under docs/ link, show and name: all of it is there, and nothing is forgotten."""
 
 import dataclasses
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -189,5 +190,5 @@ def test_the_table_names_what_is_registered(part):
 def test_the_weights_that_programs_recommend_are_what_the_page_says():
     page = " ".join(PAGES[ROOT / "docs" / "config.md"].split())
     for name, program in PROGRAMS.items():
-        weights = [f"`{key}: {value}`" for key, value in program.recommended.items()]
+        weights = [f"`{key}: {json.dumps(value)}`" for key, value in program.recommended.items()]
         assert f"`{name}` {', '.join(weights[:-1])} and {weights[-1]}" in page

@@ -32,13 +32,14 @@ class Program(ABC):
     program may add further terms. A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is
     the paper's program.
 
-    With `normalise`, the weights are numbers without units: every term is measured against the batch's mean cost
-    J̄ (detached; C as the mean over time), but J, which enters as log J̄, whose gradient is ∇J̄/J̄.
+    With `normalise`, the weights are numbers without units: every term is measured against its `unit`, the batch's mean
+    cost J̄ (detached; C as the mean over time) unless told otherwise, but J, which enters as log J̄, whose gradient is
+    ∇J̄/J̄.
     """
 
     degree: ClassVar[int]  # all terms but J are of this degree in units of cost
     weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
-    recommended: ClassVar[Mapping[str, float]] = {}  # arguments in the standard recipe
+    recommended: ClassVar[Mapping[str, float | bool]] = {}  # arguments in the standard recipe
 
     constraint: float = 1.0
     terminal: float = 0.0
@@ -78,14 +79,18 @@ class Program(ABC):
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
-            mean_cost = mean_over_processes(J.detach())
-            terms = {name: term / mean_cost**self.degree for name, term in terms.items()}
+            mean_cost, cost = mean_over_processes(J.detach()), trajectory.cost.detach()
+            terms = {name: (term / self.unit(name, cost, mean_cost)).mean() for name, term in per_state.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
             # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
             terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
+
+    def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
+        """What a term of trajectories of some cost J is measured against: J̄ to the power of its degree."""
+        return mean_cost**self.degree
 
     def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
         """What this program promises of one closed loop, by default: J within 5 % of V(0, x₀), and ‖x(T) − goal‖

@@ -10,24 +10,34 @@ from lyapnet.programs.terms import cost_to_go_error, residual, terminal_residual
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
+LEAST = 0.05  # of the mean cost, against which an error of V counts where the cost itself is less
+
 
 @dataclass(frozen=True)
 class ValueProgram(Program):
     """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244.
 
     The loss has a further term, cost_to_go · D, with D the mean over the nodes of (V_n − J_n)², J_n being what the
-    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly.
+    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly. With
+    `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is then
+    right in relation to what it costs from where that is little, too.
     """
 
     degree = 2
     weighted = (*Program.weighted, "cost_to_go")
-    recommended = MappingProxyType({"constraint": 0, "cost_to_go": 10, "trajectory_cost": 1})
+    recommended = MappingProxyType({"constraint": 0, "cost_to_go": 10, "trajectory_cost": 1, "relative": True})
 
     cost_to_go: float = 0.0
+    relative: bool = False
 
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
         error = cost_to_go_error(values, trajectory.step_cost, trajectory.terminal_cost)
         return {**super().per_state(values, trajectory), "cost_to_go": error}
+
+    def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
+        if self.relative and name == "cost_to_go":
+            return cost.maximum(LEAST * mean_cost) ** 2
+        return super().unit(name, cost, mean_cost)
 
     def penalty(self, excess: Tensor) -> Tensor:
         return excess**2

@@ -113,6 +113,22 @@ def test_value_program_weighs_the_distance_from_the_cost_to_go():
     assert "cost_to_go" not in LyapunovProgram()(trajectory_of()).terms
 
 
+def test_a_relative_distance_counts_against_the_cost_of_its_own_trajectory():
+    """The costs are 10.5 and 3.25; of one that costs next to nothing, a share of their mean."""
+    relative = ValueProgram(relative=True)
+    assert_close(relative(trajectory_of()).terms["cost_to_go"], torch.tensor(0.75 / 10.5**2 + 1.1875 / 3.25**2) / 2)
+    assert_close(ValueProgram()(trajectory_of()).terms["cost_to_go"], torch.tensor((0.75 + 1.1875) / 2 / 6.875**2))
+    shares = torch.tensor([1.0, 1e-6])
+    little = relative(trajectory_of(VALUES * shares + 0.1, STEP_COST * shares, TERMINAL_COST * shares))
+    expected = cost_to_go_error(VALUES * shares + 0.1, STEP_COST * shares, TERMINAL_COST * shares)
+    mean = (10.5 + 3.25e-6) / 2
+    assert_close(little.terms["cost_to_go"], (expected / torch.tensor([10.5, 0.05 * mean]) ** 2).mean())
+    for name in ("constraint", "terminal"):
+        assert_close(relative(trajectory_of()).terms[name], ValueProgram()(trajectory_of()).terms[name])
+    absolute = ValueProgram(relative=True, normalise=False)(trajectory_of())
+    assert absolute.terms["cost_to_go"] == (0.75 + 1.1875) / 2
+
+
 @programs
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_of_zero_leaves_a_term_out(program, name):

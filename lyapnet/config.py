@@ -276,7 +276,7 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
     recipe = dict(STANDARD)
-    if content.get("constraints") or any(each.startswith("constraints") for each in overrides):
+    if _names_constraints(content.get("constraints") or {}, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     program = standard["program"]
@@ -284,6 +284,16 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     known = PROGRAMS.get(str(named[-1]))
     weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **program}}
+
+
+def _names_constraints(section: Mapping[str, Any], overrides: Sequence[str]) -> bool:
+    """Whether a file or the command line asks for a constraint, and not for its margin alone."""
+    named = ("lower", "upper", "outside", "inside", "name")
+    if any(section.get(key) and section[key] != ConstraintsConfig.name for key in named):
+        return True
+    keys = ("constraints", *(f"constraints.{key}" for key in named))
+    return any(key.startswith(keys) and key != "constraints.margin" and value not in ("", "{}", "null")
+               for key, _, value in (each.partition("=") for each in overrides))  # fmt: skip
 
 
 def to_plain(config: Config) -> dict[str, Any]:

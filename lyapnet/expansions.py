@@ -57,7 +57,7 @@ class Expansion(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Trajectories by Euler steps; J_N is infinite where one is not finite, and x is then finite all the same."""
+    """Trajectories step by step; J_N is infinite where one is not finite, and x is then finite all the same."""
 
     x: StatePath
     u: ControlPath
@@ -69,6 +69,11 @@ class Optimum(NamedTuple):
 
     path: Path
     expansion: Expansion
+
+    def member(self, rows: Tensor) -> "Optimum":
+        """Those with some indices."""
+        x, u, cost = self.path
+        return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows))
 
 
 def held_control(problem: Problem, x: State, V_x: State, H: Tensor) -> Control:
@@ -173,19 +178,28 @@ def in_float64(problem: Problem) -> Problem:
     return copied(problem).requires_grad_(False)
 
 
-def _step(problem: Problem, x: State, u: Tensor) -> tuple[State, PerState]:
+def euler_step(problem: Problem, x: State, u: Control) -> tuple[State, PerState]:
     """F(x, u), and Δt ℓ."""
     dt = problem.horizon.dt
     return x + dt * problem.system.dynamics(x, u), dt * problem.cost.running(x, u)
 
 
 @torch.no_grad()
-def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
+def path_under(
+    problem: Problem,
+    law: Callable[[int, State], Control],
+    x0: State,
+    step: Callable[[Problem, State, Control], tuple[State, PerState]] = euler_step,
+) -> Path:
+    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it.
+
+    Args:
+        step: (problem, x_n, u_n) ↦ (x_{n+1}, what the step costs).
+    """
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
-        following, paid = _step(problem, x[-1], u[-1])
+        following, paid = step(problem, x[-1], u[-1])
         x.append(following)
         J = J + paid
     J = (J + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf)
@@ -222,8 +236,8 @@ def _backward(
     if not curved:
         return backward
     with torch.enable_grad():
-        slopes = _rows((backward.expansion.gradient[1:] * steps.F).sum(-1, keepdim=True), steps.z)[..., 0, :]
-        bent = steps.l_zz + _rows(slopes, steps.z).detach()
+        slopes = jacobian((backward.expansion.gradient[1:] * steps.F).sum(-1, keepdim=True), steps.z)[..., 0, :]
+        bent = steps.l_zz + jacobian(slopes, steps.z).detach()
     return _recursion(problem, x, u, steps._replace(l_zz=bent), damping)
 
 
@@ -298,19 +312,19 @@ def _terminal(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
     with torch.enable_grad():
         x = x.detach().requires_grad_()
         phi = problem.cost.terminal(x)
-        phi_x = _rows(phi[..., None], x)[..., 0, :]
-        return phi.detach(), phi_x.detach(), _rows(phi_x, x).detach()
+        phi_x = jacobian(phi[..., None], x)[..., 0, :]
+        return phi.detach(), phi_x.detach(), jacobian(phi_x, x).detach()
 
 
 def _derivatives(problem: Problem, x: StatePath, u: ControlPath) -> _Steps:
     with torch.enable_grad():
         z = torch.cat([x[:-1], u], -1).detach().requires_grad_()
-        F, paid = _step(problem, z[..., : x.shape[-1]], z[..., x.shape[-1] :])
-        l_z = _rows(paid[..., None], z)[..., 0, :]
-        return _Steps(z, F, _rows(F, z).detach(), paid.detach(), l_z.detach(), _rows(l_z, z).detach())
+        F, paid = euler_step(problem, z[..., : x.shape[-1]], z[..., x.shape[-1] :])
+        l_z = jacobian(paid[..., None], z)[..., 0, :]
+        return _Steps(z, F, jacobian(F, z).detach(), paid.detach(), l_z.detach(), jacobian(l_z, z).detach())
 
 
-def _rows(y: Tensor, z: Tensor) -> Tensor:
+def jacobian(y: Tensor, z: Tensor) -> Tensor:
     """∂y/∂z, (*batch, outputs, inputs), each state's by itself; zero where y does not depend on z."""
     if not y.requires_grad:
         return y.new_zeros(*y.shape, z.shape[-1])

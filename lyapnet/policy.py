@@ -1,12 +1,13 @@
 """Control laws that a value function defines."""
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
-from lyapnet.expansions import held_control, riccati
+from lyapnet.cost.base import quadratic_form
+from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, is_positive_definite, multiply
 from lyapnet.problem import Problem
@@ -26,6 +27,8 @@ class PolicyOutput(NamedTuple):
 
 class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
+
+    held: ClassVar[bool] = False  # whether u is made to be held for Δt from t on
 
     def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__()
@@ -115,6 +118,8 @@ class SampledPolicy(ValuePolicy):
     Riccati solution at the goal. About a target, u is counted from u*, and f is f + gu*.
     """
 
+    held = True
+
     def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__(problem, V)
         self.problem = problem
@@ -146,17 +151,18 @@ class LookaheadPolicy(SampledPolicy):
     From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = 2R + Δt gᵀV_xx g, or H in the place of V_xx where that
     is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
     close to state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit
-    function theorem), up to what the steps leave of Q_u.
+    function theorem), up to what the steps leave of Q_u. Where Q_uu/Δt does not exceed CONVEX · 2R, both are those of
+    the model H, and u may be short of the minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
 
     Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
     Wright, Numerical Optimization, 2006, ch. 3 (the steps).
     """
 
     def forward(self, t: Time, x: State) -> Control:
-        u = super().forward(t, x).detach()
         step = _HeldStep(self.problem, self.V, self._after(t), x)
         H = self._curvature(step.after)
         with torch.no_grad():
+            u = super().forward(t, x)
             for _ in range(DESCENTS):
                 u = step.descended(u, H)
         moved = step.newton(u, H)
@@ -196,7 +202,7 @@ class _HeldStep:
     def _paid(self, u: Control) -> PerState:
         """Q."""
         v = self._from_rest(u)
-        return self.problem.horizon.dt * (v * apply(self.R, v)).sum(-1) + self.V(self.after, self._next(u))
+        return self.problem.horizon.dt * quadratic_form(self.R, v) + self.V(self.after, self._next(u))
 
     def _slope(self, u: Control) -> Control:
         """Q_u/Δt."""
@@ -209,8 +215,7 @@ class _HeldStep:
         with torch.enable_grad():
             z = self._next(u).detach().requires_grad_()
             LgV = apply(g.mT, self.V.value_and_state_gradient(self.after, z)[1])
-            rows = [torch.autograd.grad(each.sum(), z, retain_graph=True)[0] for each in LgV.unbind(-1)]
-        own = self.problem.horizon.dt * multiply(torch.stack(rows, -2).detach(), g)
+            own = self.problem.horizon.dt * multiply(jacobian(LgV, z).detach(), g)
         own = R2 + (own + own.mT) / 2
         model = R2 + self.problem.horizon.dt * multiply(g.mT, multiply(H.detach(), g))
         return torch.where(is_positive_definite(own - CONVEX * R2)[..., None, None], own, model)

@@ -339,6 +339,10 @@ def test_with_constraints_the_standard_law_looks_ahead(plain):
     own = {**task, "constraints": limits, "rollout": {"policy": "hjb"}}
     assert config_from_plain(own).rollout.policy == "hjb"
     assert config_from_plain(task).rollout.policy == "sampled"
+    for none in ({"margin": 0.01}, {"upper": {}}):
+        assert config_from_plain({**task, "constraints": none}).rollout.policy == "sampled"
+    for none in ("constraints.margin=0.01", "constraints={}"):
+        assert config_from_plain(task, [none]).rollout.policy == "sampled"
 
 
 def test_what_a_file_says_comes_on_top_of_the_standard_recipe(plain):

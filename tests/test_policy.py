@@ -271,6 +271,38 @@ def test_the_lookahead_law_is_the_best_held_control_where_V_is_steep(held):
     assert problem.controls.contains(POLICIES["lookahead"](problem, V)(t, x)).all()
 
 
+def test_the_lookahead_law_of_two_limited_controls_is_the_best_of_a_grid():
+    """With a coupled R, and a V that is not convex: where Q is not, the law still lowers what the sampled one pays."""
+    system = Linear([[0.0, 1.0], [-1.0, 0.3]], [[1.0, 0.2], [0.0, 1.0]])
+    cost = QuadraticCost(torch.eye(2), [[1.0, 0.4], [0.4, 0.5]], torch.eye(2))
+    problem = problem_of(system, cost, dt=0.3, controls=ControlBox([-2.0, -1.0], [3.0, 1.0]))
+    x, t = torch.rand(100, 2) - 0.5, torch.tensor(0.0)
+    grid = torch.cartesian_prod(torch.linspace(-2, 3, 251), torch.linspace(-1, 1, 101))
+
+    def paid(V, u):
+        states = x[:, None].expand(-1, u.shape[1], -1)
+        after = states + 0.3 * system.dynamics(states, u)
+        return 0.3 * cost.control(states, u) + V(t, after)
+
+    for value, tolerance in ((steep, 1e-3), (lambda t, x: steep(t, x) + 0.5 * torch.cos(4 * x).sum(-1), 0.05)):
+        V = Formula(value)
+        u = {law: POLICIES[law](problem, V)(t, x).detach() for law in ("lookahead", "sampled")}
+        least = paid(V, grid.expand(100, -1, -1)).amin(1)
+        ahead, sampled = (paid(V, u[law][:, None])[:, 0] for law in ("lookahead", "sampled"))
+        assert (ahead <= sampled + 1e-12).all()
+        assert float((ahead - least).mean()) < tolerance < float((sampled - least).mean())
+        assert problem.controls.contains(u["lookahead"]).all()
+
+
+@pytest.mark.parametrize("value", [lambda t, x: x.sum(-1), lambda t, x: 0 * t + torch.ones_like(x[..., 0])])
+def test_the_lookahead_law_of_a_V_without_curvature(value):
+    problem, x = problem_of(DoubleIntegrator(), dt=0.3), torch.randn(5, 2)
+    V = Formula(lambda t, x: value(t, x) + 0 * x.sum(-1))
+    u = LookaheadPolicy(problem, V)(torch.tensor(0.0), x).detach()
+    slope = torch.autograd.functional.jacobian(lambda y: value(torch.tensor(0.0), y).sum() + 0 * y.sum(), x)
+    assert_close(u, -0.5 * slope[:, 1:], rtol=0, atol=1e-9)
+
+
 def test_the_derivative_of_the_lookahead_law_is_that_of_the_minimiser(held):
     problem, paid = held
     x, h = torch.rand(50, 2) - 0.5, 1e-6

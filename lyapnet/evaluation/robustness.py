@@ -12,10 +12,11 @@ from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.expansions import Path, path_under
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Horizon, Problem
 from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import ADAPTIVE_METHODS, Rollout
+from lyapnet.rollout import ADAPTIVE_METHODS, Rollout, held_step
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
@@ -47,6 +48,7 @@ class Disturbance(NamedTuple):
     policy: nn.Module  # u(t, x), which knows nothing of it
     x0: State
     method: str  # how the closed loop is integrated
+    held: bool = False  # whether u is held over each step; else it is u(t, x) at every stage
 
 
 class DisturbanceRow(NamedTuple):
@@ -83,9 +85,10 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
     Those are: initial states up to 20 % outside X₀ and none inside; each positive physical parameter of the system 20 %
     lower and higher, gravity aside, while the policy and the cost keep the old one; noise of 1 % on the state that the
-    policy reads; half the Δt; and no Δt at all: u(t, x) at every t, by an adaptive integrator, against the optimum by
-    steps of fourth order over half the Δt. Of a family it is the task of one member, `nominal`; and where V can be told
-    a parameter, there is also the task of the member that has it.
+    policy reads; half the Δt; and continuous time. A law that is made to be held is held for Δt there, with steps of
+    fourth order, as in the optimum; another one is u(t, x) at every t, by an adaptive integrator, and the optimum,
+    where it is not Riccati's, has half the Δt. Of a family it is the task of one member, `nominal`; and where V can be
+    told a parameter, there is also the task of the member that has it.
     """
     family = dict[str, float]() if not controller.system.constants else nominal(controller)
     whole, controller = controller, controller.with_(**family) if family else controller
@@ -112,7 +115,10 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
     halved = Horizon(2 * problem.horizon.steps, problem.horizon.dt / 2)
     finer = problem.replaced(horizon=halved)
     yield undisturbed._replace(name="half the Δt", problem=finer)
-    yield undisturbed._replace(name="continuous time", problem=finer, method=ADAPTIVE_METHODS[0])
+    if controller.closed_loop.policy.held:
+        yield undisturbed._replace(name="continuous time, u held for Δt", method="rk4", held=True)
+    elif controller.method not in ADAPTIVE_METHODS:
+        yield undisturbed._replace(name="continuous time", problem=finer, method=ADAPTIVE_METHODS[0])
 
 
 def nominal(family: Controller) -> dict[str, float]:
@@ -151,26 +157,43 @@ def robustness(
 
 
 def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
-    name, problem, policy, x0, method = disturbance
+    name, problem, _, x0, method, _ = disturbance
     try:
-        with torch.no_grad():
-            trajectory = Rollout(problem, policy, method, "backprop")(x0)
+        path = _closed_loop(disturbance)
     except DivergenceError:
         return DisturbanceRow(name, None, None, None, None, None)
-    cost = float(trajectory.cost.mean())
-    error = float(torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1).mean())
+    cost = float(path.cost.mean())
+    error = float(torch.linalg.vector_norm(problem.cost.from_goal(path.x[-1]), dim=-1).mean())
     without_optimum = DisturbanceRow(name, cost, None, None, None, error)
     if not optimum:
         return without_optimum
     try:
-        optima = oracle_of(problem, method).solve(x0, trajectory.u)
+        optima = oracle_of(problem, method).solve(x0, path.u)
     except OracleError:
         return without_optimum
     return without_optimum._replace(
         optimal_cost_mean=mean_optimum(optima.cost),
-        cost_ratio=ratio_of_means(trajectory.cost, optima.cost),
+        cost_ratio=ratio_of_means(path.cost, optima.cost),
         optimum_failures=optima.failures,
     )
+
+
+@torch.no_grad()
+def _closed_loop(disturbance: Disturbance) -> Path:
+    """The closed loops.
+
+    Raises:
+        DivergenceError: one is not finite.
+    """
+    _, problem, policy, x0, method, held = disturbance
+    if not held:
+        trajectory = Rollout(problem, policy, method, "backprop")(x0)
+        return Path(trajectory.x, trajectory.u, trajectory.cost)
+    times = problem.horizon.times(x0)
+    path = path_under(problem, lambda n, x: policy(times[n], x), x0, held_step)
+    if not path.cost.isfinite().all():
+        raise DivergenceError("Expected a finite closed loop, got one that is not.")
+    return path
 
 
 def _outside(X0: Box, samples: int, generator: torch.Generator) -> State:

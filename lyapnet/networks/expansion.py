@@ -15,6 +15,7 @@ from lyapnet.types import PerState, State, Time
 
 FEW = 4  # states for which a narrower network is enough
 SINGULAR = 1e-6  # of the greatest curvature, below which there is no valley to follow
+ROUGHLY = 1e-6  # of a state's magnitude, below which it does not spread
 ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
 NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
 
@@ -25,8 +26,8 @@ class ExpansionNetwork(ValueFunction):
     Where c = 0, around a goal that is an equilibrium, ρ = ‖ξ‖²/(1 + ‖ξ‖²), so that V and V_x stay zero there, and what
     costs little has a V that is off by little; elsewhere ρ = 1. C are the coordinates in which the expansion curves
     equally in every direction: H ≈ 2s CCᵀ. A correction that is small in V is then small in u = −½R⁻¹gᵀV_x too; in
-    units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, all but N is
-    zero and C = diag(1/scale).
+    units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, V = s N and
+    C = diag(1/scale), or, once optima are known, diag(1/spread) about a centre x̄.
 
     Constant states p, the parameters of a family, are told apart from the others, y: ξ is (Cᵀ(δy + Sδp), δp / spread),
     S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
@@ -102,7 +103,9 @@ class ExpansionNetwork(ValueFunction):
 
     @torch.no_grad()
     def take_nothing(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
-        """Start from V = 0, with what is known of its size: N is in units of a spread around a centre.
+        """Start a new network from V = 0, with what is known of its size: N is in units of a spread around a centre.
+
+        V is not held at zero at a goal then.
 
         Args:
             t: the nodes (K,).
@@ -116,7 +119,8 @@ class ExpansionNetwork(ValueFunction):
         self.expansion.take(t, torch.cat(parts, 1))
         self.at_goal.fill_(0)
         self.scale.fill_(value)
-        self.coordinates.copy_(torch.diag(1 / spread.where(spread > 0, 1)))
+        magnitude = 1 / self.coordinates.diagonal()
+        self.coordinates.copy_(torch.diag(1 / spread.where(spread > ROUGHLY * magnitude, magnitude)))
 
     @torch.no_grad()
     def take(

@@ -56,7 +56,9 @@ TABLEAUX = {
 }
 
 
-def held_step(problem: Problem, tableau: ButcherTableau, x: State, u: Control) -> tuple[State, PerState]:
+def held_step(
+    problem: Problem, x: State, u: Control, tableau: ButcherTableau = TABLEAUX["rk4"]
+) -> tuple[State, PerState]:
     """(x', ∫ℓ): one step of Δt with u held."""
     dt, slopes, rates = problem.horizon.dt, [], []
     for row in tableau.a:

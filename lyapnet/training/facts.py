@@ -7,7 +7,6 @@ from torch import Tensor
 
 from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64, riccati
-from lyapnet.policy import SampledPolicy
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
@@ -121,10 +120,10 @@ def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
     gain = problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max())
     found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
     if gain <= STABLE:
-        return Fact("stiffness", f"{found}: both control laws are stable at this Δt")
+        return Fact("stiffness", f"{found}: every control law is stable at this Δt")
     found = f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt"
-    if rollout is not None and isinstance(rollout.closed_loop.policy, SampledPolicy):
-        return Fact("stiffness", f"{found}, rollout.policy=sampled, which this config has, is stable")
+    if rollout is not None and rollout.closed_loop.policy.held:
+        return Fact("stiffness", f"{found}; the law that this config has is made to be held for Δt, and is stable")
     return Fact("stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}")
 
 

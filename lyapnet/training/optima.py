@@ -58,8 +58,7 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
     finite = optimum.path.cost.isfinite() & curvature.isfinite()
     wild = WILD if problem.constraints is None else WILD**3
     kept = finite & (curvature <= wild * curvature[finite].median()) if finite.any() else finite
-    path = Path(optimum.path.x[:, kept], optimum.path.u[:, kept], optimum.path.cost[kept])
-    return Optimum(path, optimum.expansion.member(kept))
+    return optimum.member(kept)
 
 
 def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:

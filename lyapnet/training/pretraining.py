@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import FLOOR, Expansion, Optimum, Path, in_float64, path_under
+from lyapnet.expansions import FLOOR, Optimum, Path, in_float64, path_under
 from lyapnet.linear_algebra import apply
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
@@ -58,8 +58,8 @@ def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) 
     The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
     V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
     """
-    expansion = _finite(optimum)
-    near = _trusted(expansion, _towards_neighbours(expansion.x, generator), TRUSTED_NEAR)
+    optimum = _finite(optimum)
+    near = _trusted(optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)
     return _examples(problem, optimum, [torch.zeros_like(near), near])
 
 
@@ -72,34 +72,38 @@ def examples_visited(problem: Problem, optimum: Optimum, path: Path) -> Examples
     Source: Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
     learning", AISTATS 2011, for the loop.
     """
-    expansion = _finite(optimum)
-    deviation = path.x[:-1] - expansion.x[:-1]
-    return _examples(problem, optimum, [_trusted(expansion, deviation, TRUSTED)])
+    optimum = _finite(optimum)
+    deviation = path.x[:-1] - optimum.expansion.x[:-1]
+    return _examples(problem, optimum, [_trusted(optimum, deviation, TRUSTED)])
 
 
-def _trusted(expansion: Expansion, deviation: StatePath, share: float) -> StatePath:
+def _trusted(optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
     """Deviations (N, b, n) from trajectories, drawn nearer where ½ δᵀ|H|δ is more than a share of the cost."""
-    values, vectors = torch.linalg.eigh(expansion.hessian[:-1])
-    quadratic = (apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2
-    ratio = share * _cost_of(expansion) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
+    values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
+    quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
+    ratio = share * _cost_of(optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
     return ratio.sqrt().clamp_max(1)[..., None] * deviation
 
 
 def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor]) -> Examples:
     """The rows at some deviations (N, b, n) from the finite trajectories."""
-    problem, expansion = in_float64(problem), _finite(optimum)
-    parts = zip(*(_columns(problem, expansion, each) for each in deviations), strict=True)
+    problem, optimum = in_float64(problem), _finite(optimum)
+    parts = zip(*(_columns(problem, optimum, each) for each in deviations), strict=True)
     return Examples(*(torch.cat(columns) for columns in parts), problem.horizon.duration)  # pyright: ignore
 
 
-def _finite(optimum: Optimum) -> Expansion:
-    return optimum.expansion.member(optimum.path.cost.isfinite())
+def _finite(optimum: Optimum) -> Optimum:
+    return optimum.member(optimum.path.cost.isfinite())
 
 
-def _cost_of(expansion: Expansion) -> PerState:
+def _cost_of(optimum: Optimum) -> PerState:
     """What errors of V along each trajectory are held against: its cost, or the median of all if that is more."""
-    cost = expansion.value[0]
-    return cost.clamp_min(float(cost.median()) or float(cost.mean()))
+    return optimum.path.cost.clamp_min(typical(optimum.path.cost))
+
+
+def typical(cost: PerState) -> float:
+    """The median of some costs, or their mean where half of them are none."""
+    return float(cost.median()) or float(cost.mean())
 
 
 def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
@@ -115,9 +119,9 @@ def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
     return share * (x[before, neighbour] - x[before, every])
 
 
-def _columns(problem: Problem, expansion: Expansion, deviation: Tensor) -> list[Tensor]:
-    """The columns of the examples at the nodes of some expansions, each a deviation away from them."""
-    (x, value, gradient, hessian), dt = expansion, problem.horizon.dt
+def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tensor]:
+    """The columns of the examples at the nodes of some optima, each a deviation away from them."""
+    (x, value, gradient, hessian), dt = optimum.expansion, problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
     here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
     drifted = problem.drifted(now)
@@ -126,7 +130,7 @@ def _columns(problem: Problem, expansion: Expansion, deviation: Tensor) -> list[
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
     target = gradient[1:] + apply(H, drifted - x[1:])
-    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(expansion).expand(here.shape)
+    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(optimum).expand(here.shape)
     return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], drifted, target, weight, cost)]
 
 
@@ -143,10 +147,11 @@ def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(No
 
 
 def misfit(V: ValueFunction, examples: Examples) -> float:
-    """What a fit lowers, at about SOME of the examples."""
-    some = slice(None, None, max(1, len(examples.t) // SOME))
+    """What a fit lowers, at SOME of the examples."""
+    rows = torch.linspace(0, len(examples.t) - 1, min(SOME, len(examples.t))).long()
+    some = Examples(*(column[rows] for column in examples.columns), examples.duration)  # pyright: ignore[reportCallIssue]
     with torch.no_grad():
-        value_error, excess = errors(V, examples.to(next(V.parameters())), some)
+        value_error, excess = errors(V, some.to(next(V.parameters())))
     return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
 
 
@@ -158,14 +163,14 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:
     """
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
     exact, times, optima = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
-    best, least = learner.V.state_dict(), (0.0, math.inf)
+    best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     for k in range(ROUNDS + 1):
         _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)])
-        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optima.x[0])
+        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optima.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k and now[1] <= GOOD * float(optima.value[0].mean()):
+        if k == ROUNDS or (k and now[1] <= GOOD * float(optima.path.cost.mean())):
             break
         examples = examples.with_further(examples_visited(learner.problem, optimum, path))
     learner.V.load_state_dict(best)

@@ -26,7 +26,7 @@ from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
-from lyapnet.training.pretraining import Examples, examples_of, fit, misfit
+from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, typical
 from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
@@ -233,7 +233,7 @@ def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, 
     spread = SPREAD * ((expansion.x - centre) ** 2).mean((0, 1)).sqrt()
     size = expansion.hessian.abs().amax((0, -2, -1))
     curvature = _curvature(network, expansion.hessian[:, size <= size.median()].mean(1))
-    cost, like = float(optimum.path.cost.median()), network.scale
+    cost, like = typical(optimum.path.cost) or 1.0, network.scale
     t = problem.horizon.times(expansion.x)
     network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
 

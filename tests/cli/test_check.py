@@ -89,12 +89,13 @@ def test_stiffness_is_that_at_which_the_hjb_law_breaks():
         fact = facts({**stiff, "rollout": {"policy": policy}})["stiffness"]
         assert "= 3 > 2" in fact.found
         assert fact.advice == "rollout.policy=sampled, or horizon.dt ≤ 0.067"
-    sampled = facts({**stiff, "rollout": {"policy": "sampled"}})["stiffness"]
-    assert "= 3 > 2" in sampled.found
-    assert "which this config has, is stable" in sampled.found
-    assert not sampled.advice
+    for policy in ("sampled", "lookahead"):
+        fact = facts({**stiff, "rollout": {"policy": policy}})["stiffness"]
+        assert "= 3 > 2" in fact.found
+        assert "made to be held for Δt, and is stable" in fact.found
+        assert not fact.advice
     assert (
-        "both control laws" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["stiffness"].found
+        "every control law" in facts(linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [19]}))["stiffness"].found
     )
 
 

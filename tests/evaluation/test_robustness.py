@@ -1,5 +1,7 @@
 """Disturbances hit the plant and not the policy, and are measured against the optimum of the disturbed task."""
 
+import math
+
 import pytest
 import torch
 from scipy.linalg import solve_continuous_are
@@ -9,9 +11,10 @@ from lyapnet.controller import Controller
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation import robustness
 from lyapnet.evaluation.robustness import disturbances
+from lyapnet.policy import SampledPolicy
 from lyapnet.rollout import Rollout
-from lyapnet.systems import DoubleIntegrator
-from tests.problems import Quadratic, problem_of, untrained
+from lyapnet.systems import DoubleIntegrator, Linear
+from tests.problems import Formula, Quadratic, problem_of, untrained
 
 SMALL = ["network.hidden=[4,4]", "horizon.steps=20"]
 
@@ -89,6 +92,24 @@ def test_the_law_of_continuous_time_is_optimal_in_the_row_of_that_name():
     rows = {row.disturbance: row for row in robustness.robustness(steady, 20)}
     assert rows["continuous time"].cost_ratio == pytest.approx(1, abs=1e-6)
     assert rows["none"].cost_ratio > 1.001
+
+
+def test_a_law_that_is_made_to_be_held_is_held_in_continuous_time():
+    """The sampled law of one step, by hand: u = −(ΔtR + ΔtPΔt)⁻¹ΔtP(1 + Δta)x0, under exact exponentials."""
+    a, dt, P = 0.5, 0.4, 3.0
+    problem = problem_of(Linear([[a]], [[1.0]]), QuadraticCost([[0.0]], [[1.0]], [[P]]), 1, dt)
+    V = Formula(lambda t, x: P * x[..., 0] ** 2)
+    V.curvature = lambda t: torch.tensor([[2 * P]])
+    controller = Controller(problem, V, Rollout(problem, SampledPolicy(problem, V)))
+    row = {each.disturbance: each for each in robustness.robustness(controller, 30)}["continuous time, u held for Δt"]
+    x0 = by_name(controller, 30)["none"].x0
+    u = -P * (1 + dt * a) * x0 / (1 + P * dt)
+    grown, pushed = math.exp(a * dt), (math.exp(a * dt) - 1) / a
+    cost = (dt * u**2 + P * (grown * x0 + pushed * u) ** 2).mean()
+    best = P * grown**2 * dt / (dt + P * pushed**2) * (x0**2).mean()
+    assert row.cost_mean == pytest.approx(float(cost), rel=1e-4)
+    assert 0.99 * best < row.optimal_cost_mean < best, "of a linear task it is the optimum without holding"
+    assert row.cost_ratio > 1.0005, "the law was made for Euler's step"
 
 
 def test_a_loop_that_diverges_is_a_row_too(controller, monkeypatch):

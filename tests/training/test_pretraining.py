@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.networks import FCN, Scaling
@@ -128,13 +129,33 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     assert costs[2] != pytest.approx(costs[4], rel=1e-6)
 
 
-def test_near_states_are_no_further_than_their_expansion_is_believed(swing):
+def test_near_states_are_no_further_than_their_expansion_is_believed(swing, monkeypatch):
     problem, seen, _ = swing
-    along, near = examples_of(problem, seen, GENERATOR).x.reshape(2, problem.horizon.steps, 12, 2)
-    H, delta = seen.expansion.hessian[:-1], near - along
-    quadratic = (delta[..., None, :] @ H @ delta[..., None])[..., 0, 0].abs() / 2
-    cost = seen.path.cost.clamp_min(float(seen.path.cost.median()))
-    assert bool((quadratic <= (1 + 1e-9) * cost).all())
+    H, cost = seen.expansion.hessian[:-1], seen.path.cost.clamp_min(float(seen.path.cost.median()))
+
+    def furthest():
+        """The greatest ½ δᵀ|H|δ, as a share of the cost."""
+        generator = torch.Generator().manual_seed(1)
+        along, near = examples_of(problem, seen, generator).x.reshape(2, problem.horizon.steps, 12, 2)
+        values, vectors = torch.linalg.eigh(H)
+        moved = (vectors.mT @ (near - along)[..., None])[..., 0]
+        return float(((moved**2 * values.abs()).sum(-1) / 2 / cost).max())
+
+    anyhow = furthest()
+    monkeypatch.setattr(pretraining, "TRUSTED_NEAR", anyhow / 5)
+    assert furthest() == pytest.approx(anyhow / 5)
+
+
+def test_where_no_law_is_finite_a_fit_leaves_the_weights(swing, monkeypatch):
+    problem, seen, _ = swing
+    learner, x = learner_of(problem, 1.0), torch.randn(5, 2)
+    before = learner.V(torch.zeros(()), x)
+    monkeypatch.setattr(pretraining, "ROUNDS", 1)
+    diverging = path_under(problem, at_rest(problem), seen.path.x[0])
+    diverging = diverging._replace(cost=diverging.cost * torch.inf)
+    monkeypatch.setattr(pretraining, "path_under", lambda *arguments: diverging)
+    fit(learner, seen, examples_of(problem, seen, GENERATOR))
+    assert_close(learner.V(torch.zeros(()), x), before, rtol=0, atol=0)
 
 
 def test_errors_count_against_what_their_own_trajectory_costs(problem):
@@ -169,9 +190,14 @@ def test_the_states_that_a_law_visits_are_examples(problem):
     assert len(examples_of(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
 
 
-def test_a_law_that_diverges_leaves_finite_examples(problem):
+@pytest.mark.parametrize("free", [False, True])
+def test_a_law_that_diverges_leaves_finite_examples(problem, free):
+    if free:  # a state that costs nothing, in which V does not curve
+        cost = QuadraticCost(torch.diag(torch.tensor([1.0, 0.0])), [[1.0]], torch.diag(torch.tensor([1.0, 0.0])))
+        problem = problem_of(Linear([[0.0, 0.0], [1.0, 0.0]], [[1.0], [0.0]]), cost, steps=20, dt=0.1)
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(4))
     path = path_under(problem, lambda _, x: 1e40 * x[..., :1] * x.norm(), optimum.path.x[0])
+    assert float(path.x.abs().max()) > 1e300
     visited = examples_visited(problem, optimum, path)
     assert all(column.isfinite().all() for column in visited.columns)
 

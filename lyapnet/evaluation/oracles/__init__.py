@@ -35,7 +35,7 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     Where the system is `Linear`, R a matrix, U = ℝᵐ and nothing constrained, it is Riccati's: that of the discretised
     task, J_N*, with Euler, and that of the continuous task with any other integrator. Else it is found by direct
     transcription, within the limits of U and h(x) ≤ 0: with the steps of that integrator, rk4 for an adaptive one, and
-    u held over each. In continuous time a law that does not hold u may so cost less, by O(Δt²).
+    u held over each. Their rollouts read the law at every stage of a step, and may so cost less, by O(Δt²).
 
     Raises:
         OracleError: there is none; says why, and what to do.

@@ -79,7 +79,7 @@ class Transcription(Oracle):
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
-        return held_step(self.problem, self.tableau, x, u)
+        return held_step(self.problem, x, u, self.tableau)
 
     def end(self, x: State) -> tuple[PerState]:
         """(φ(x_N),)."""

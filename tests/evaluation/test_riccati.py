@@ -20,6 +20,7 @@ from lyapnet.evaluation.oracles import (
     optimal_cost,
     oracle_of,
 )
+from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Horizon, Problem
 from lyapnet.rollout import Rollout
@@ -249,10 +250,12 @@ def test_optimal_cost_of_linear_systems_with_constant_R_is_riccatis():
     assert torch.equal(J(x0), discrete_riccati(system, cost, REFERENCE).value(0, x0))
     assert J(x0).shape == (3, 2)
     assert J(x0[0, 0]).shape == ()
-    # in continuous time nobody knows that of any other task
-    assert optimal_cost(reference_problem(system, QuadraticCost(cost.Q, system.inverse_mass, cost.Q_T)), "rk4") is None
-    weight = torch.eye(4).to(F64)
-    assert optimal_cost(reference_problem(Cartpole(), QuadraticCost(weight, [[1.0]], weight)), "dopri5") is None
+    assert isinstance(optimal_cost(reference_problem(system, cost), "rk4"), RiccatiOracle)
+    # of any other task it is that of a transcription, in continuous time too
+    varying, weight = QuadraticCost(cost.Q, system.inverse_mass, cost.Q_T), torch.eye(4).to(F64)
+    assert isinstance(optimal_cost(reference_problem(system, varying), "rk4"), Transcription)
+    other = reference_problem(Cartpole(), QuadraticCost(weight, [[1.0]], weight))
+    assert isinstance(optimal_cost(other, "dopri5"), Transcription)
 
 
 @pytest.mark.parametrize("build", [double_integrator, random_linear])

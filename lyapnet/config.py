@@ -291,9 +291,8 @@ def _names_constraints(section: Mapping[str, Any], overrides: Sequence[str]) -> 
     named = ("lower", "upper", "outside", "inside", "name")
     if any(section.get(key) and section[key] != ConstraintsConfig.name for key in named):
         return True
-    keys = ("constraints", *(f"constraints.{key}" for key in named))
-    return any(key.startswith(keys) and key != "constraints.margin" and value not in ("", "{}", "null")
-               for key, _, value in (each.partition("=") for each in overrides))  # fmt: skip
+    given = (each.partition("=") for each in overrides if each.startswith("constraints"))
+    return any(key != "constraints.margin" and value not in ("", "{}", "null") for key, _, value in given)
 
 
 def to_plain(config: Config) -> dict[str, Any]:

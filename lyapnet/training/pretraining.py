@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -47,9 +47,13 @@ class Examples(NamedTuple):
         columns = (torch.cat(both) for both in zip(self.columns, others.columns, strict=True))
         return Examples(*columns, self.duration)  # pyright: ignore[reportCallIssue]
 
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Examples":
+        """The same with every column changed alike."""
+        return Examples(*map(change, self.columns), self.duration)  # pyright: ignore[reportCallIssue]
+
     def to(self, like: Tensor) -> "Examples":
         """The same in the precision and on the device of a tensor."""
-        return Examples(*(column.to(like) for column in self.columns), self.duration)  # pyright: ignore[reportCallIssue]
+        return self.each(lambda column: column.to(like))
 
 
 def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) -> Examples:
@@ -149,7 +153,7 @@ def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(No
 def misfit(V: ValueFunction, examples: Examples) -> float:
     """What a fit lowers, at SOME of the examples."""
     rows = torch.linspace(0, len(examples.t) - 1, min(SOME, len(examples.t))).long()
-    some = Examples(*(column[rows] for column in examples.columns), examples.duration)  # pyright: ignore[reportCallIssue]
+    some = examples.each(lambda column: column[rows])
     with torch.no_grad():
         value_error, excess = errors(V, some.to(next(V.parameters())))
     return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
@@ -162,15 +166,15 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:
     law cost least stays.
     """
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
-    exact, times, optima = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
+    exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     for k in range(ROUNDS + 1):
         _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)])
-        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optima.path.x[0])
+        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == ROUNDS or (k and now[1] <= GOOD * float(optima.path.cost.mean())):
+        if k == ROUNDS or (k and now[1] <= GOOD * float(optimum.path.cost.mean())):
             break
         examples = examples.with_further(examples_visited(learner.problem, optimum, path))
     learner.V.load_state_dict(best)

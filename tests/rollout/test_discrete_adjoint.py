@@ -185,7 +185,9 @@ def test_every_network_under_every_control_law(value, law, system, cost, x0):
     by_law = {name: routes(system, cost, policy(problem_of(system, cost), V)) for name, policy in POLICIES.items()}
     is_exact(by_law[law], x0)
     slopes_of = {name: slopes(backprop, x0) for name, (_, backprop) in by_law.items()}
-    assert all(error(slopes_of[law], other) > 1e-4 for name, other in slopes_of.items() if name != law)
+    for name, other in slopes_of.items():
+        apart = 1e-4 if "lookahead" in (law, name) else 1e-3  # it is close to others where V is nearly quadratic
+        assert name == law or error(slopes_of[law], other) > apart
 
 
 def test_gradient_by_formula_and_by_autograd_are_the_same(system, cost, V, x0):

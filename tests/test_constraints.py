@@ -177,6 +177,13 @@ def test_the_penalty_is_as_dear_as_the_optima_need():
     assert said[0] == "optima without constraints"
 
 
+@pytest.fixture
+def few_optima(monkeypatch):
+    """For what does not ask how good a start is."""
+    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     content = {**constrained(**SPEED), "logs": str(tmp_path_factory.mktemp("logs"))}
@@ -223,9 +230,10 @@ def test_who_violates_is_told(run):
     assert far["violated"] == 0
 
 
+@pytest.mark.usefixtures("few_optima")
 def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     content = {**constrained(name="tests.test_constraints:Tube"), "logs": str(tmp_path)}
-    run = lyapnet.train(content, BRIEF)
+    run = lyapnet.train(content, [*BRIEF, "rollout.policy=sampled"])
     with pytest.raises(UsageError, match=r"Expected constraints=…"):
         lyapnet.load(run.best)
     assert lyapnet.load(run.best, constraints=Tube()).problem.constraints.names == ("tube",)
@@ -295,6 +303,7 @@ def test_paths_around_a_disk():
     assert math.isclose(panel.patches[0].get_radius(), 0.3)
 
 
+@pytest.mark.usefixtures("few_optima")
 def test_what_is_said_before_training_names_the_penalty():
     config = config_from_plain(constrained(**SPEED))
     learner = build_learner(config, build_problem(config).relaxed())

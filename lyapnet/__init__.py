@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from lyapnet.controller import Controller, load
     from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
+    from lyapnet.horizon import Horizon
     from lyapnet.interpolation import Table
     from lyapnet.policy import HJBPolicy, SontagPolicy
-    from lyapnet.problem import Horizon, Problem
+    from lyapnet.problem import Problem
     from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
     from lyapnet.rollout import Rollout, Trajectory
     from lyapnet.sets import Box, ControlBox, ControlSet, Unbounded
@@ -34,7 +35,8 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
     "policy": ["HJBPolicy", "SontagPolicy"],
-    "problem": ["Horizon", "Problem"],
+    "horizon": ["Horizon"],
+    "problem": ["Problem"],
     "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
     "rollout": ["Rollout", "Trajectory"],
     "sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],

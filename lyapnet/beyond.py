@@ -41,6 +41,7 @@ class ContinuedPolicy(ValuePolicy):
         regulator = Regulator(problem) if beyond == "riccati" else None
         super().__init__(problem, _ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
+        self.held = policy.held
 
     def forward(self, t: Time, x: State) -> Control:
         late = t >= self.duration - slack(t, self.duration)
@@ -60,7 +61,7 @@ class ContinuedPolicy(ValuePolicy):
 class Regulator(nn.Module):
     """u = u* − K(x − x*), kept to U: optimal for the problem linearised at its goal, over an infinite horizon.
 
-    P solves the discrete algebraic Riccati equation of the Euler step, and δᵀPδ, δ = x − x*, is the cost that is left.
+    P solves the discrete algebraic Riccati equation of one step with u held; δᵀPδ, δ = x − x*, is what is left to pay.
 
     Raises:
         ValueError: the goal is no equilibrium, or no linear law stabilises it.
@@ -74,15 +75,16 @@ class Regulator(nn.Module):
         if problem.system.constants:
             raise ValueError("Expected a single problem for beyond=riccati, got a family; take hold or receding.")
         exact = in_float64(problem)
-        x, u, dt = exact.goal, exact.rest, exact.horizon.dt
+        x, u = exact.goal, exact.rest
         if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:
             raise ValueError("Expected a goal that is an equilibrium for beyond=riccati, got another; take hold.")
         jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian
-        f_x, q_xx = jacobian(lambda y: exact.system.dynamics(y, u), x), hessian(exact.cost.state, x)
-        A, B = np.eye(len(x)) + dt * np.asarray(f_x), dt * np.asarray(exact.system.g(x).detach())
-        Q, R = dt / 2 * np.asarray(q_xx), dt * np.asarray(exact.cost.R(x).detach())
+        A, B = (np.asarray(part) for part in jacobian(lambda *z: exact.step(*z)[0], (x, u)))
+        (Q, S), (_, R) = (
+            [np.asarray(part) / 2 for part in row] for row in hessian(lambda *z: exact.step(*z)[1], (x, u))
+        )
         try:
-            P = solve_discrete_are(A, B, Q, R)
+            P = solve_discrete_are(A, B, Q, R, s=S)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(
                 "Expected a goal that a linear law stabilises, and a cost q that sees every mode, for beyond=riccati, "
@@ -90,7 +92,7 @@ class Regulator(nn.Module):
             ) from error
         self.problem = problem
         self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
         slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
         if slowest >= 1 - STILL:
             raise ValueError(
@@ -113,7 +115,7 @@ class LaterPolicy(ValuePolicy):
 
     def __init__(self, problem: Problem, policy: ValuePolicy, start: float):
         super().__init__(problem, _LaterValue(policy.V, start))
-        self.policy, self.start = policy, start
+        self.policy, self.start, self.held = policy, start, policy.held
 
     def forward(self, t: Time, x: State) -> Control:
         return self.policy(t + self.start, x)

@@ -29,8 +29,9 @@ from lyapnet.constraints import Constraints
 from lyapnet.cost import Cost
 from lyapnet.errors import CheckpointError, UsageError
 from lyapnet.family import AtParameters, FamilySystem
+from lyapnet.horizon import Horizon
 from lyapnet.policy import HJBPolicy, ValuePolicy
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.programs import Program, ValueProgram
 from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
 from lyapnet.sets import Box, ControlSet
@@ -208,17 +209,16 @@ class Controller:
     def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
         """The first steps of a trajectory."""
         nodes = slice(steps + 1)
-        end = self.cost.terminal(whole.x[steps])
-        value = whole.require_value()[nodes]
+        end, value = self.cost.terminal(whole.x[steps]), whole.require_value()[nodes]
         return Trajectory(whole.t[nodes], whole.x[nodes], whole.u[:steps], whole.running_cost[nodes], end, value)
 
     def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
         """A trajectory with further steps, under what follows the horizon."""
-        problem = self.problem.replaced(horizon=Horizon(steps, self.horizon.dt))
+        problem = self.problem.in_steps(steps=steps)
         law, solver = LaterPolicy(problem, self._continued, self.horizon.duration), self._rollout.solver_arguments
         rest = Rollout(problem, law, self.method, "backprop", solver["rtol"], solver["atol"])(first.x[-1])
         return Trajectory(
-            Horizon(self.horizon.steps + steps, self.horizon.dt).times(first.x),
+            self.problem.in_steps(steps=self.horizon.steps + steps).horizon.times(first.x),
             torch.cat([first.x, rest.x[1:]]),
             torch.cat([first.u, rest.u]),
             torch.cat([first.running_cost, first.running_cost[-1] + rest.running_cost[1:]]),

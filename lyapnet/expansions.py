@@ -1,7 +1,8 @@
 """Optimal trajectories of the discretised problem, and the value function to second order around them.
 
-The problem is J_N = Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) along x_{n+1} = F(x_n, u_n) = x_n + Δt(f + g u). With
-Q(x, u) = Δt ℓ + V_{n+1}(F(x, u)), backwards from V_N = φ and to second order in (x, u),
+The problem is J_N = Σ_{n<N} l(x_n, u_n) + φ(x_N) along x_{n+1} = F(x_n, u_n), both of them `Problem.step`: with Euler
+F = x + Δt(f + gu) and l = Δt ℓ. With Q(x, u) = l + V_{n+1}(F(x, u)), backwards from V_N = φ and to second order in
+(x, u),
 
     k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
 
@@ -12,7 +13,7 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 "Control-limited differential dynamic programming", ICRA 2014.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 
 from lyapnet.contracts import copied
 from lyapnet.linear_algebra import apply, multiply, solve
-from lyapnet.problem import Problem
+from lyapnet.problem import Problem, Response
 from lyapnet.sets import Unbounded
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
 
@@ -76,15 +77,19 @@ class Optimum(NamedTuple):
         return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows))
 
 
-def held_control(problem: Problem, x: State, V_x: State, H: Tensor) -> Control:
-    """u held for Δt: the minimiser of Δt ℓ(x, u) + V(x + Δt(f + gu)) for V of gradient V_x at x + Δt f and curvature H.
+def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
+    """u held for Δt: the minimiser of ∫ℓ + V(F(x, u)) for V of gradient V_x at F(x, 0) and curvature H.
 
-    It is the minimiser of ½ uᵀ(2R + Δt gᵀHg)u + V_xᵀgu over U: without limits, −(2R + Δt gᵀHg)⁻¹ gᵀV_x. About a
-    target, u is counted from u*, and f is f + gu*.
+    It is the minimiser of ½ uᵀ(2R + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
+    −(2R + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g and ℓ_u = 0; with others ℓ_u is what q
+    pays within the step, whose curvature in u is left out. About a target, u is counted from u*, and f is f + gu*.
+
+    Args:
+        free: the step with the control that costs nothing.
     """
-    g = problem.system.g(x)
-    weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(g.mT, multiply(H, g))
-    b = apply(g.mT, V_x)
+    B = free.by_control
+    weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(B.mT, multiply(H, B))
+    b = apply(B.mT, V_x) + free.slope
     if problem.controls.limited:
         return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
     u = -solve(weight, b[..., None])[..., 0]
@@ -95,8 +100,9 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
     """(n, x_n) ↦ u_n: the held control for V as one expansion has it."""
 
     def law(n: int, x: State) -> Control:
-        H, after = expansion.hessian[n + 1], problem.drifted(x)
-        return held_control(problem, x, expansion.gradient[n + 1] + apply(H, after - expansion.x[n + 1]), H)
+        H, free = expansion.hessian[n + 1], problem.response(x)
+        V_x = expansion.gradient[n + 1] + apply(H, free.x - expansion.x[n + 1])
+        return held_control(problem, x, free, V_x, H)
 
     return law
 
@@ -128,8 +134,9 @@ def optimal_trajectories(
 ) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
-    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Where the
-    controls lead nowhere finite the cost is infinite.
+    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Steps of higher
+    order begin with what Euler steps lead to, where that is cheaper than the controls that are given: far from an
+    optimum those are as good a guide, and less work. Where the controls lead nowhere finite the cost is infinite.
 
     Args:
         iterations: of each of the two kinds, at the most.
@@ -137,8 +144,15 @@ def optimal_trajectories(
             that still cost HOPELESS times as much are left as they are.
     """
     problem = in_float64(problem)
-    given = problem.controls.project(u.double())
-    now = path_under(problem, lambda n, _: given[n], x0.double())
+    x0, u = x0.double(), problem.controls.project(u.double())
+
+    def under(controls: ControlPath, problem: Problem = problem) -> Path:
+        return path_under(problem, lambda n, _: controls[n], x0)
+
+    now = under(u)
+    if problem.horizon.method != "euler":
+        roughly = problem.in_steps(method="euler")
+        now = cheapest([now, under(_descended(roughly, under(u, roughly), False, iterations, NEAR, rivals).u)])
     now = _descended(problem, now, False, iterations, NEAR, rivals)
     now = _descended(problem, now, True, iterations, SETTLED, rivals)
     return Optimum(now, _backward(problem, now.x, now.u).expansion)
@@ -173,33 +187,25 @@ def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
     )
 
 
+def cheapest(paths: Sequence[Path]) -> Path:
+    """Of each state, that of several trajectories which costs least."""
+    x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
+    best, each = cost.argmin(0), torch.arange(cost.shape[1])
+    return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
+
+
 def in_float64(problem: Problem) -> Problem:
     """A copy of a problem for what is computed before training: on the CPU, without gradients of its parameters."""
     return copied(problem).requires_grad_(False)
 
 
-def euler_step(problem: Problem, x: State, u: Control) -> tuple[State, PerState]:
-    """F(x, u), and Δt ℓ."""
-    dt = problem.horizon.dt
-    return x + dt * problem.system.dynamics(x, u), dt * problem.cost.running(x, u)
-
-
 @torch.no_grad()
-def path_under(
-    problem: Problem,
-    law: Callable[[int, State], Control],
-    x0: State,
-    step: Callable[[Problem, State, Control], tuple[State, PerState]] = euler_step,
-) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it.
-
-    Args:
-        step: (problem, x_n, u_n) ↦ (x_{n+1}, what the step costs).
-    """
+def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
+    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
-        following, paid = step(problem, x[-1], u[-1])
+        following, paid = problem.step(x[-1], u[-1])
         x.append(following)
         J = J + paid
     J = (J + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf)
@@ -242,7 +248,7 @@ def _backward(
 
 
 class _Steps(NamedTuple):
-    """F(z), l(z) = Δt ℓ and their derivatives at z = (x, u) of all steps at once; F with its graph."""
+    """F(z), l(z) and their derivatives at z = (x, u) of all steps at once; F with its graph."""
 
     z: Tensor
     F: StatePath
@@ -319,7 +325,7 @@ def _terminal(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
 def _derivatives(problem: Problem, x: StatePath, u: ControlPath) -> _Steps:
     with torch.enable_grad():
         z = torch.cat([x[:-1], u], -1).detach().requires_grad_()
-        F, paid = euler_step(problem, z[..., : x.shape[-1]], z[..., x.shape[-1] :])
+        F, paid = problem.step(z[..., : x.shape[-1]], z[..., x.shape[-1] :])
         l_z = jacobian(paid[..., None], z)[..., 0, :]
         return _Steps(z, F, jacobian(F, z).detach(), paid.detach(), l_z.detach(), jacobian(l_z, z).detach())
 

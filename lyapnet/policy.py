@@ -1,16 +1,15 @@
 """Control laws that a value function defines."""
 
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
-from lyapnet.cost.base import quadratic_form
 from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, is_positive_definite, multiply
-from lyapnet.problem import Problem
+from lyapnet.problem import Problem, Response
 from lyapnet.types import Control, PerState, State, Time
 
 DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
@@ -28,7 +27,7 @@ class PolicyOutput(NamedTuple):
 class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
-    held: ClassVar[bool] = False  # whether u is made to be held for Δt from t on
+    held: bool = False  # whether u is made to be held for Δt from t on
 
     def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__()
@@ -108,14 +107,15 @@ class SontagPolicy(ValuePolicy):
 
 
 class SampledPolicy(ValuePolicy):
-    """The law of a controller that holds u for Δt: the minimiser of Δt ℓ(x, u) + V(t + Δt, x + Δt(f + gu)) over u ∈ U,
+    """The law of a controller that holds u for Δt: the minimiser of ∫ℓ + V(t + Δt, F(x, u)) over u ∈ U,
 
-        u = argmin over u ∈ U of ½ uᵀ(2R + Δt gᵀHg)u + V_x(t + Δt, x + Δt f)ᵀgu,
+        u = argmin over u ∈ U of ½ uᵀ(2R + Δt BᵀHB)u + (BᵀV_x(t + Δt, F(x, 0)) + ℓ_u)ᵀu,
 
-    for V of curvature H along g; with U = ℝᵐ it is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With Euler steps of Δt and V = xᵀP_n x it
-    is the optimal law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where
-    Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the
-    Riccati solution at the goal. About a target, u is counted from u*, and f is f + gu*.
+    for V of curvature H along B = F_u/Δt. F and ∫ℓ are one step of the horizon's method: with Euler F = x + Δt(f + gu),
+    B = g and ℓ_u = 0, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is then the optimal law
+    of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
+    exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the
+    goal. About a target, u is counted from u*, and f is f + gu*.
     """
 
     held = True
@@ -128,9 +128,9 @@ class SampledPolicy(ValuePolicy):
             self.riccati = Curve(problem.horizon.times(problem.goal), riccati(problem).hessian.to(problem.goal))
 
     def forward(self, t: Time, x: State) -> Control:
-        after = self._after(t)
-        V_x = self.V.value_and_state_gradient(after, self.problem.drifted(x))[1]
-        return held_control(self.problem, x, V_x, self._curvature(after))
+        after, free = self._after(t), self.problem.response(x)
+        V_x = self.V.value_and_state_gradient(after, free.x)[1]
+        return held_control(self.problem, x, free, V_x, self._curvature(after))
 
     def _after(self, t: Time) -> Time:
         """t + Δt, within the horizon."""
@@ -146,9 +146,9 @@ class SampledPolicy(ValuePolicy):
 class LookaheadPolicy(SampledPolicy):
     """The same minimiser, of V itself and not of a model of its curvature that is one for all states:
 
-        u = argmin over u ∈ U of Q(u) = Δt uᵀRu + V(t + Δt, x + Δt(f + gu)).
+        u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
-    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = 2R + Δt gᵀV_xx g, or H in the place of V_xx where that
+    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = 2R + Δt BᵀV_xx B, or H in the place of V_xx where that
     is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
     close to state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit
     function theorem), up to what the steps leave of Q_u. Where Q_uu/Δt does not exceed CONVEX · 2R, both are those of
@@ -170,11 +170,10 @@ class LookaheadPolicy(SampledPolicy):
 
 
 class _HeldStep:
-    """One step from x with u held: Q(u) = Δt (u − u*)ᵀR(u − u*) + V(t + Δt, x + Δt(f + gu)), and ways down it."""
+    """One step from x with u held: Q(u) = ∫ℓ + V(t + Δt, F(x, u)), and ways down it."""
 
     def __init__(self, problem: Problem, V: ValueFunction, after: Time, x: State):
-        self.problem, self.V, self.after = problem, V, after
-        self.drifted, self.g, self.R = problem.drifted(x), problem.system.g(x), problem.cost.R(x)
+        self.problem, self.V, self.after, self.x = problem, V, after, x
 
     def descended(self, u: Control, H: Tensor) -> Control:
         """The best of u and some shares of the Newton step from it."""
@@ -189,35 +188,26 @@ class _HeldStep:
 
     def newton(self, u: Control, H: Tensor) -> Control:
         """The minimiser over U of Q to second order around u, with its curvature as a number."""
-        slope, curvature = self._slope(u), self._curved(u.detach(), H)
+        answer = self.problem.response(self.x, u)
+        V_x = self.V.value_and_state_gradient(self.after, answer.x)[1]
+        slope = apply(answer.by_control.mT, V_x) + answer.slope
+        curvature = self._curvature(answer, H)
         return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
-
-    def _from_rest(self, u: Control) -> Control:
-        rest = self.problem.cost.rest
-        return u if rest is None else u - rest
-
-    def _next(self, u: Control) -> State:
-        return self.drifted + self.problem.horizon.dt * apply(self.g, self._from_rest(u))
 
     def _paid(self, u: Control) -> PerState:
         """Q."""
-        v = self._from_rest(u)
-        return self.problem.horizon.dt * quadratic_form(self.R, v) + self.V(self.after, self._next(u))
+        following, paid = self.problem.step(self.x, u)
+        return paid + self.V(self.after, following)
 
-    def _slope(self, u: Control) -> Control:
-        """Q_u/Δt."""
-        V_x = self.V.value_and_state_gradient(self.after, self._next(u))[1]
-        return 2 * apply(self.R, self._from_rest(u)) + apply(self.g.mT, V_x)
-
-    def _curved(self, u: Control, H: Tensor) -> Tensor:
+    def _curvature(self, answer: Response, H: Tensor) -> Tensor:
         """Q_uu/Δt where that is convex, else with H for V_xx; without a graph."""
-        g, R2 = self.g.detach(), 2 * self.R.detach()
+        B, R2, dt = answer.by_control.detach(), 2 * self.problem.cost.R(self.x).detach(), self.problem.horizon.dt
         with torch.enable_grad():
-            z = self._next(u).detach().requires_grad_()
-            LgV = apply(g.mT, self.V.value_and_state_gradient(self.after, z)[1])
-            own = self.problem.horizon.dt * multiply(jacobian(LgV, z).detach(), g)
+            z = answer.x.detach().requires_grad_()
+            along = apply(B.mT, self.V.value_and_state_gradient(self.after, z)[1])
+            own = dt * multiply(jacobian(along, z).detach(), B)
         own = R2 + (own + own.mT) / 2
-        model = R2 + self.problem.horizon.dt * multiply(g.mT, multiply(H.detach(), g))
+        model = R2 + dt * multiply(B.mT, multiply(H.detach(), B))
         return torch.where(is_positive_definite(own - CONVEX * R2)[..., None, None], own, model)
 
 

@@ -1,8 +1,8 @@
 """The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -11,40 +11,23 @@ from lyapnet.constraints import Constraints
 from lyapnet.contracts import called, check_function, copied
 from lyapnet.cost import Cost, PenaltyCost
 from lyapnet.errors import UsageError
+from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
+from lyapnet.linear_algebra import apply
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import Control, State, Times
+from lyapnet.types import Control, PerState, State
 
 TRIED = 64  # states at which functions of others are tried
 LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
 
 
-@dataclass(frozen=True)
-class Horizon:
-    """N steps of Δt seconds; T = NΔt.
+class Response(NamedTuple):
+    """One step with u held, to first order in u."""
 
-    Raises:
-        ValueError: no step, or Δt not positive.
-    """
-
-    steps: int
-    dt: float
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"Expected steps ≥ 1, got {self.steps}; a horizon needs at least one step.")
-        if not 0 < self.dt < float("inf"):
-            raise ValueError(f"Expected dt > 0, got {self.dt}; give the step length in seconds.")
-
-    @property
-    def duration(self) -> float:
-        """T in s."""
-        return self.steps * self.dt
-
-    def times(self, like: Tensor) -> Times:
-        """The nodes t_n = nΔt, n = 0 … N, in the dtype and on the device of a tensor."""
-        return torch.arange(self.steps + 1, dtype=like.dtype, device=like.device) * self.dt
+    x: State  # F(x, u), where it leads
+    by_control: Tensor  # F_u/Δt (*batch, n, m); with Euler g(x)
+    slope: Control  # of the mean ℓ over the step by u
 
 
 class Problem(nn.Module):
@@ -92,16 +75,61 @@ class Problem(nn.Module):
         rest = self.cost.rest
         return self.goal.new_zeros(self.system.m) if rest is None else rest.to(self.goal)
 
-    def drifted(self, x: State) -> State:
-        """x + Δt(f(x) + g(x)u*): where a step leads with the control that costs nothing."""
+    def rates(self, x: State, u: Control) -> tuple[State, PerState]:
+        """The means of ẋ and of ℓ over one step from x with u held, by the method of the horizon."""
+        tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
+        for row in tableau.a:
+            X = x + self.horizon.dt * weighted_sum(row, slopes) if any(row) else x
+            slopes.append(self.system.dynamics(X, u))
+            costs.append(self.cost.running(X, u))
+        return weighted_sum(tableau.b, slopes), weighted_sum(tableau.b, costs)
+
+    def step(self, x: State, u: Control) -> tuple[State, PerState]:
+        """(F(x, u), ∫ℓ): where one step with u held leads, and what it costs; with Euler (x + Δt(f + gu), Δt ℓ)."""
+        rate, cost = self.rates(x, u)
+        return x + self.horizon.dt * rate, self.horizon.dt * cost
+
+    def response(self, x: State, u: Control | None = None) -> Response:
+        """How one step from x answers to u.
+
+        Args:
+            u: where; None: u*, the control that costs nothing.
+        """
+        if self.horizon.method == "euler":
+            return self._euler_response(x, u)
+        u, n, recording = (
+            self.rest.expand(*x.shape[:-1], -1) if u is None else u,
+            self.system.n,
+            torch.is_grad_enabled(),
+        )
+        with torch.enable_grad():
+            # one copy of u for each component of (ẋ, ℓ): all rows of the Jacobian in one sweep
+            copies = u.expand(n + 1, *u.shape)
+            copies = copies if recording and copies.requires_grad else copies.detach().requires_grad_()
+            rate, cost = self.rates(x.expand(n + 1, *x.shape), copies)
+            y = torch.cat([rate, cost[..., None]], -1)
+            rows = torch.eye(n + 1).to(y).reshape(n + 1, *[1] * (y.ndim - 2), n + 1).expand_as(y)
+            (by_control,) = torch.autograd.grad(y, copies, rows, create_graph=recording)
+        rate = rate[0] if recording else rate[0].detach()
+        return Response(x + self.horizon.dt * rate, by_control[:n].movedim(0, -2), by_control[n])
+
+    def _euler_response(self, x: State, u: Control | None) -> Response:
         rest = self.cost.rest
-        rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
-        return x + self.horizon.dt * rate
+        if u is None:
+            rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
+            zero = x.new_zeros(self.system.m).expand(*x.shape[:-1], -1)
+            return Response(x + self.horizon.dt * rate, self.system.g(x), zero)
+        after = x + self.horizon.dt * self.system.dynamics(x, u)
+        return Response(after, self.system.g(x), 2 * apply(self.cost.R(x), u if rest is None else u - rest))
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts exchanged."""
         names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
         return Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+
+    def in_steps(self, **changes: Any) -> "Problem":
+        """The problem in other steps: its horizon with some of steps, dt and method exchanged."""
+        return self.replaced(horizon=replace(self.horizon, **changes))
 
     def relaxed(self, weight: float = 0.0) -> "Problem":
         """The problem that training solves, whose cost keeps closed loops off the constraints; itself without any.

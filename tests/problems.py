@@ -11,9 +11,10 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.config import load_config
 from lyapnet.controller import Controller
 from lyapnet.cost import Cost, QuadraticCost
+from lyapnet.horizon import Horizon
 from lyapnet.networks import ExpansionNetwork
 from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem
@@ -29,11 +30,12 @@ def problem_of(
     dt: float = 0.1,
     initial_states: Box | None = None,
     controls: ControlSet | None = None,
+    method: str = "euler",
 ) -> Problem:
     """A problem of a system: with Q = I, R = I, Q_T = I, no limits, and X₀ = [−1, 1]ⁿ unless told otherwise."""
     cost = QuadraticCost(torch.eye(system.n), torch.eye(system.m), torch.eye(system.n)) if cost is None else cost
     box = Box([-1.0] * system.n, [1.0] * system.n) if initial_states is None else initial_states
-    return Problem(system, cost, Unbounded() if controls is None else controls, box, Horizon(steps, dt))
+    return Problem(system, cost, Unbounded() if controls is None else controls, box, Horizon(steps, dt, method))
 
 
 def untrained(name: str, *overrides: str) -> Controller:

@@ -11,7 +11,7 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 # Each line imports only lines above it.
 LEVELS = (
     {"drawing", "errors", "interpolation", "linear_algebra", "provenance", "random_streams", "tables", "types"},
-    {"constraints", "contracts", "cost", "files", "schema", "sets", "sizes", "systems"},
+    {"constraints", "contracts", "cost", "files", "horizon", "schema", "sets", "sizes", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
     {"policy"},
@@ -29,8 +29,8 @@ LEVELS = (
 )
 MATHEMATICS = {
     "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family", "files", "graphs",
-    "interpolation", "linear_algebra", "networks", "policy", "problem", "programs", "random_streams", "rollout", "sets",
-    "systems", "types",
+    "horizon", "interpolation", "linear_algebra", "networks", "policy", "problem", "programs", "random_streams",
+    "rollout", "sets", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

@@ -157,7 +157,8 @@ def test_a_state_from_which_a_limit_cannot_be_kept_has_no_optimum():
     assert "IPOPT" in optima.reasons[0]
 
 
-def test_the_penalty_is_as_dear_as_the_optima_need():
+def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
+    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 3)
     problem = bryson_denham(0.1).relaxed()
     found, said = find_relaxation(problem, lambda stage: None), []
     assert found.kept == found.states
@@ -169,6 +170,7 @@ def test_the_penalty_is_as_dear_as_the_optima_need():
     assert float(ell + true.terminal(path.x[-1])) == pytest.approx(4.4444, rel=0.01)
     problem.cost.weight.fill_(found.weight / 100)
     assert float(problem.constraints.worst(optimal_trajectories(problem, x0, idle).path.x).max()) > 0
+    monkeypatch.setattr("lyapnet.training.relaxation.WEIGHTS", 4)
     impossible = problem_of({**constrained(upper={"position": 1.01}), "controls": {"lower": -1, "upper": 1}})
     impossible = impossible.replaced(initial_states=lyapnet.Box([0.99, 0.1], [1.0, 0.2])).relaxed()
     found = find_relaxation(impossible, said.append)
@@ -182,12 +184,15 @@ def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 6)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     content = {**constrained(**SPEED), "logs": str(tmp_path_factory.mktemp("logs"))}
-    return lyapnet.train(content, BRIEF)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lyapnet.training.pretraining.STEPS", (500, 250))
+        return lyapnet.train(content, [*BRIEF, "rollout.policy=sampled"])  # which is faster as it is written
 
 
 def test_a_training_with_constraints(run):
@@ -233,7 +238,7 @@ def test_who_violates_is_told(run):
 @pytest.mark.usefixtures("few_optima")
 def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     content = {**constrained(name="tests.test_constraints:Tube"), "logs": str(tmp_path)}
-    run = lyapnet.train(content, [*BRIEF, "rollout.policy=sampled"])
+    run = lyapnet.train(content, [*BRIEF, "rollout.policy=lookahead", "loggers=[csv]"])
     with pytest.raises(UsageError, match=r"Expected constraints=…"):
         lyapnet.load(run.best)
     assert lyapnet.load(run.best, constraints=Tube()).problem.constraints.names == ("tube",)
@@ -309,7 +314,7 @@ def test_what_is_said_before_training_names_the_penalty():
     learner = build_learner(config, build_problem(config).relaxed())
     facts = {fact.name: fact.found for fact in facts_of(learner)}
     assert facts["constraints"].startswith("penalty of ")
-    assert "optima from 24 states keep them, at 1." in facts["constraints"]
+    assert "optima from 6 states keep them, at 1." in facts["constraints"]
     assert float(learner.problem.cost.weight) > 0
 
 

@@ -14,8 +14,8 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.config import load_config
 from lyapnet.cost import Cost, QuadraticCost
 from lyapnet.errors import UsageError
+from lyapnet.horizon import Horizon
 from lyapnet.networks import FCN, Scaling
-from lyapnet.problem import Horizon
 from lyapnet.sets import Box, ControlBox, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem, DoubleIntegrator
 from tests.problems import problem_of

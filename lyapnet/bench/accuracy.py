@@ -9,9 +9,9 @@ from torch import Tensor
 
 from lyapnet.bench.cases import Case, derivatives, flat, trained
 from lyapnet.bench.routes import EXACT, REFERENCE
+from lyapnet.horizon import TABLEAUX
 from lyapnet.programs import ValueProgram
 from lyapnet.rollout import ADAPTIVE_METHODS
-from lyapnet.rollout.runge_kutta import TABLEAUX
 from lyapnet.types import State
 
 SLICE = 256  # states whose graph the reference holds at once

@@ -12,7 +12,8 @@ from lyapnet.build import build_problem, build_program, build_rollout, build_val
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, config_from_plain, load_config
 from lyapnet.errors import UsageError
-from lyapnet.problem import Horizon, Problem
+from lyapnet.horizon import Horizon
+from lyapnet.problem import Problem
 from lyapnet.programs import Program
 from lyapnet.random_streams import TEST, stream
 from lyapnet.rollout import Rollout

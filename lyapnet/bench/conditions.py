@@ -14,9 +14,10 @@ from lyapnet.controller import Controller
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import continuous_riccati
+from lyapnet.horizon import Horizon
 from lyapnet.networks import FCN, GoalAnchor, Scaling
 from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box, Unbounded
 from lyapnet.systems import DoubleIntegrator, IntegratorChain, Linear

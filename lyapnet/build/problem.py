@@ -17,7 +17,8 @@ from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised
 from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, QuadraticCost
 from lyapnet.errors import UsageError
-from lyapnet.problem import Horizon, Problem
+from lyapnet.horizon import TABLEAUX, Horizon
+from lyapnet.problem import Problem
 from lyapnet.sets import Box, ControlBox, ControlSet
 from lyapnet.systems import ControlAffineSystem, Linear
 
@@ -45,7 +46,9 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             initial_states = Box(*(repeated(bound, system.n) for bound in bounds))
             require_length("initial_states.lower", initial_states.dimension, system)
         with section("horizon"):
-            horizon = Horizon(config.horizon.steps, config.horizon.dt)
+            method = config.rollout.method
+            held = method if method in TABLEAUX else "rk4"  # of an adaptive method
+            horizon = Horizon(config.horizon.steps, config.horizon.dt, held)
         with section("cost"):
             cost = build_cost(config.cost, system) if cost is None else cost.double()
         with section("controls"):

@@ -14,7 +14,7 @@ from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.constraints import Constraints, names_of
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.types import Corner, Corners, PerState, State, Time
@@ -101,10 +101,10 @@ def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.G
     if constraints is None:
         return None
     x0 = torch.cat([corners(problem.initial_states), problem.initial_states.sample(LOOPS, generator)])
-    finer = problem.replaced(horizon=Horizon(FINER * horizon.steps, horizon.dt / FINER))
+    finer = problem.in_steps(steps=FINER * horizon.steps, dt=horizon.dt / FINER)
     try:
         with torch.no_grad():
-            trajectory = Rollout(finer, closed_loop.policy, "rk4", "backprop")(x0)
+            trajectory = Rollout(finer, closed_loop.policy, "rk4", "backprop", held=False)(x0)
     except DivergenceError:
         return None
     h = constraints(trajectory.x)

@@ -18,11 +18,12 @@ from lyapnet.problem import Problem
 from lyapnet.types import PerState, State
 
 
-class EulerEpisodes:
-    """Trajectories of a task (*batch,) that start together: x_{n+1} = x_n + Δt(f + gu), with u = scale · clip(a, ±1).
+class Episodes:
+    """Trajectories of a task (*batch,) that start together: x_{n+1} = F(x_n, u_n), with u = scale · clip(a, ±1).
 
-    A control outside U is projected onto it. The reward of step n is −Δt ℓ(x_n, u_n), and −φ(x_N) with the last: an
-    episode's undiscounted return is −J_N(x₀).
+    F is the problem's step with u held, x_n + Δt(f + gu) with Euler. A control outside U is projected onto it. The
+    reward of step n is what it costs, −Δt ℓ(x_n, u_n) with Euler, and −φ(x_N) with the last: an episode's undiscounted
+    return is −J_N(x₀).
     """
 
     def __init__(self, bounded: BoundedProblem, observe_time: bool):
@@ -54,11 +55,9 @@ class EulerEpisodes:
         self.clipped += int((given.abs() >= 1).sum())  # at the bound: learners clip before they ask
         self.controls += given.numel()
         self.control = self.problem.controls.project(self.scale * given.clamp(-1, 1))
-        system, cost, horizon = self.problem.system, self.problem.cost, self.problem.horizon
-        reward = -horizon.dt * cost.running(self.state, self.control)
-        self.state = self.state + horizon.dt * system.dynamics(self.state, self.control)
+        self.state, paid = self.problem.step(self.state, self.control)
         self.step += 1
-        return reward - cost.terminal(self.state) if self.over else reward
+        return -paid - self.problem.cost.terminal(self.state) if self.over else -paid
 
     def require_finite(self) -> None:
         """Refuse to go on with a state that left the finite numbers.
@@ -118,7 +117,7 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         control_scale: float | Sequence[float] | None = None,
         observe_time: bool = False,
     ):
-        self._episode = EulerEpisodes(bounded_problem(task, control_scale), observe_time)
+        self._episode = Episodes(bounded_problem(task, control_scale), observe_time)
         self.observation_space, self.action_space = self._episode.observation_space, self._episode.action_space
         self.render_mode = None
 

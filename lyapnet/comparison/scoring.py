@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from lyapnet.comparison.environments import EulerEpisodes
+from lyapnet.comparison.environments import Episodes
 from lyapnet.comparison.reference_problems import BoundedProblem
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import optimal_cost, oracle_of
@@ -22,7 +22,7 @@ class Costs(NamedTuple):
 
 def costs_of(policy: Any, bounded: BoundedProblem, observe_time: bool, x0: State) -> Costs:
     """What a policy with SB3's `predict` costs from each of x₀ (b, n), without exploration; clipped as in training."""
-    episodes, dt = EulerEpisodes(bounded, observe_time), bounded.problem.horizon.dt
+    episodes, dt = Episodes(bounded, observe_time), bounded.problem.horizon.dt
     episodes.start(x0)
     cost, memory, start = torch.zeros_like(x0[:, 0]), None, np.ones(len(x0), dtype=bool)
     while not episodes.over:

@@ -12,11 +12,10 @@ from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
-from lyapnet.expansions import Path, path_under
 from lyapnet.family import FamilySystem
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import ADAPTIVE_METHODS, Rollout, held_step
+from lyapnet.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
@@ -48,7 +47,6 @@ class Disturbance(NamedTuple):
     policy: nn.Module  # u(t, x), which knows nothing of it
     x0: State
     method: str  # how the closed loop is integrated
-    held: bool = False  # whether u is held over each step; else it is u(t, x) at every stage
 
 
 class DisturbanceRow(NamedTuple):
@@ -74,6 +72,7 @@ class NoisyPolicy(nn.Module):
     def __init__(self, policy: nn.Module, deviation: Tensor, generator: torch.Generator):
         super().__init__()
         self.policy, self.deviation, self.generator = policy, deviation, generator
+        self.held = getattr(policy, "held", False)
 
     def forward(self, t: Time, x: State) -> Control:
         noise = torch.randn(x.shape, generator=self.generator, dtype=x.dtype).to(x)
@@ -112,11 +111,11 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
                 yield undisturbed._replace(name=named, problem=told.problem, policy=policy)
     policy = NoisyPolicy(undisturbed.policy, NOISE * magnitude(controller, x0), stream(seed, TEST))
     yield undisturbed._replace(name=f"noise of {NOISE:.0%} on the state", policy=policy)
-    halved = Horizon(2 * problem.horizon.steps, problem.horizon.dt / 2)
-    finer = problem.replaced(horizon=halved)
+    finer = problem.in_steps(steps=2 * problem.horizon.steps, dt=problem.horizon.dt / 2)
     yield undisturbed._replace(name="half the Δt", problem=finer)
     if controller.closed_loop.policy.held:
-        yield undisturbed._replace(name="continuous time, u held for Δt", method="rk4", held=True)
+        if controller.method != "rk4":
+            yield undisturbed._replace(name="continuous time, u held for Δt", method="rk4")
     elif controller.method not in ADAPTIVE_METHODS:
         yield undisturbed._replace(name="continuous time", problem=finer, method=ADAPTIVE_METHODS[0])
 
@@ -157,9 +156,10 @@ def robustness(
 
 
 def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
-    name, problem, _, x0, method, _ = disturbance
+    name, problem, policy, x0, method = disturbance
     try:
-        path = _closed_loop(disturbance)
+        with torch.no_grad():
+            path = Rollout(problem, policy, method, "backprop")(x0)
     except DivergenceError:
         return DisturbanceRow(name, None, None, None, None, None)
     cost = float(path.cost.mean())
@@ -176,24 +176,6 @@ def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
         cost_ratio=ratio_of_means(path.cost, optima.cost),
         optimum_failures=optima.failures,
     )
-
-
-@torch.no_grad()
-def _closed_loop(disturbance: Disturbance) -> Path:
-    """The closed loops.
-
-    Raises:
-        DivergenceError: one is not finite.
-    """
-    _, problem, policy, x0, method, held = disturbance
-    if not held:
-        trajectory = Rollout(problem, policy, method, "backprop")(x0)
-        return Path(trajectory.x, trajectory.u, trajectory.cost)
-    times = problem.horizon.times(x0)
-    path = path_under(problem, lambda n, x: policy(times[n], x), x0, held_step)
-    if not path.cost.isfinite().all():
-        raise DivergenceError("Expected a finite closed loop, got one that is not.")
-    return path
 
 
 def _outside(X0: Box, samples: int, generator: torch.Generator) -> State:

@@ -10,17 +10,14 @@ from lyapnet.rollout.integration import (
     Rollout,
     Trajectory,
 )
-from lyapnet.rollout.runge_kutta import TABLEAUX, held_step
 
 __all__ = [
     "ADAPTIVE_METHODS",
     "FIXED_STEP_METHODS",
     "GRADIENTS",
     "METHODS",
-    "TABLEAUX",
     "ClosedLoop",
     "DiscreteAdjoint",
     "Rollout",
     "Trajectory",
-    "held_step",
 ]

@@ -10,11 +10,17 @@ from lyapnet.types import Control, State, Time
 
 
 class ClosedLoop(nn.Module):
-    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
+    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x).
 
-    def __init__(self, problem: Problem, policy: nn.Module):
+    Args:
+        held: it is the mean over a step of the horizon instead, with u held from t on; Euler steps of Δt are then
+            steps of the horizon's method.
+    """
+
+    def __init__(self, problem: Problem, policy: nn.Module, held: bool = False):
         super().__init__()
         self.system, self.cost, self.policy = problem.system, problem.cost, policy
+        self.stepped = problem if held else None
 
     @property
     def V(self) -> ValueFunction | None:
@@ -27,7 +33,11 @@ class ClosedLoop(nn.Module):
 
     def slope(self, x: State, u: Control) -> Tensor:
         """(f + g u, ℓ), (*batch, n + 1)."""
-        return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
+        if self.stepped is None:
+            rate, cost = self.system.dynamics(x, u), self.cost.running(x, u)
+        else:
+            rate, cost = self.stepped.rates(x, u)
+        return torch.cat([rate, cost[..., None]], -1)
 
     def control(self, t: Time, x: State) -> PolicyOutput:
         """u, V and V_x; with a law that no V defines, V = 0."""

@@ -18,9 +18,10 @@ from torch.func import functional_call
 from lyapnet.errors import LyapnetError, UntraceableError, one_line
 from lyapnet.graphs.compilation import Scan, compilation_errors, compiled, is_on_disk
 from lyapnet.graphs.tracing import batched, cut, trace
+from lyapnet.horizon import TABLEAUX
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
-from lyapnet.rollout.runge_kutta import TABLEAUX, Linearise, Step
+from lyapnet.rollout.runge_kutta import Linearise, Step
 from lyapnet.types import ControlPath, Jacobians, StagePath, State, StatePath, ValuePath
 
 _LOG = logging.getLogger(__name__)

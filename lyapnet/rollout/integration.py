@@ -8,9 +8,10 @@ from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
 from lyapnet.errors import DivergenceError
+from lyapnet.horizon import TABLEAUX
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
-from lyapnet.rollout.discrete_adjoint import TABLEAUX, DiscreteAdjoint
+from lyapnet.rollout.discrete_adjoint import DiscreteAdjoint
 from lyapnet.types import ControlPath, PerState, State, StatePath, Times, ValuePath
 
 
@@ -58,7 +59,8 @@ class Rollout(nn.Module):
 
     Args:
         problem, policy: what is integrated.
-        method: a member of METHODS; rk4 is the 3/8 rule, dopri5 chooses its own steps between the nodes.
+        method: a member of METHODS; rk4 is the 3/8 rule, dopri5 chooses its own steps between the nodes. A law that is
+            made to be held is held over each step of a fixed-step method, else it is u(t, x) at every stage.
         gradient: a member of GRADIENTS.
             adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
                 to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
@@ -69,6 +71,7 @@ class Rollout(nn.Module):
                 times faster than either, in memory that grows with neither the network nor the graph of the steps.
                 For fixed-step methods.
         rtol, atol: tolerances of adaptive methods.
+        held: whether u is held over each step; None: as the law is made to be.
 
     Raises:
         ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
@@ -83,6 +86,7 @@ class Rollout(nn.Module):
         gradient: str = "adjoint",
         rtol: float = 1e-6,
         atol: float = 1e-8,
+        held: bool | None = None,
     ):
         super().__init__()
         for name, value, known in (("method", method, METHODS), ("gradient", gradient, GRADIENTS)):
@@ -93,14 +97,19 @@ class Rollout(nn.Module):
                 f"Expected method as one of {', '.join(FIXED_STEP_METHODS)} for gradient discrete, got {method!r}; "
                 "choose one of them, or gradient adjoint."
             )
-        self.closed_loop, horizon = ClosedLoop(problem, policy), problem.horizon
-        self.problem = problem
-        self.horizon, self.method, self.gradient = horizon, method, gradient
-        self.solver_arguments: dict[str, Any] = {"method": method, "rtol": rtol, "atol": atol}
+        wanted = getattr(policy, "held", False) if held is None else held
+        held = bool(wanted) and method in FIXED_STEP_METHODS
+        stepped = problem.in_steps(method=method) if held else problem
+        self.closed_loop, self.horizon = ClosedLoop(stepped, policy, held), problem.horizon
+        self.problem, self.method, self.gradient = problem, method, gradient
+        step = "euler" if held else method  # of the mean over a step that `method` takes
+        self.solver_arguments: dict[str, Any] = {"method": step, "rtol": rtol, "atol": atol}
         if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
             self.solver_arguments["options"] = {"max_num_steps": 10_000}
         self.discrete = (
-            DiscreteAdjoint(self.closed_loop, horizon.steps, horizon.dt, method) if gradient == "discrete" else None
+            DiscreteAdjoint(self.closed_loop, self.horizon.steps, self.horizon.dt, step)
+            if gradient == "discrete"
+            else None
         )
 
     def forward(self, x0: State) -> Trajectory:

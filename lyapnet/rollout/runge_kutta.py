@@ -18,13 +18,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.horizon import ButcherTableau, weighted_sum
 from lyapnet.linear_algebra import apply, multiply
-from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.types import (
-    Control,
     Jacobians,
-    PerState,
     Scalar,
     StageControls,
     StageInputMatrices,
@@ -39,35 +37,6 @@ from lyapnet.types import (
 )
 
 
-class ButcherTableau(NamedTuple):
-    """An explicit Runge–Kutta method: X_i = x + Δt Σ_{j<i} a_ij k_j at t + c_i Δt, and x' = x + Δt Σ_i b_i k_i."""
-
-    a: tuple[tuple[float, ...], ...]
-    b: tuple[float, ...]
-    c: tuple[float, ...]
-
-
-TABLEAUX = {
-    "euler": ButcherTableau(((),), (1.0,), (0.0,)),
-    "midpoint": ButcherTableau(((), (1 / 2,)), (0.0, 1.0), (0.0, 1 / 2)),
-    "rk4": ButcherTableau(  # the 3/8 rule, as in torchdiffeq
-        ((), (1 / 3,), (-1 / 3, 1.0), (1.0, -1.0, 1.0)), (1 / 8, 3 / 8, 3 / 8, 1 / 8), (0.0, 1 / 3, 2 / 3, 1.0)
-    ),
-}
-
-
-def held_step(
-    problem: Problem, x: State, u: Control, tableau: ButcherTableau = TABLEAUX["rk4"]
-) -> tuple[State, PerState]:
-    """(x', ∫ℓ): one step of Δt with u held."""
-    dt, slopes, rates = problem.horizon.dt, [], []
-    for row in tableau.a:
-        X = x + dt * _combine(row, slopes) if any(row) else x
-        slopes.append(problem.system.dynamics(X, u))
-        rates.append(problem.cost.running(X, u))
-    return x + dt * _combine(tableau.b, slopes), dt * _combine(tableau.b, rates)
-
-
 class Step(nn.Module):
     """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V): one step from a batch of states, and what is kept of it."""
 
@@ -78,12 +47,12 @@ class Step(nn.Module):
     def forward(self, t: Scalar, dt: Scalar, x: State) -> tuple[Tensor, ...]:
         stages, slopes, outputs = [], [], []
         for row, c in zip(self.tableau.a, self.tableau.c, strict=True):
-            X = x + dt * _combine(row, [k[..., :-1] for k in slopes]) if any(row) else x
+            X = x + dt * weighted_sum(row, [k[..., :-1] for k in slopes]) if any(row) else x
             output = self.loop.control(t + c * dt, X)
             outputs.append(output)
             stages.append(X)
             slopes.append(self.loop.slope(X, output.u))
-        step = dt * _combine(self.tableau.b, slopes)
+        step = dt * weighted_sum(self.tableau.b, slopes)
         return x + step[..., :-1], torch.stack(stages), step[..., -1], outputs[0].u, outputs[0].value
 
 
@@ -135,14 +104,14 @@ class Linearise(nn.Module):
         jacobians, cost_jacobians = [], []
         for i, row in enumerate(tableau.a):
             if any(row):
-                X_x = eye + h * _combine(row, jacobians)
+                X_x = eye + h * weighted_sum(row, jacobians)
                 jacobians.append(multiply(f_x[:, i], X_x))
                 cost_jacobians.append(apply(X_x.mT, cost_x[:, i]))
             else:
                 jacobians.append(f_x[:, i])
                 cost_jacobians.append(cost_x[:, i])
-        transition = (eye + h * _combine(tableau.b, jacobians)).mT
-        cost_x0 = dt[:, None, None] * _combine(tableau.b, cost_jacobians)
+        transition = (eye + h * weighted_sum(tableau.b, jacobians)).mT
+        cost_x0 = dt[:, None, None] * weighted_sum(tableau.b, cost_jacobians)
         source = node_bar + value_bar[..., None] * V_x[:, 0].detach() + cost_bar[..., None] * cost_x0
         return Linearisation(transition, source, f_x, cost_x, f_u, cost_u, u, value, given)
 
@@ -180,12 +149,6 @@ class Linearise(nn.Module):
     def _times(self, t: Times, dt: Times) -> Float[Tensor, "nodes stages 1"]:
         """The stages' times."""
         return torch.stack([t + c * dt for c in self.tableau.c], -1)[..., None]
-
-
-def _combine(weights: Sequence[float], tensors: Sequence[Tensor]) -> Tensor:
-    """Σ w_i y_i over the weights that are not zero."""
-    terms = [y if w == 1 else w * y for w, y in zip(weights, tensors, strict=True) if w]
-    return sum(terms[1:], start=terms[0])
 
 
 def _vjp(outputs: Sequence[Tensor], inputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> tuple[Tensor, ...]:

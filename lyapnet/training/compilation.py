@@ -11,7 +11,8 @@ from rich.console import Console
 from lyapnet.config import Config
 from lyapnet.errors import CompilationError, UntraceableError
 from lyapnet.graphs.compilation import cache_folder, has_compiler
-from lyapnet.rollout import TABLEAUX
+from lyapnet.horizon import TABLEAUX
+from lyapnet.policy import POLICIES
 from lyapnet.training.compiling_ahead import CompilingAhead
 
 
@@ -72,7 +73,8 @@ def earns_compilation(config: Config) -> bool:
     """Whether a run is long enough to earn its compilation back.
 
     By measurement on the standard recipe and one CPU core, compiling takes about 45 s and then saves 1 ms at each
-    stage of each step, and 20 µs more for each state.
+    stage of each step at which the law is asked, and 20 µs more for each state.
     """
-    states, stages = config.training.batch_size * config.seeds, len(TABLEAUX[config.rollout.method].b)
+    held = POLICIES[config.rollout.policy].held
+    states, stages = config.training.batch_size * config.seeds, 1 if held else len(TABLEAUX[config.rollout.method].b)
     return config.training.iterations * config.horizon.steps * stages * (1e-3 + 2e-5 * states) > 45

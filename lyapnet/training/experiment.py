@@ -28,7 +28,7 @@ from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.start import Start, choose_start, has_place_for_start, silent
+from lyapnet.training.start import REMEDY, Start, choose_start, has_place_for_start, silent
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -161,6 +161,8 @@ def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     if told and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)
+        if start.steps_miss:
+            console.print(f"steps: {start.steps_miss}; {REMEDY}", soft_wrap=True)
     return start
 
 

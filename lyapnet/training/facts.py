@@ -11,7 +11,7 @@ from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.start import CALM, Report, choose_start, silent
+from lyapnet.training.start import CALM, REMEDY, Report, choose_start, silent
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 
@@ -44,6 +44,8 @@ def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
         cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
         chosen = " ← training starts here" if candidate == start.chosen else ""
         facts.append(Fact(f"start from {candidate.name}", f"{cost}, known after {candidate.seconds:.2g} s{chosen}"))
+    if start.steps_miss:
+        facts.append(Fact("steps", start.steps_miss, REMEDY))
     if start.chosen.finite < 1:
         facts.append(Fact("start", "no candidate is finite on all of X₀", "choose a smaller X₀, or a shorter horizon"))
     elif start.chosen.name == CALM:
@@ -108,8 +110,8 @@ def _linearisation(problem: Problem) -> list[Fact]:
             "what grows there cannot be held near the goal" if grows else "",
         ))  # fmt: skip
     growth = (1 + dt * values).abs()
-    if bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
-        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under Euler steps", "a smaller horizon.dt"))
+    if problem.horizon.method == "euler" and bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
+        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under Euler steps", REMEDY))
     return facts
 
 

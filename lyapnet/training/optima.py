@@ -11,6 +11,7 @@ from lyapnet.expansions import (
     Optimum,
     Path,
     at_rest,
+    cheapest,
     exchanged,
     greedy_law,
     in_float64,
@@ -91,13 +92,6 @@ def _followed(exact: Problem, optimum: Optimum) -> Optimum:
 def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
     """From each of some states under the law of one of the optima."""
     return path_under(exact, greedy_law(exact, optimum.expansion.member(which)), x0)
-
-
-def cheapest(paths: Sequence[Path]) -> Path:
-    """Of each state, that of several trajectories which costs least."""
-    x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
-    best, each = cost.argmin(0), torch.arange(cost.shape[1])
-    return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
 
 
 def nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:

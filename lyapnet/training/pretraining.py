@@ -31,9 +31,9 @@ class Examples(NamedTuple):
     x: State
     value: PerState  # V(t_n, x_n)
     after: Tensor  # t_{n+1}
-    drifted: State  # x_n + Δt f, or x_n + Δt(f + gu*)
+    drifted: State  # F(x_n, u*), where the control that costs nothing leads
     gradient: State  # V_x(t_{n+1}, drifted)
-    weight: Tensor  # L⁻¹gᵀ (k, m, n), LLᵀ = 2R + Δt gᵀHg: for what a wrong V_x costs
+    weight: Tensor  # L⁻¹Bᵀ (k, m, n), LLᵀ = 2R + Δt BᵀHB, B = F_u/Δt: for what a wrong V_x costs
     cost: PerState  # J of the trajectory, or the median of all if that is more
     duration: float  # T
 
@@ -128,21 +128,21 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tens
     (x, value, gradient, hessian), dt = optimum.expansion, problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
     here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
-    drifted = problem.drifted(now)
-    g, R = problem.system.g(now), problem.cost.R(now)
-    values, vectors = torch.linalg.eigh(2 * R + dt * g.mT @ H @ g)
+    free, R = problem.response(now), problem.cost.R(now)
+    B = free.by_control
+    values, vectors = torch.linalg.eigh(2 * R + dt * B.mT @ H @ B)
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
-    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ g.mT
-    target = gradient[1:] + apply(H, drifted - x[1:])
+    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ B.mT
+    target = gradient[1:] + apply(H, free.x - x[1:])
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(optimum).expand(here.shape)
-    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], drifted, target, weight, cost)]
+    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], free.x, target, weight, cost)]
 
 
 def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
-    """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹gᵀ(V_x − V_x*)‖².
+    """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹Bᵀ(V_x − V_x*)‖².
 
     The second is what the held controls of V cost beyond the optimum, to second order, as a share of J: a step with
-    controls u + e costs ½ Δt eᵀ(2R + Δt gᵀHg)e more.
+    controls u + e costs ½ Δt eᵀ(2R + Δt BᵀHB)e more.
     """
     t, x, value, after, drifted, gradient, weight, cost = (column[rows] for column in examples.columns)
     wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]

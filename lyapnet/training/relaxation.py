@@ -4,10 +4,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from lyapnet.cost import PenaltyCost
-from lyapnet.expansions import Path, at_rest, greedy_law, in_float64, optimal_trajectories, path_under
+from lyapnet.expansions import Path, at_rest, cheapest, greedy_law, in_float64, optimal_trajectories, path_under
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
-from lyapnet.training.optima import cheapest
 from lyapnet.training.start import expansions_of
 
 STATES = 24  # of X₀, from which optima are sought

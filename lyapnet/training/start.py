@@ -27,13 +27,15 @@ from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
 from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, typical
-from lyapnet.types import State
+from lyapnet.types import PerState, State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
 CLOSE, FEW = 1e-5, 16  # share of the cost by which nothing may improve on a law that leaves nothing to fit, from FEW
 SPREAD = 0.35  # of the distances from the goal along optima, in units of which a network begins without an expansion
+MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 CALM = "V = 0"
+REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 
 Report = Callable[[str], None]
 
@@ -56,6 +58,16 @@ class Start(NamedTuple):
 
     chosen: Candidate
     candidates: Sequence[Candidate]
+    held_cost: float  # of the chosen one in continuous time, u held for Δt
+
+    @property
+    def steps_miss(self) -> str:
+        """What the steps of the rollout miss of continuous time; empty where that is little."""
+        ratio = self.held_cost / self.chosen.cost if self.chosen.cost else 1.0
+        if abs(ratio - 1) <= MISSED or self.chosen.name == CALM:
+            return ""
+        by = f"{ratio:.3g} times as much" if math.isfinite(ratio) else "more than any number"
+        return f"in continuous time, u held for Δt, the law that training starts from costs {by}"
 
     def __str__(self) -> str:
         others = ", ".join(f"{_shown(other)} from {other.name}" for other in self.candidates if other != self.chosen)
@@ -65,6 +77,7 @@ class Start(NamedTuple):
         return {
             "chosen": self.chosen.name,
             "tried": {c.name: c.cost if c.finite == 1 else None for c in self.candidates},
+            "held_cost": self.held_cost if math.isfinite(self.held_cost) else None,
             "seconds": {c.name: round(c.seconds, 2) for c in self.candidates},
         }
 
@@ -105,7 +118,8 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
-    return Start(chosen, tried)
+    in_time = problem.in_steps(method="rk4")
+    return Start(chosen, tried, float(_costs(learners[0], in_time, x0).mean()))
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -194,10 +208,15 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
 
 def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    policy, times = learner.rollout.closed_loop.policy, learner.problem.horizon.times(x0)
-    cost = path_under(learner.problem, lambda n, x: policy(times[n], x), x0).cost
+    cost = _costs(learner, learner.problem, x0)
     share = float(cost.isfinite().double().mean())
     return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
+
+
+def _costs(learner: Learner, problem: Problem, x0: State) -> PerState:
+    """What the law of a learner costs in a problem, each control held for a step."""
+    policy, times = learner.rollout.closed_loop.policy, problem.horizon.times(x0)
+    return path_under(problem, lambda n, x: policy(times[n], x), x0).cost
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:

@@ -24,8 +24,8 @@ from lyapnet.calculus import ValueFunction, gradients
 from lyapnet.certification import Budget, sound_claim
 from lyapnet.cost import Cost, QuadraticCost
 from lyapnet.errors import LyapnetError
+from lyapnet.horizon import Horizon
 from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Horizon
 from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem, Linear

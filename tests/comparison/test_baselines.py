@@ -21,7 +21,7 @@ from lyapnet.comparison.baselines.settings import SETTINGS
 from lyapnet.comparison.baselines.training import BaselineTraining, costs_of_best
 from lyapnet.comparison.reference_problems import bounded_problem
 from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.problem import Horizon
+from lyapnet.horizon import Horizon
 
 SMALL = {
     "ppo": {"n_steps": 6, "batch_size": 24, "n_epochs": 2},

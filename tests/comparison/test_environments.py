@@ -22,7 +22,7 @@ from lyapnet.comparison.reference_problems import CONTROL_SCALES, TASKS, bounded
 from lyapnet.comparison.scoring import costs_of
 from lyapnet.config import load_config, to_plain
 from lyapnet.errors import DivergenceError, UsageError
-from lyapnet.problem import Horizon
+from lyapnet.horizon import Horizon
 from lyapnet.sets import Unbounded
 from lyapnet.systems import DoubleIntegrator
 from tests.problems import CONF, problem_of, untrained

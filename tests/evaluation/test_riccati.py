@@ -21,8 +21,9 @@ from lyapnet.evaluation.oracles import (
     oracle_of,
 )
 from lyapnet.evaluation.oracles.transcription import Transcription
+from lyapnet.horizon import Horizon
 from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Horizon, Problem
+from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import Cartpole, ControlAffineSystem, DoubleIntegrator, Linear, is_linear

@@ -15,7 +15,7 @@ from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of
 from lyapnet.evaluation.oracles.multistart import Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
-from lyapnet.problem import Horizon
+from lyapnet.horizon import Horizon
 from lyapnet.systems import Cartpole, DoubleIntegrator, Linear, Reacher
 from tests.problems import problem_of
 

@@ -13,8 +13,8 @@ from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import DivergenceError, UsageError
+from lyapnet.horizon import Horizon
 from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Horizon
 from lyapnet.programs import PROGRAMS, LyapunovProgram, Tolerances, ValueProgram
 from lyapnet.programs.terms import (
     cost_to_go_error,

@@ -15,10 +15,10 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.horizon import Horizon
 from lyapnet.networks import ACTIVATIONS, FCN, NETWORKS, Scaling
 from lyapnet.networks.anchored import TerminalAnchor
 from lyapnet.policy import POLICIES, HJBPolicy
-from lyapnet.problem import Horizon
 from lyapnet.programs import LyapunovProgram, ValueProgram
 from lyapnet.rollout import FIXED_STEP_METHODS, Rollout, discrete_adjoint
 from lyapnet.rollout.runge_kutta import Linearise

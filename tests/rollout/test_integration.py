@@ -13,8 +13,8 @@ from torch.testing import assert_close
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.errors import DivergenceError
+from lyapnet.horizon import Horizon
 from lyapnet.policy import POLICIES
-from lyapnet.problem import Horizon
 from lyapnet.rollout import ADAPTIVE_METHODS, FIXED_STEP_METHODS, GRADIENTS, METHODS, Rollout
 from lyapnet.systems import SYSTEMS, DoubleIntegrator
 from tests.problems import KINDS, problem_of
@@ -218,11 +218,13 @@ def law_by_autograd(request, system, cost, quadratic):
 @pytest.mark.parametrize(("gradient", "tolerance"), [("adjoint", 1e-5), ("backprop", 1e-7), ("discrete", 1e-7)])
 def test_every_route_differentiates_through_a_gradient(system, cost, law_by_autograd, x0, gradient, tolerance):
     laws = law_by_autograd, Cut(law_by_autograd)
-    rollout, without = (rollout_of(system, cost, law, method="rk4", gradient=gradient) for law in laws)
+    method = "dopri5" if gradient == "adjoint" else "rk4"  # held over steps, a law has no costate but the discrete one
+    options = {"method": method, "gradient": gradient, "rtol": 1e-7, "atol": 1e-9}
+    rollout, without = (rollout_of(system, cost, law, **options) for law in laws)
     directions = draw_directions(rollout, x0)
     expected = by_differences(rollout, x0, directions)
     assert relative_error(by_gradient(rollout, x0, directions), expected) < tolerance
-    assert relative_error(by_gradient(without, x0, directions), expected) > 5e-3
+    assert relative_error(by_gradient(without, x0, directions), expected) > 1e-3
 
 
 class Cut(nn.Module):

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from lyapnet.comparison.environments import EulerEpisodes
+from lyapnet.comparison.environments import Episodes
 from lyapnet.comparison.reference_problems import bounded_problem
 from lyapnet.problem import Problem
 from lyapnet.types import State
@@ -37,7 +37,7 @@ class VectorEnvironment(VecEnv):
         truncates: bool = True,
         seed: int = 0,
     ):
-        self.episodes = EulerEpisodes(bounded_problem(task, control_scale), observe_time)
+        self.episodes = Episodes(bounded_problem(task, control_scale), observe_time)
         self.truncates, self.generator = truncates, torch.Generator().manual_seed(seed)
         self._actions = np.zeros((num_envs, self.episodes.problem.system.m))
         super().__init__(num_envs, self.episodes.observation_space, self.episodes.action_space)

@@ -29,13 +29,17 @@ __all__ = [
 ]
 
 
-def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
+def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
     """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
 
     Where the system is `Linear`, R a matrix, U = ℝᵐ and nothing constrained, it is Riccati's: that of the discretised
     task, J_N*, with Euler, and that of the continuous task with any other integrator. Else it is found by direct
     transcription, within the limits of U and h(x) ≤ 0: with the steps of that integrator, rk4 for an adaptive one, and
-    u held over each. Their rollouts read the law at every stage of a step, and may so cost less, by O(Δt²).
+    u held over each. Rollouts of laws that are not held read them at every stage of a step, and may so cost less, by
+    O(Δt²).
+
+    Args:
+        method: of the steps; None: the horizon's.
 
     Raises:
         OracleError: there is none; says why, and what to do.
@@ -47,6 +51,7 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
             f"{type(problem.controls).__name__}; costs stand alone."
         )
     system, cost, horizon = problem.system, problem.cost, problem.horizon
+    method = method or horizon.method
     free = problem.constraints is None and not problem.controls.limited
     if free and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
@@ -60,7 +65,7 @@ def oracle_of(problem: Problem, method: str = "euler") -> Oracle:
     return Transcription(problem, "rk4" if method in ADAPTIVE_METHODS else method)
 
 
-def optimal_cost(problem: Problem, method: str = "euler") -> Oracle | None:
+def optimal_cost(problem: Problem, method: str | None = None) -> Oracle | None:
     """The oracle of a task, or None where there is none.
 
     Raises:

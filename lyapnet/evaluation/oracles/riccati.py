@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
-from lyapnet.problem import Horizon
+from lyapnet.horizon import Horizon
 from lyapnet.systems import Linear
 from lyapnet.types import Control, ControlPath, PerState, State
 

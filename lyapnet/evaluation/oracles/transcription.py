@@ -19,7 +19,6 @@ from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, i
 from lyapnet.expansions import riccati
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
-from lyapnet.rollout import TABLEAUX, held_step
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 VIOLATED = 1e-6  # h that is still taken for zero
@@ -48,7 +47,7 @@ class Transcription(Oracle):
     """
 
     def __init__(self, problem: Problem, method: str = "euler", iterations: int = 500):
-        self.problem, self.tableau = copied(problem), TABLEAUX[method]
+        self.problem = copied(problem).in_steps(method=method)
         system, horizon = self.problem.system, self.problem.horizon
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         graphs = [traced(self.step, (x, u)), traced(self.end, (x,))]
@@ -79,7 +78,7 @@ class Transcription(Oracle):
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
-        return held_step(self.problem, x, u, self.tableau)
+        return self.problem.step(x, u)
 
     def end(self, x: State) -> tuple[PerState]:
         """(φ(x_N),)."""

@@ -77,18 +77,18 @@ class Optimum(NamedTuple):
         return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows))
 
 
-def held_control(problem: Problem, x: State, free: Response, V_x: State, H: Tensor) -> Control:
+def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
     """u held for Δt: the minimiser of ∫ℓ + V(F(x, u)) for V of gradient V_x at F(x, 0) and curvature H.
 
-    It is the minimiser of ½ uᵀ(2R + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
-    −(2R + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g and ℓ_u = 0; with others ℓ_u is what q
-    pays within the step, whose curvature in u is left out. About a target, u is counted from u*, and f is f + gu*.
+    It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
+    −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with others q
+    pays for u within the step too. About a target, u is counted from u*, and f is f + gu*.
 
     Args:
         free: the step with the control that costs nothing.
     """
     B = free.by_control
-    weight = 2 * problem.cost.R(x) + problem.horizon.dt * multiply(B.mT, multiply(H, B))
+    weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
     if problem.controls.limited:
         return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
@@ -102,7 +102,7 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
     def law(n: int, x: State) -> Control:
         H, free = expansion.hessian[n + 1], problem.response(x)
         V_x = expansion.gradient[n + 1] + apply(H, free.x - expansion.x[n + 1])
-        return held_control(problem, x, free, V_x, H)
+        return held_control(problem, free, V_x, H)
 
     return law
 

@@ -9,11 +9,10 @@ from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, inp
 from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, is_positive_definite, multiply
-from lyapnet.problem import Problem, Response
+from lyapnet.problem import CONVEX, Problem, Response
 from lyapnet.types import Control, PerState, State, Time
 
 DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
-CONVEX = 0.1  # share of 2R by which a step's curvature has to exceed zero
 
 
 class PolicyOutput(NamedTuple):
@@ -109,11 +108,11 @@ class SontagPolicy(ValuePolicy):
 class SampledPolicy(ValuePolicy):
     """The law of a controller that holds u for Δt: the minimiser of ∫ℓ + V(t + Δt, F(x, u)) over u ∈ U,
 
-        u = argmin over u ∈ U of ½ uᵀ(2R + Δt BᵀHB)u + (BᵀV_x(t + Δt, F(x, 0)) + ℓ_u)ᵀu,
+        u = argmin over u ∈ U of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x(t + Δt, F(x, 0)) + ℓ_u)ᵀu,
 
     for V of curvature H along B = F_u/Δt. F and ∫ℓ are one step of the horizon's method: with Euler F = x + Δt(f + gu),
-    B = g and ℓ_u = 0, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is then the optimal law
-    of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
+    B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is the optimal
+    law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
     exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the
     goal. About a target, u is counted from u*, and f is f + gu*.
     """
@@ -130,7 +129,7 @@ class SampledPolicy(ValuePolicy):
     def forward(self, t: Time, x: State) -> Control:
         after, free = self._after(t), self.problem.response(x)
         V_x = self.V.value_and_state_gradient(after, free.x)[1]
-        return held_control(self.problem, x, free, V_x, self._curvature(after))
+        return held_control(self.problem, free, V_x, self._curvature(after))
 
     def _after(self, t: Time) -> Time:
         """t + Δt, within the horizon."""
@@ -148,8 +147,8 @@ class LookaheadPolicy(SampledPolicy):
 
         u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
-    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = 2R + Δt BᵀV_xx B, or H in the place of V_xx where that
-    is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
+    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx B, or H for V_xx where that is not
+    convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
     close to state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit
     function theorem), up to what the steps leave of Q_u. Where Q_uu/Δt does not exceed CONVEX · 2R, both are those of
     the model H, and u may be short of the minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
@@ -201,14 +200,14 @@ class _HeldStep:
 
     def _curvature(self, answer: Response, H: Tensor) -> Tensor:
         """Q_uu/Δt where that is convex, else with H for V_xx; without a graph."""
-        B, R2, dt = answer.by_control.detach(), 2 * self.problem.cost.R(self.x).detach(), self.problem.horizon.dt
+        B, paid, dt = answer.by_control.detach(), answer.curvature.detach(), self.problem.horizon.dt
         with torch.enable_grad():
             z = answer.x.detach().requires_grad_()
             along = apply(B.mT, self.V.value_and_state_gradient(self.after, z)[1])
             own = dt * multiply(jacobian(along, z).detach(), B)
-        own = R2 + (own + own.mT) / 2
-        model = R2 + dt * multiply(B.mT, multiply(H.detach(), B))
-        return torch.where(is_positive_definite(own - CONVEX * R2)[..., None, None], own, model)
+        own = paid + (own + own.mT) / 2
+        model = paid + dt * multiply(B.mT, multiply(H.detach(), B))
+        return torch.where(is_positive_definite(own - CONVEX * paid)[..., None, None], own, model)
 
 
 POLICIES: dict[str, type[ValuePolicy]] = {

@@ -12,22 +12,24 @@ from lyapnet.contracts import called, check_function, copied
 from lyapnet.cost import Cost, PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
-from lyapnet.linear_algebra import apply
+from lyapnet.linear_algebra import apply, is_positive_definite
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State
 
+CONVEX = 0.1  # share of 2R by which a curvature in u has to exceed zero
 TRIED = 64  # states at which functions of others are tried
 LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
 
 
 class Response(NamedTuple):
-    """One step with u held, to first order in u."""
+    """One step with u held: F to first order in u, and ℓ to second."""
 
     x: State  # F(x, u), where it leads
     by_control: Tensor  # F_u/Δt (*batch, n, m); with Euler g(x)
-    slope: Control  # of the mean ℓ over the step by u
+    slope: Control  # ℓ_u of the mean ℓ over the step
+    curvature: Tensor  # ℓ_uu (*batch, m, m), symmetric positive definite; with Euler 2R
 
 
 class Problem(nn.Module):
@@ -38,7 +40,7 @@ class Problem(nn.Module):
         cost: ℓ and φ.
         controls: U.
         initial_states: X₀.
-        horizon: T, and its steps.
+        horizon: T, its steps, and the method by which each is taken with u held.
         constraints: h; None: there are none.
 
     Raises:
@@ -97,30 +99,34 @@ class Problem(nn.Module):
         """
         if self.horizon.method == "euler":
             return self._euler_response(x, u)
-        u, n, recording = (
-            self.rest.expand(*x.shape[:-1], -1) if u is None else u,
-            self.system.n,
-            torch.is_grad_enabled(),
-        )
+        n, recording = self.system.n, torch.is_grad_enabled()
+        u = self.rest.expand(*x.shape[:-1], -1) if u is None else u
         with torch.enable_grad():
-            # one copy of u for each component of (ẋ, ℓ): all rows of the Jacobian in one sweep
-            copies = u.expand(n + 1, *u.shape)
-            copies = copies if recording and copies.requires_grad else copies.detach().requires_grad_()
-            rate, cost = self.rates(x.expand(n + 1, *x.shape), copies)
-            y = torch.cat([rate, cost[..., None]], -1)
-            rows = torch.eye(n + 1).to(y).reshape(n + 1, *[1] * (y.ndim - 2), n + 1).expand_as(y)
-            (by_control,) = torch.autograd.grad(y, copies, rows, create_graph=recording)
-        rate = rate[0] if recording else rate[0].detach()
-        return Response(x + self.horizon.dt * rate, by_control[:n].movedim(0, -2), by_control[n])
+            u = u if recording and u.requires_grad else u.detach().requires_grad_()
+            # one copy of u for each component of ẋ: all rows of the Jacobian in one sweep
+            copies = u.expand(n, *u.shape)
+            rate = self.rates(x.expand(n, *x.shape), copies)[0]
+            rows = torch.eye(n).to(rate).reshape(n, *[1] * (rate.ndim - 2), n).expand_as(rate)
+            (by_control,) = torch.autograd.grad(rate, copies, rows, create_graph=recording)
+            (slope,) = torch.autograd.grad(self.rates(x, u)[1].sum(), u, create_graph=True)
+            bends = [torch.autograd.grad(s.sum(), u, create_graph=True)[0] for s in slope.unbind(-1)]
+        parts = x + self.horizon.dt * rate[0], by_control.movedim(0, -2), slope, self._convex(torch.stack(bends, -2), x)
+        return Response(*(part if recording else part.detach() for part in parts))
+
+    def _convex(self, curvature: Tensor, x: State) -> Tensor:
+        """ℓ_uu, or 2R in its place where it is not well above zero."""
+        least = 2 * self.cost.R(x)
+        usable = is_positive_definite(curvature - CONVEX * least)
+        return torch.where(usable[..., None, None], (curvature + curvature.mT) / 2, least)
 
     def _euler_response(self, x: State, u: Control | None) -> Response:
         rest = self.cost.rest
         if u is None:
             rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
             zero = x.new_zeros(self.system.m).expand(*x.shape[:-1], -1)
-            return Response(x + self.horizon.dt * rate, self.system.g(x), zero)
-        after = x + self.horizon.dt * self.system.dynamics(x, u)
-        return Response(after, self.system.g(x), 2 * apply(self.cost.R(x), u if rest is None else u - rest))
+            return Response(x + self.horizon.dt * rate, self.system.g(x), zero, 2 * self.cost.R(x))
+        after, R2 = x + self.horizon.dt * self.system.dynamics(x, u), 2 * self.cost.R(x)
+        return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2)
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts exchanged."""

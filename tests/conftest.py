@@ -145,7 +145,10 @@ def quadratic():
     return Quadratic
 
 
-LONG = ("test_runs.py", "test_readme.py", "test_funnel.py", "test_negative_controls.py", "test_bounds.py")
+LONG = (
+    "test_runs.py", "test_start.py", "test_constraints.py", "test_crossing.py", "test_readme.py", "test_funnel.py",
+    "test_negative_controls.py", "test_bounds.py",
+)  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):

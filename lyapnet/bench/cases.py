@@ -12,7 +12,6 @@ from lyapnet.build import build_problem, build_program, build_rollout, build_val
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config, config_from_plain, load_config
 from lyapnet.errors import UsageError
-from lyapnet.horizon import Horizon
 from lyapnet.problem import Problem
 from lyapnet.programs import Program
 from lyapnet.random_streams import TEST, stream
@@ -46,8 +45,7 @@ class Case(NamedTuple):
 
     def in_steps(self, steps: int) -> "Case":
         """The same T in another number of steps."""
-        horizon = Horizon(steps, self.problem.horizon.duration / steps)
-        return self._replace(problem=self.problem.replaced(horizon=horizon))
+        return self._replace(problem=self.problem.in_steps(steps=steps, dt=self.problem.horizon.duration / steps))
 
 
 def load_case(name: str, overrides: Sequence[str] = ()) -> Case:

@@ -10,17 +10,11 @@ from lyapnet.types import Control, State, Time
 
 
 class ClosedLoop(nn.Module):
-    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x).
+    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
 
-    Args:
-        held: it is the mean over a step of the horizon instead, with u held from t on; Euler steps of Δt are then
-            steps of the horizon's method.
-    """
-
-    def __init__(self, problem: Problem, policy: nn.Module, held: bool = False):
+    def __init__(self, problem: Problem, policy: nn.Module):
         super().__init__()
         self.system, self.cost, self.policy = problem.system, problem.cost, policy
-        self.stepped = problem if held else None
 
     @property
     def V(self) -> ValueFunction | None:
@@ -33,14 +27,22 @@ class ClosedLoop(nn.Module):
 
     def slope(self, x: State, u: Control) -> Tensor:
         """(f + g u, ℓ), (*batch, n + 1)."""
-        if self.stepped is None:
-            rate, cost = self.system.dynamics(x, u), self.cost.running(x, u)
-        else:
-            rate, cost = self.stepped.rates(x, u)
-        return torch.cat([rate, cost[..., None]], -1)
+        return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
 
     def control(self, t: Time, x: State) -> PolicyOutput:
         """u, V and V_x; with a law that no V defines, V = 0."""
         if isinstance(self.policy, ValuePolicy):
             return self.policy.with_value(t, x)
         return PolicyOutput(self.policy(t, x), torch.zeros_like(x[..., 0]), torch.zeros_like(x))
+
+
+class SteppedLoop(ClosedLoop):
+    """The means of (f + gu, ℓ) over a step with u held: Euler steps of it are steps of the horizon's method."""
+
+    def __init__(self, problem: Problem, policy: nn.Module):
+        super().__init__(problem, policy)
+        self.problem = problem
+
+    def slope(self, x: State, u: Control) -> Tensor:
+        rate, cost = self.problem.rates(x, u)
+        return torch.cat([rate, cost[..., None]], -1)

@@ -10,7 +10,7 @@ from torchdiffeq import odeint, odeint_adjoint
 from lyapnet.errors import DivergenceError
 from lyapnet.horizon import TABLEAUX
 from lyapnet.problem import Problem
-from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.rollout.closed_loop import ClosedLoop, SteppedLoop
 from lyapnet.rollout.discrete_adjoint import DiscreteAdjoint
 from lyapnet.types import ControlPath, PerState, State, StatePath, Times, ValuePath
 
@@ -59,8 +59,9 @@ class Rollout(nn.Module):
 
     Args:
         problem, policy: what is integrated.
-        method: a member of METHODS; rk4 is the 3/8 rule, dopri5 chooses its own steps between the nodes. A law that is
-            made to be held is held over each step of a fixed-step method, else it is u(t, x) at every stage.
+        method: a member of METHODS, None: the horizon's; rk4 is the 3/8 rule, dopri5 chooses its own steps between the
+            nodes. A law that is made to be held is held over each step of a fixed-step method, else it is u(t, x) at
+            every stage.
         gradient: a member of GRADIENTS.
             adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
                 to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
@@ -75,20 +76,21 @@ class Rollout(nn.Module):
 
     Raises:
         ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
-            an adaptive method, whose steps depend on the state.
+            an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler.
     """
 
     def __init__(
         self,
         problem: Problem,
         policy: nn.Module,
-        method: str = "euler",
+        method: str | None = None,
         gradient: str = "adjoint",
         rtol: float = 1e-6,
         atol: float = 1e-8,
         held: bool | None = None,
     ):
         super().__init__()
+        method = problem.horizon.method if method is None else method
         for name, value, known in (("method", method, METHODS), ("gradient", gradient, GRADIENTS)):
             if value not in known:
                 raise ValueError(f"Expected {name} as one of {', '.join(known)}, got {value!r}; choose one of them.")
@@ -98,18 +100,21 @@ class Rollout(nn.Module):
                 "choose one of them, or gradient adjoint."
             )
         wanted = getattr(policy, "held", False) if held is None else held
-        held = bool(wanted) and method in FIXED_STEP_METHODS
-        stepped = problem.in_steps(method=method) if held else problem
-        self.closed_loop, self.horizon = ClosedLoop(stepped, policy, held), problem.horizon
+        held = bool(wanted) and method in FIXED_STEP_METHODS[1:]  # with Euler steps every law is held
+        if held and gradient == "adjoint":
+            raise ValueError(
+                f"Expected gradient discrete or backprop for a law that is held over steps of {method}, got adjoint; "
+                "choose one of them: the costate equation of continuous time knows nothing of a held control."
+            )
+        self.closed_loop, self.horizon = ClosedLoop(problem, policy), problem.horizon
+        self.stepped = SteppedLoop(problem.in_steps(method=method), policy) if held else self.closed_loop
         self.problem, self.method, self.gradient = problem, method, gradient
         step = "euler" if held else method  # of the mean over a step that `method` takes
         self.solver_arguments: dict[str, Any] = {"method": step, "rtol": rtol, "atol": atol}
         if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
             self.solver_arguments["options"] = {"max_num_steps": 10_000}
         self.discrete = (
-            DiscreteAdjoint(self.closed_loop, self.horizon.steps, self.horizon.dt, step)
-            if gradient == "discrete"
-            else None
+            DiscreteAdjoint(self.stepped, self.horizon.steps, self.horizon.dt, step) if gradient == "discrete" else None
         )
 
     def forward(self, x0: State) -> Trajectory:
@@ -168,7 +173,7 @@ class Rollout(nn.Module):
             solve = odeint_adjoint
             arguments |= self._adjoint_arguments()
         try:
-            return solve(self.closed_loop, y0, t, **arguments)
+            return solve(self.stepped, y0, t, **arguments)
         except (
             AssertionError
         ) as error:  # how torchdiffeq says that an adaptive step shrank to nothing, or too many came

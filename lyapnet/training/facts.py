@@ -1,5 +1,6 @@
 """What can be said of a problem before training: its goal, its linearisation there, how stiff it is, where to start."""
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -7,6 +8,7 @@ from torch import Tensor
 
 from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64, riccati
+from lyapnet.horizon import TABLEAUX
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
@@ -109,9 +111,12 @@ def _linearisation(problem: Problem) -> list[Fact]:
             "controllable", f"not linearised at the goal: u does not reach {modes}",
             "what grows there cannot be held near the goal" if grows else "",
         ))  # fmt: skip
-    growth = (1 + dt * values).abs()
-    if problem.horizon.method == "euler" and bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
-        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under Euler steps", REMEDY))
+    method, z = problem.horizon.method, dt * values
+    order = len(TABLEAUX[method].b)  # of each of these methods, as of its stability polynomial
+    growth = sum((z**k / math.factorial(k) for k in range(1, order + 1)), start=torch.ones_like(z)).abs()
+    if bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
+        by = "Euler" if method == "euler" else method
+        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under {by} steps", REMEDY))
     return facts
 
 
@@ -144,4 +149,4 @@ def _listed(values: Tensor) -> str:
 
 
 def _complex(value: complex) -> str:
-    return f"{value.real:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} {value.imag:+.3g}i"
+    return f"{value.real + 0.0:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} {value.imag:+.3g}i"

@@ -33,7 +33,7 @@ class Examples(NamedTuple):
     after: Tensor  # t_{n+1}
     drifted: State  # F(x_n, u*), where the control that costs nothing leads
     gradient: State  # V_x(t_{n+1}, drifted)
-    weight: Tensor  # L⁻¹Bᵀ (k, m, n), LLᵀ = 2R + Δt BᵀHB, B = F_u/Δt: for what a wrong V_x costs
+    weight: Tensor  # L⁻¹Bᵀ (k, m, n), LLᵀ = ℓ_uu + Δt BᵀHB, B = F_u/Δt: for what a wrong V_x costs
     cost: PerState  # J of the trajectory, or the median of all if that is more
     duration: float  # T
 
@@ -130,7 +130,7 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tens
     here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
     free, R = problem.response(now), problem.cost.R(now)
     B = free.by_control
-    values, vectors = torch.linalg.eigh(2 * R + dt * B.mT @ H @ B)
+    values, vectors = torch.linalg.eigh(free.curvature + dt * B.mT @ H @ B)
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ B.mT
     target = gradient[1:] + apply(H, free.x - x[1:])
@@ -142,7 +142,7 @@ def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(No
     """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹Bᵀ(V_x − V_x*)‖².
 
     The second is what the held controls of V cost beyond the optimum, to second order, as a share of J: a step with
-    controls u + e costs ½ Δt eᵀ(2R + Δt BᵀHB)e more.
+    controls u + e costs ½ Δt eᵀ(ℓ_uu + Δt BᵀHB)e more.
     """
     t, x, value, after, drifted, gradient, weight, cost = (column[rows] for column in examples.columns)
     wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]

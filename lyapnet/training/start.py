@@ -27,7 +27,7 @@ from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
 from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, typical
-from lyapnet.types import PerState, State
+from lyapnet.types import Control, PerState, State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
@@ -36,6 +36,7 @@ SPREAD = 0.35  # of the distances from the goal along optima, in units of which 
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 CALM = "V = 0"
 REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
+SUBSTEPS = 4  # of fourth order within Δt, for continuous time
 
 Report = Callable[[str], None]
 
@@ -63,8 +64,10 @@ class Start(NamedTuple):
     @property
     def steps_miss(self) -> str:
         """What the steps of the rollout miss of continuous time; empty where that is little."""
-        ratio = self.held_cost / self.chosen.cost if self.chosen.cost else 1.0
-        if abs(ratio - 1) <= MISSED or self.chosen.name == CALM:
+        if self.chosen.finite < 1 or not self.chosen.cost or self.chosen.name == CALM:
+            return ""
+        ratio = self.held_cost / self.chosen.cost
+        if abs(ratio - 1) <= MISSED:
             return ""
         by = f"{ratio:.3g} times as much" if math.isfinite(ratio) else "more than any number"
         return f"in continuous time, u held for Δt, the law that training starts from costs {by}"
@@ -118,8 +121,7 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
-    in_time = problem.in_steps(method="rk4")
-    return Start(chosen, tried, float(_costs(learners[0], in_time, x0).mean()))
+    return Start(chosen, tried, float(_costs(learners[0], x0, SUBSTEPS).mean()))
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -208,15 +210,24 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
 
 def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    cost = _costs(learner, learner.problem, x0)
+    cost = _costs(learner, x0)
     share = float(cost.isfinite().double().mean())
     return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
 
 
-def _costs(learner: Learner, problem: Problem, x0: State) -> PerState:
-    """What the law of a learner costs in a problem, each control held for a step."""
-    policy, times = learner.rollout.closed_loop.policy, problem.horizon.times(x0)
-    return path_under(problem, lambda n, x: policy(times[n], x), x0).cost
+def _costs(learner: Learner, x0: State, substeps: int = 0) -> PerState:
+    """What the law of a learner costs, each control held for a step, which may be some rk4 steps."""
+    problem, policy, each = learner.problem, learner.rollout.closed_loop.policy, max(substeps, 1)
+    times, u = problem.horizon.times(x0), x0
+    if substeps:
+        problem = problem.in_steps(steps=each * problem.horizon.steps, dt=problem.horizon.dt / each, method="rk4")
+
+    def law(n: int, x: State) -> Control:
+        nonlocal u
+        u = u if n % each else policy(times[n // each], x)
+        return u
+
+    return path_under(problem, law, x0).cost
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:

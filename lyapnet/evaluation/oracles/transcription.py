@@ -36,7 +36,7 @@ class Transcription(Oracle):
 
     Args:
         problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
-        method: of the steps, a key of TABLEAUX.
+        method: of the steps, a key of TABLEAUX; None: the horizon's.
         iterations: of IPOPT from one start, at most.
 
     Raises:
@@ -46,8 +46,8 @@ class Transcription(Oracle):
     implementation of an interior-point filter line-search algorithm", Mathematical Programming 2006 (IPOPT).
     """
 
-    def __init__(self, problem: Problem, method: str = "euler", iterations: int = 500):
-        self.problem = copied(problem).in_steps(method=method)
+    def __init__(self, problem: Problem, method: str | None = None, iterations: int = 500):
+        self.problem = copied(problem).in_steps(method=method or problem.horizon.method)
         system, horizon = self.problem.system, self.problem.horizon
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
         graphs = [traced(self.step, (x, u)), traced(self.end, (x,))]

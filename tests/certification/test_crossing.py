@@ -29,7 +29,7 @@ def speed(limit):
 
 def level(constraints, delta=0.0, enough=ENOUGH):
     condition = DecreaseCondition(loop(riccati()), 0.9, delta, constraints)
-    return crossing_level(condition, domain(), Budget(5), enough)
+    return crossing_level(condition, domain(), Budget(20), enough)
 
 
 def test_the_level_of_a_limit_of_the_position():
@@ -168,9 +168,9 @@ def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
     bumped = Formula(lambda t, x: quadratic(t, x) + 0.05 * torch.exp(-1500 * ((x - place) ** 2).sum(-1)))
     closed_loop = hjb_loop(DoubleIntegrator(), cost(), bumped)
     task, box = problem().replaced(initial_states=Box([-0.25, -0.25], [0.25, 0.25])), Box([-0.8, -1.2], [0.8, 1.2])
-    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(20)).verdict == "falsified"
+    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(60)).verdict == "falsified"
     slow = task.replaced(constraints=speed(0.65))
-    assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(20)).verdict == "certified"
+    assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(60)).verdict == "certified"
 
 
 def test_the_report_says_what_is_kept():

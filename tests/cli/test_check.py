@@ -12,6 +12,7 @@ from lyapnet.config import config_from_plain
 from lyapnet.systems import Linear
 from lyapnet.training.build import build_learner, build_problem
 from lyapnet.training.facts import facts_of
+from lyapnet.training.start import Candidate, Start
 
 TASK = {
     "system": {"name": "pendulum"},
@@ -99,9 +100,38 @@ def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     )
 
 
-def test_a_step_that_euler_cannot_take():
-    assert "grow under Euler" in facts(linear([[-30]], [[1]]))["Δt"].found
-    assert "Δt" not in facts(linear([[-10]], [[1]]))
+@pytest.mark.parametrize(("method", "least"), [("euler", 2.0), ("midpoint", 2.0), ("rk4", 2.785)])
+def test_a_step_that_a_method_cannot_take(method, least):
+    """−λΔt at which each becomes unstable (Hairer, Wanner, Solving Ordinary Differential Equations II, § IV.2)."""
+    by = {"rollout": {"policy": "sampled", "method": method}}
+    name = "Euler" if method == "euler" else method
+    assert f"grow under {name} steps" in facts(linear([[-10 * (least + 0.01)]], [[1]], **by))["Δt"].found
+    assert "Δt" not in facts(linear([[-10 * (least - 0.01)]], [[1]], **by))
+
+
+def test_what_steps_miss_of_continuous_time():
+    """ẋ = u from any x₀ under u = −Kx held: Σ x² of Euler against ∫x² of straight lines."""
+    coarse = linear([[0]], [[1]], cost={"Q": [1], "R": [0.1], "Q_T": [1e-3]}, horizon={"steps": 10, "dt": 0.2})
+    fact = facts(coarse)["steps"]
+    P, K = 1e-3, []
+    for _ in range(10):
+        K.insert(0, P / (0.1 + 0.2 * P))
+        P = 0.2 * (1 + 0.1 * K[0] ** 2) + P * (1 - 0.2 * K[0]) ** 2
+    x, euler, true = 1.0, 0.0, 0.0
+    for k in K:
+        after = x * (1 - 0.2 * k)
+        paid = 0.2 * 0.1 * (k * x) ** 2
+        euler, true = euler + 0.2 * x**2 + paid, true + 0.2 * (x**2 + x * after + after**2) / 3 + paid
+        x = after
+    ratio = (true + 1e-3 * x**2) / (euler + 1e-3 * x**2)
+    assert f"costs {ratio:.3g} times as much" in fact.found
+    assert fact.advice.startswith("rollout.method=rk4")
+    assert "steps" not in facts({**coarse, "rollout": {"policy": "sampled", "method": "rk4"}})
+    assert "steps" not in facts({**coarse, "horizon": {"steps": 200, "dt": 0.01}})
+    chosen = Candidate("an optimum", 1.0, 1.0, 0.0)
+    assert "1.05 times" in Start(chosen, [chosen], 1.05).steps_miss
+    assert "more than any number" in Start(chosen, [chosen], float("inf")).steps_miss
+    assert not Start(chosen._replace(cost=float("inf"), finite=0.5), [chosen], 3.0).steps_miss, "nothing to compare"
 
 
 def test_a_start_that_is_not_finite_says_so():

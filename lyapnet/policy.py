@@ -148,10 +148,11 @@ class LookaheadPolicy(SampledPolicy):
         u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
     From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx B, or H for V_xx where that is not
-    convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as
-    close to state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit
-    function theorem), up to what the steps leave of Q_u. Where Q_uu/Δt does not exceed CONVEX · 2R, both are those of
-    the model H, and u may be short of the minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
+    convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as close to
+    state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit function
+    theorem), up to what the steps leave of Q_u, and V_xᵀF_uu, which is zero with Euler. Where Q_uu/Δt does not exceed
+    CONVEX · ℓ_uu, both are those of the model H, and u may be short of the minimiser. In float32 u is as exact as the
+    rounding of V lets Q be compared.
 
     Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
     Wright, Numerical Optimization, 2006, ch. 3 (the steps).

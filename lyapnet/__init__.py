@@ -12,11 +12,12 @@ except PackageNotFoundError:  # a source tree that was never installed
 if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
     from lyapnet.constraints import AllOf, Ball, Constraints, StateLimits
-    from lyapnet.controller import Controller, load
+    from lyapnet.controller import Controller
     from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
     from lyapnet.horizon import Horizon
     from lyapnet.interpolation import Table
+    from lyapnet.loading import load
     from lyapnet.policy import HJBPolicy, SontagPolicy
     from lyapnet.problem import Problem
     from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
@@ -30,10 +31,11 @@ if TYPE_CHECKING:
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
     "constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
-    "controller": ["Controller", "load"],
+    "controller": ["Controller"],
     "cost": ["Cost", "ObstacleCost", "PeriodicCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
+    "loading": ["load"],
     "policy": ["HJBPolicy", "SontagPolicy"],
     "horizon": ["Horizon"],
     "problem": ["Problem"],

@@ -20,7 +20,7 @@ LEVELS = (
     {"config"},
     {"build"},
     {"controller"},
-    {"evaluation"},
+    {"evaluation", "loading"},
     {"certification"},
     {"bench", "training"},
     {"comparison"},

@@ -11,6 +11,8 @@ from torch.testing import assert_close
 from lyapnet import Controller
 from lyapnet.beyond import BEYOND
 from lyapnet.cost import QuadraticCost, TargetCost
+from lyapnet.errors import UsageError
+from lyapnet.evaluation.afterwards import afterwards, distances, in_plain_data
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.policy import POLICIES, HJBPolicy
 from lyapnet.rollout import Rollout
@@ -194,3 +196,48 @@ def test_the_last_node_is_within_the_horizon_in_single_precision(steps, dt, logg
 def test_another_word_is_refused():
     with pytest.raises(ValueError, match="Expected beyond as one of hold, receding, riccati, error, got 'stop'"):
         controller("stop")
+
+
+def test_what_each_law_after_the_end_does():
+    own = controller(None)
+    found = {one.beyond: one for one in afterwards(own, X, 3)}
+    assert set(found) == {"hold", "receding", "riccati"}
+    for beyond, one in found.items():
+        assert_close(one.distance, controller(beyond).rollout(X, steps=30).x.norm(dim=-1))
+    hold, receding, riccati = (row["distances"] for row in in_plain_data(list(found.values()), own, 3))
+    assert [at["time"] for at in hold] == pytest.approx([1.0, 1.2, 2.0, 3.0])
+    assert hold[0]["mean"] == receding[0]["mean"] == riccati[0]["mean"]
+    assert len({at[-1]["mean"] for at in (hold, receding, riccati)}) == 3
+    (panel,) = distances(list(found.values()), own).axes
+    assert [line.get_label() for line in panel.lines] == ["hold", "receding", "riccati", "T"]
+    assert panel.lines[0].get_xdata()[-1] == pytest.approx(3.0)
+
+
+def test_a_law_that_cannot_follow_says_why():
+    """No regulator of a plant that no control reaches, and a law that leaves the finite numbers after T alone."""
+    problem = problem_of(Linear([[1.0]], [[0.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
+    hold, receding, riccati = afterwards(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
+    assert len(hold.distance) == 12, "one step after T at the least"
+    assert hold.refused == ""
+    assert riccati.distance is None
+    assert "that a linear law stabilises" in riccati.refused
+    assert receding.mean_at(11) == hold.mean_at(11)
+
+
+def test_a_law_that_leaves_the_finite_numbers_says_so():
+    """V(T, ·) = 0 leaves an unstable plant alone, whose states grow by eleven with each step."""
+    problem = problem_of(Linear([[100.0]], [[1.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
+    own = Controller(problem, Formula(lambda t, x: torch.where(t < 0.95, 105.0, 0.0) * (x**2).sum(-1)))
+    hold, receding, riccati = found = afterwards(own, X[:, :1], 40)
+    assert hold.distance is None
+    assert "the closed loop diverges" in hold.refused
+    assert float(receding.distance[-1].max()) < 1e-6
+    assert float(riccati.distance[-1].max()) < 1e-6
+    assert in_plain_data(found, own, 40)[0]["distances"][-1]["mean"] is None
+    assert "none of hold" in distances(found, own).axes[0].get_title()
+
+
+@pytest.mark.parametrize("multiple", [0.5, float("inf"), float("nan")])
+def test_a_time_that_never_comes_is_refused(multiple):
+    with pytest.raises(UsageError, match="Expected a multiple of T from 1 on"):
+        afterwards(controller(None), X, multiple)

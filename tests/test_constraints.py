@@ -238,7 +238,7 @@ def test_who_violates_is_told(run):
 @pytest.mark.usefixtures("few_optima")
 def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     content = {**constrained(name="tests.test_constraints:Tube"), "logs": str(tmp_path)}
-    run = lyapnet.train(content, [*BRIEF, "rollout.policy=lookahead", "loggers=[csv]"])
+    run = lyapnet.train(content, [*BRIEF, "rollout.policy=lookahead", "horizon={steps: 10, dt: 0.2}", "loggers=[csv]"])
     with pytest.raises(UsageError, match=r"Expected constraints=…"):
         lyapnet.load(run.best)
     assert lyapnet.load(run.best, constraints=Tube()).problem.constraints.names == ("tube",)
@@ -310,7 +310,7 @@ def test_paths_around_a_disk():
 
 @pytest.mark.usefixtures("few_optima")
 def test_what_is_said_before_training_names_the_penalty():
-    config = config_from_plain(constrained(**SPEED))
+    config = config_from_plain(constrained(**SPEED), ["rollout.policy=sampled"])
     learner = build_learner(config, build_problem(config).relaxed())
     facts = {fact.name: fact.found for fact in facts_of(learner)}
     assert facts["constraints"].startswith("penalty of ")

@@ -40,7 +40,7 @@ def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, few_seconds_f
 
 def test_what_waits_in_a_command_stops_at_once(monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.cli.options.read_checkpoint", lambda *_: time.sleep(60), raising=False)
-    monkeypatch.setattr("lyapnet.controller.read_checkpoint", lambda *_: time.sleep(60))
+    monkeypatch.setattr("lyapnet.loading.read_checkpoint", lambda *_: time.sleep(60))
     before = signal.getsignal(signal.SIGTERM)
     told_after(0.5, signal.SIGTERM)
     started = time.monotonic()

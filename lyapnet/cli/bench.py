@@ -141,7 +141,7 @@ def certify(
     from lyapnet.bench.proofs import growth
     from lyapnet.bench.tables import proofs_table, tightness_table
     from lyapnet.bench.tightness import tightness
-    from lyapnet.controller import load
+    from lyapnet.loading import load
 
     lengths = [_count("--dimensions", text) for text in _items([dimensions])]
     if figures is not None:

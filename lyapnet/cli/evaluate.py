@@ -24,6 +24,7 @@ from lyapnet.errors import UsageError
 
 if TYPE_CHECKING:
     from lyapnet.controller import Controller
+    from lyapnet.evaluation.afterwards import Afterwards
     from lyapnet.evaluation.measurement import Evaluation
 
 
@@ -38,6 +39,10 @@ def evaluate(
     disturbed: Annotated[
         bool, typer.Option("--robustness", help="Also outside X₀, on other plants, under noise, with half the Δt.")
     ] = False,
+    until: Annotated[
+        float | None,
+        typer.Option(help="Also what each law that can follow T does, up to this many T.", metavar="MULTIPLE"),
+    ] = None,
     system: System = None,
     network: Network = None,
     cost: Cost = None,
@@ -52,9 +57,10 @@ def evaluate(
     The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
     once for each state: the next evaluation of any controller of the task reads it.
     """
+    from lyapnet.evaluation.afterwards import afterwards, in_plain_data
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.robustness import nominal, robustness
-    from lyapnet.evaluation.tables import evaluation_table, robustness_table
+    from lyapnet.evaluation.tables import afterwards_table, evaluation_table, robustness_table
 
     if table is not None and not table.parent.is_dir():
         raise UsageError(
@@ -80,6 +86,9 @@ def evaluate(
         if disturbed:
             rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]
+        later = [] if until is None else afterwards(controller, measured.table.x0[:count], until)
+        if until is not None:
+            result["afterwards"] = in_plain_data(later, controller, until)
     if as_json:
         print(json.dumps(result))
     else:
@@ -87,16 +96,19 @@ def evaluate(
         if disturbed:
             member = nominal(controller) if controller.system.constants else {}
             Console(highlight=False, markup=False).print(robustness_table(result["robustness"], count, member))
+        if until is not None:
+            Console(highlight=False, markup=False).print(afterwards_table(result["afterwards"], count))
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
-        notes.print(_write_figures(figures, controller, measured), soft_wrap=True)
+        notes.print(_write_figures(figures, controller, measured, later), soft_wrap=True)
 
 
-def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation") -> str:
+def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation", later: "list[Afterwards]") -> str:
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
+    from lyapnet.evaluation.afterwards import distances
     from lyapnet.evaluation.path_figure import has_plane, paths
 
     trajectory, problem = controller.rollout(measured.table.x0[:12]), controller.problem
@@ -108,6 +120,8 @@ def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation
         drawn["paths"] = paths(trajectory, problem)
     if measured.result()["cost_ratio"] is not None:
         drawn["optimality"] = figures.optimality(measured.table)
+    if any(one.distance is not None for one in later):
+        drawn["afterwards"] = distances(later, controller)
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         figure.savefig(folder / f"{name}.png", dpi=150)

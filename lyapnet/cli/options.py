@@ -23,7 +23,7 @@ def parts_given(checkpoint: Path, **own: str | None) -> Any:
     """The user's own parts, each by its option's name, where one is given; made with the config of a checkpoint."""
     from lyapnet.build import Parts, parts_named
     from lyapnet.checkpoint import read_checkpoint
-    from lyapnet.controller import config_of
+    from lyapnet.loading import config_of
 
     named = {part: name for part, name in own.items() if name is not None}
     return parts_named(config_of(read_checkpoint(checkpoint), checkpoint), named) if named else Parts()
@@ -33,7 +33,7 @@ def load_controller(checkpoint: Path, at: list[str] | None = None, **own: str | 
     """The controller of a checkpoint, with the user's own parts; of a family, that of one member if `at` names it."""
     import torch
 
-    from lyapnet.controller import load
+    from lyapnet.loading import load
 
     controller = load(checkpoint, **vars(parts_given(checkpoint, **own)))
     torch.set_num_threads(controller.config.training.threads)

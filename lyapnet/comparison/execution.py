@@ -18,10 +18,11 @@ from lyapnet.comparison.results import OURS, Measurement, Result
 from lyapnet.comparison.scoring import Costs, costs_of, optima_of
 from lyapnet.comparison.sweep.points import Point
 from lyapnet.config import ControlsConfig, CostConfig, config_from_plain, to_plain
-from lyapnet.controller import Controller, load
+from lyapnet.controller import Controller
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.evaluation.states import measure
 from lyapnet.files import write_json
+from lyapnet.loading import load
 from lyapnet.random_streams import TEST, stream
 from lyapnet.schema import differences
 from lyapnet.training.runs import Run

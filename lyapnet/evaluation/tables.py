@@ -89,6 +89,17 @@ def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[s
     return table
 
 
+def afterwards_table(rows: list[dict[str, Any]], samples: int) -> Table:
+    """Where closed loops go after T under each law, as afterwards.in_plain_data has it."""
+    columns = [Column(f"at {at['time']:g} s", justify="right") for at in rows[0]["distances"]]
+    table = Table("beyond", *columns, title=f"what follows T: mean ‖x − x*‖ of {samples} closed loops")
+    for row in rows:
+        table.add_row(row["beyond"], *("–" if at["mean"] is None else f"{at['mean']:.3g}" for at in row["distances"]))
+    refused = [f"{row['beyond']}: {row['refused']}" for row in rows if row["refused"]]
+    table.caption = Text("\n".join(refused)) if refused else None
+    return table
+
+
 def measured_or_not(key: str, value: float | None) -> str:
     """A measure of an evaluation as text, a dash where it is not known."""
     return "–" if value is None else measured(key, value)

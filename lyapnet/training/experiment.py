@@ -16,10 +16,10 @@ from rich.text import Text
 
 from lyapnet.build import Parts
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
-from lyapnet.controller import load
 from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
 from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
+from lyapnet.loading import load
 from lyapnet.training.build import build_data
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each

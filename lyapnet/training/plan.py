@@ -13,8 +13,8 @@ import torch
 from lyapnet.build import Parts, parts_of
 from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
-from lyapnet.controller import config_of, load_value_function, require_parts
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.loading import config_of, load_value_function, require_parts
 from lyapnet.problem import Problem
 from lyapnet.sizes import check_training_sizes
 from lyapnet.training.build import build_callbacks, build_module

@@ -14,9 +14,9 @@ from lyapnet.build import Parts
 from lyapnet.certification import DecreaseCondition, violations
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
-from lyapnet.controller import require_parts
 from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
+from lyapnet.loading import require_parts
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.training.experiment import train
 from lyapnet.training.runs import CONFIG, LAST, Run, runs_of

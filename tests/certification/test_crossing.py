@@ -93,20 +93,39 @@ def test_constraints_have_gradients_and_these_are_their_own():
     assert as_it_says < 0.6 * level(Lying()) < 0.6 * float(P[0, 0]) * 1.2**2
 
 
+def task_within(constraints):
+    return problem().replaced(constraints=constraints)
+
+
 def claim(constraints, **options):
-    task = problem().replaced(constraints=constraints)
-    return sound_claim(loop(riccati()), task, **{"alpha": 0.9, "delta": 0.02, "budget": Budget(20), **options})
+    return sound_claim(
+        loop(riccati()), task_within(constraints), **{"alpha": 0.9, "delta": 0.02, "budget": Budget(20), **options}
+    )
 
 
-def certificate(constraints):
-    task = problem().replaced(constraints=constraints)
-    closed_loop = loop(riccati())
-    return SoundCertificate(Controller(task, closed_loop.V), claim(constraints), {"seconds": 30.0})
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """The proof that is kept of the safe claim, for tests that read it."""
+    return tmp_path_factory.mktemp("kept") / "proof"
 
 
-def test_a_safe_set_is_proved_and_another_falsified():
+@pytest.fixture(scope="module")
+def safe(kept):
+    return claim(position(1.35), keep=kept)
+
+
+@pytest.fixture(scope="module")
+def unsafe():
+    return claim(position(1.03))
+
+
+def certificate(limit, claimed):
+    return SoundCertificate(Controller(task_within(limit), loop(riccati()).V), claimed, {"seconds": 30.0})
+
+
+def test_a_safe_set_is_proved_and_another_falsified(safe, unsafe):
     """From the corner of X₀ the position rises to 1.06 m; the funnel that X₀ needs reaches 1.31 m."""
-    safe, unsafe, between = claim(position(1.35)), claim(position(1.03)), claim(position(1.2))
+    between = claim(position(1.2))
     assert safe.verdict == "certified"
     assert safe.violation is None
     assert safe.constraints == ("position within 1.35",)
@@ -120,16 +139,14 @@ def test_a_safe_set_is_proved_and_another_falsified():
     assert 0 < between.volume_share < 1
 
 
-def test_a_kept_proof_is_about_its_constraints(tmp_path):
-    kept, options = tmp_path / "proof", {"alpha": 0.9, "delta": 0.02}
-    whole = claim(position(1.35), keep=kept)
+def test_a_kept_proof_is_about_its_constraints(safe, kept):
     again = claim(position(1.35), keep=kept, replay=True, budget=Budget(60))
-    assert whole.verdict == again.verdict == "certified"
-    assert whole.fingerprint == again.fingerprint
+    assert safe.verdict == again.verdict == "certified"
+    assert safe.fingerprint == again.fingerprint
     with pytest.raises(UsageError):
-        claim(position(1.4), keep=kept, **options)
+        claim(position(1.4), keep=kept)
     with pytest.raises(UsageError):
-        claim(None, keep=kept, **options)
+        claim(None, keep=kept)
 
 
 class Counting(Constraints):
@@ -143,23 +160,23 @@ class Counting(Constraints):
         return x[..., :1] / 1.35 - (1 if self.calls < 60 else 9)
 
 
-def test_constraints_that_change_with_the_calls_are_refused_or_what_they_were():
+def test_constraints_that_change_with_the_calls_are_refused_or_what_they_were(safe):
     try:
         found = claim(Counting())
     except UsageError:
         return
-    assert found.crossing <= claim(position(1.35)).crossing * 1.01
+    assert found.crossing <= safe.crossing * 1.01
 
 
 def test_a_violation_is_one():
-    task = problem().replaced(constraints=position(1.03))
+    task = task_within(position(1.03))
     found = find_violation(loop(riccati()), task, torch.Generator().manual_seed(0))
     x0 = torch.tensor(found.x0)
     assert task.initial_states.contains(x0)
     A = torch.tensor([[0.0, 1.0], [0.0, 0.0]]) - torch.tensor([[0.0], [1.0]]) @ torch.as_tensor(riccati())[1:]
     x = torch.matrix_exp(A * found.t) @ x0
     assert float(x[0] - 1.03) == pytest.approx(found.h, rel=1e-4)
-    assert find_violation(loop(riccati()), problem().replaced(constraints=position(1.35)), None) is None
+    assert find_violation(loop(riccati()), task_within(position(1.35)), None) is None
 
 
 def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
@@ -168,13 +185,13 @@ def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
     bumped = Formula(lambda t, x: quadratic(t, x) + 0.05 * torch.exp(-1500 * ((x - place) ** 2).sum(-1)))
     closed_loop = hjb_loop(DoubleIntegrator(), cost(), bumped)
     task, box = problem().replaced(initial_states=Box([-0.25, -0.25], [0.25, 0.25])), Box([-0.8, -1.2], [0.8, 1.2])
-    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(60)).verdict == "falsified"
+    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(60, boxes=2000)).verdict == "falsified"
     slow = task.replaced(constraints=speed(0.65))
     assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(60)).verdict == "certified"
 
 
-def test_the_report_says_what_is_kept():
-    proved, failed = certificate(position(1.35)), certificate(position(1.03))
+def test_the_report_says_what_is_kept(safe, unsafe):
+    proved, failed = certificate(position(1.35), safe), certificate(position(1.03), unsafe)
     assert "or violates a constraint (position within 1.35), up to T = 2 s" in proved.in_words()
     assert "h(x(t)) ≤ 0" in proved.in_formulas()[1]
     assert "h(x₀) ≤ 0" in proved.in_formulas()[1]
@@ -240,11 +257,7 @@ def test_states_of_X0_between_the_samples_are_held_against_constraints():
     assert least[1:] == [float("inf"), float("inf")], "X₀ may reach to a limit"
 
 
-def test_a_kept_proof_is_checked_with_its_constraints(tmp_path):
-    V, kept = loop(riccati()).V, tmp_path / "proof"
-    assert claim(position(1.35), keep=kept).verdict == "certified"
-    verdicts = [
-        check(Controller(problem().replaced(constraints=h), V), kept)["verdict"]
-        for h in (position(1.35), position(1.36), None)
-    ]
+def test_a_kept_proof_is_checked_with_its_constraints(safe, kept):
+    V = loop(riccati()).V
+    verdicts = [check(Controller(task_within(h), V), kept)["verdict"] for h in (position(1.35), position(1.36), None)]
     assert verdicts == ["certified", "refused", "refused"]

@@ -19,7 +19,8 @@ from lyapnet.certification.sampling_certificates import (
 from lyapnet.certification.sound_certificate import SoundCertificate, sound_certificate
 from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
-from lyapnet.controller import Controller, load
+from lyapnet.controller import Controller
+from lyapnet.loading import load
 from lyapnet.programs import Tolerances
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator

@@ -32,8 +32,9 @@ from lyapnet.build import build_problem, build_value_function
 from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain, load_config
-from lyapnet.controller import Controller, load_value_function
+from lyapnet.controller import Controller
 from lyapnet.errors import LyapnetError, UsageError
+from lyapnet.loading import load_value_function
 from lyapnet.networks import FCN
 from lyapnet.random_streams import VALIDATION, stream
 from lyapnet.systems import DoubleIntegrator

@@ -33,15 +33,25 @@ SWING = LINEAR | {
 }
 
 
-@pytest.fixture(autouse=True)
-def _few_optima(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+@pytest.fixture(scope="module", autouse=True)
+def _few_optima():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lyapnet.training.start.OPTIMA", 12)
+        patch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+        yield
 
 
 def started(content, *overrides, **options):
     module = build_module(config_from_plain(content, overrides))
     return module.members, choose_start(list(module.members), **options)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """The learner of the swing-up where it starts from, that start, and what was told meanwhile."""
+    told = []
+    (learner,), start = started(SWING, report=told.append)
+    return learner, start, told
 
 
 def test_a_linear_task_is_solved_before_the_first_step(monkeypatch):
@@ -74,9 +84,8 @@ def test_the_learning_rate_rises_before_it_falls():
     assert config_from_plain(LINEAR).training.warmup > 0
 
 
-def test_far_from_the_goal_optima_are_the_best_start():
-    told = []
-    (learner,), start = started(SWING, report=told.append)
+def test_far_from_the_goal_optima_are_the_best_start(swing):
+    learner, start, told = swing
     assert told == ["the optimum from the centre of X₀", "optima from 12 states of X₀", "fitting V to 12 optima"]
     assert "optim" in start.chosen.name
     costs = {candidate.name: candidate.cost for candidate in start.candidates}
@@ -91,7 +100,7 @@ def test_far_from_the_goal_optima_are_the_best_start():
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
 
 
-def test_within_limits_optima_are_a_start_too(tmp_path, capsys):
+def test_within_limits_optima_are_a_start_too(swing, tmp_path, capsys):
     """Without limits, the best start costs less, and its controls are larger."""
     limited = {**SWING, "controls": {"lower": -9, "upper": 9}, "logs": str(tmp_path)}
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
@@ -105,8 +114,8 @@ def test_within_limits_optima_are_a_start_too(tmp_path, capsys):
     assert "torque at its lower, upper limit" in " ".join(capsys.readouterr().out.split())
     trajectory = load(run.best).rollout(torch.tensor([[math.pi, 0.2]]))
     assert float(trajectory.u.abs().max()) == 9
-    (learner,), _ = started(SWING)
-    assert float(learner.rollout(torch.tensor([[math.pi, 0.2]])).u.detach().abs().max()) > 9
+    unlimited, *_ = swing
+    assert float(unlimited.rollout(torch.tensor([[math.pi, 0.2]])).u.detach().abs().max()) > 9
 
 
 @pytest.mark.parametrize("task", [LINEAR, SWING])

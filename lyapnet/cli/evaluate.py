@@ -57,7 +57,7 @@ def evaluate(
     The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
     once for each state: the next evaluation of any controller of the task reads it.
     """
-    from lyapnet.evaluation.afterwards import afterwards, in_plain_data
+    from lyapnet.evaluation.afterwards import afterwards, check_multiple, in_plain_data
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.robustness import nominal, robustness
     from lyapnet.evaluation.tables import afterwards_table, evaluation_table, robustness_table
@@ -76,13 +76,15 @@ def evaluate(
         constraints=constraints,
         program=program,
     )
+    count = min(samples, 64)
+    if until is not None:
+        check_multiple(controller, until, count)
     notes = Console(stderr=True, highlight=False, markup=False)
     with notes.status("measuring …") as status:
         measured = evaluation(
             controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
         )
         result = measured.result()
-        count = min(samples, 64)
         if disturbed:
             rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]

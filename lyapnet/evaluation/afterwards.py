@@ -13,6 +13,7 @@ from lyapnet.beyond import BEYOND
 from lyapnet.controller import Controller
 from lyapnet.drawing import CYCLE, legend_below, numpy_of
 from lyapnet.errors import DivergenceError, UsageError
+from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.types import State
 
 LAWS = tuple(name for name in BEYOND if name != "error")
@@ -32,7 +33,12 @@ class Afterwards(NamedTuple):
 
 
 def afterwards(controller: Controller, x0: State, multiple: float) -> list[Afterwards]:
-    """The closed loops of a batch of states up to a multiple of T, under each law that can follow T."""
+    """The closed loops of a batch of states up to a multiple of T, under each law that can follow T.
+
+    Raises:
+        UsageError: see check_multiple.
+    """
+    check_multiple(controller, multiple, len(x0))
     steps, found = last_node(controller, multiple), []
     for beyond in LAWS:
         distance, refused = None, ""
@@ -47,14 +53,20 @@ def afterwards(controller: Controller, x0: State, multiple: float) -> list[After
     return found
 
 
-def last_node(controller: Controller, multiple: float) -> int:
-    """The node of the horizon's steps that is a multiple of T away, one after T at the least.
+def check_multiple(controller: Controller, multiple: float, states: int) -> None:
+    """Refuse a multiple of T that never comes, that is before T, or up to which closed loops fit into no memory.
 
     Raises:
-        UsageError: that is never, or before T.
+        UsageError: naming it.
     """
     if not 1 <= multiple < math.inf:
         raise UsageError(f"Expected a multiple of T from 1 on, got {multiple:g}; give how many T to go on for.")
+    size = size_of_loops(states, last_node(controller, multiple), controller.system.n)
+    require_memory("a multiple of T", multiple, len(LAWS) * size, "give a smaller one")
+
+
+def last_node(controller: Controller, multiple: float) -> int:
+    """The node of the horizon's steps that is a multiple of T away, one after T at the least."""
     return max(math.ceil(multiple * controller.horizon.steps), controller.horizon.steps + 1)
 
 

@@ -67,6 +67,19 @@ def evaluated(run, capsys, *arguments):
     return capsys.readouterr().out
 
 
+def test_what_follows_the_horizon_is_told_where_it_is_asked_for(run, capsys, tmp_path):
+    options = ["--no-optimum", "--until", "2"]
+    later = json.loads(evaluated(run, capsys, "--json", "--figures", str(tmp_path), *options))["afterwards"]
+    horizon = load(run / "checkpoints" / "best.ckpt").horizon
+    assert [law["beyond"] for law in later] == ["hold", "receding", "riccati"]
+    assert later[0]["distances"][-1]["time"] == pytest.approx(2 * horizon.duration)
+    assert (tmp_path / "afterwards.png").is_file()
+    shown = " ".join(evaluated(run, capsys, *options).split())
+    assert "what follows T: mean ‖x − x*‖ of 5 closed loops" in shown
+    assert f"{later[0]['distances'][-1]['mean']:.3g}" in shown
+    assert "afterwards" not in json.loads(evaluated(run, capsys, "--json", "--no-optimum"))
+
+
 def test_evaluation_reports_the_optimum_of_a_nonlinear_task(run, capsys, tmp_path):
     files = ["--table", str(tmp_path / "states.csv"), "--figures", str(tmp_path / "figures")]
     result = json.loads(evaluated(run, capsys, "--json", *files))

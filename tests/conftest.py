@@ -69,7 +69,10 @@ def _cache(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _checked_anew():
+    """For what a file makes once, too."""
     _calls.clear()
+    torch.set_default_dtype(torch.float64)
+    torch.manual_seed(0)
 
 
 @pytest.fixture(autouse=True)

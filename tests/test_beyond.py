@@ -12,7 +12,8 @@ from lyapnet import Controller
 from lyapnet.beyond import BEYOND
 from lyapnet.cost import QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
-from lyapnet.evaluation.afterwards import afterwards, distances, in_plain_data
+from lyapnet.evaluation.afterwards import afterwards, in_plain_data
+from lyapnet.evaluation.afterwards_figure import distances
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.policy import POLICIES, HJBPolicy
 from lyapnet.rollout import Rollout
@@ -214,7 +215,7 @@ def test_what_each_law_after_the_end_does():
 
 
 def test_a_law_that_cannot_follow_says_why():
-    """No regulator of a plant that no control reaches, and a law that leaves the finite numbers after T alone."""
+    """There is no regulator of a plant that no control reaches."""
     problem = problem_of(Linear([[1.0]], [[0.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
     hold, receding, riccati = afterwards(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
     assert len(hold.distance) == 12, "one step after T at the least"
@@ -235,6 +236,16 @@ def test_a_law_that_leaves_the_finite_numbers_says_so():
     assert float(riccati.distance[-1].max()) < 1e-6
     assert in_plain_data(found, own, 40)[0]["distances"][-1]["mean"] is None
     assert "none of hold" in distances(found, own).axes[0].get_title()
+
+
+def test_closed_loops_that_stay_at_the_goal_have_a_figure():
+    own = controller(None)
+    assert distances(afterwards(own, 0 * X, 2), own).axes[0].get_ylim()[0] > 0
+
+
+def test_what_does_not_fit_is_no_refusal():
+    with pytest.raises(ValueError, match="Expected x of shape"):
+        afterwards(controller(None), torch.zeros(2, 3), 2)
 
 
 @pytest.mark.parametrize("multiple", [0.5, float("inf"), float("nan"), 1e12])

@@ -41,7 +41,7 @@ def evaluate(
     ] = False,
     until: Annotated[
         float | None,
-        typer.Option(help="Also what each law that can follow T does, up to this many T.", metavar="MULTIPLE"),
+        typer.Option(help="Also where each law that can follow T leads, up to this many T.", metavar="MULTIPLE"),
     ] = None,
     system: System = None,
     network: Network = None,
@@ -110,7 +110,7 @@ def evaluate(
 def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation", later: "list[Afterwards]") -> str:
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
-    from lyapnet.evaluation.afterwards import distances
+    from lyapnet.evaluation.afterwards_figure import distances
     from lyapnet.evaluation.path_figure import has_plane, paths
 
     trajectory, problem = controller.rollout(measured.table.x0[:12]), controller.problem

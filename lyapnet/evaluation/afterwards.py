@@ -6,18 +6,16 @@ from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from lyapnet.beyond import BEYOND
 from lyapnet.controller import Controller
-from lyapnet.drawing import CYCLE, legend_below, numpy_of
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.types import State
 
 LAWS = tuple(name for name in BEYOND if name != "error")
-LEAST, FAR = 1e-12, 1e3  # times the greatest distance before T: what the axis shows at the most
+DIVERGES = "the closed loop diverges"
 
 
 class Afterwards(NamedTuple):
@@ -41,15 +39,19 @@ def afterwards(controller: Controller, x0: State, multiple: float) -> list[After
     check_multiple(controller, multiple, len(x0))
     steps, found = last_node(controller, multiple), []
     for beyond in LAWS:
-        distance, refused = None, ""
         try:
-            x = controller.continued(beyond).rollout(x0, steps).x
-            distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
+            other = controller.continued(beyond)
+        except ValueError as error:  # of a goal that the law cannot hold
+            found.append(Afterwards(beyond, None, str(error)))
+            continue
+        try:
+            x = other.rollout(x0, steps).x
         except DivergenceError as error:
-            refused = f"the closed loop diverges: {error}"
-        except ValueError as error:  # which the law says of a goal that it cannot hold
-            refused = str(error)
-        found.append(Afterwards(beyond, distance, refused))
+            found.append(Afterwards(beyond, None, f"{DIVERGES}: {error}"))
+            continue
+        distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
+        finite = bool(distance.isfinite().all())
+        found.append(Afterwards(beyond, distance if finite else None, "" if finite else DIVERGES))
     return found
 
 
@@ -87,26 +89,3 @@ def in_plain_data(found: Sequence[Afterwards], controller: Controller, multiple:
         }
         for one in found
     ]
-
-
-def distances(found: Sequence[Afterwards], controller: Controller) -> Figure:
-    """‖x − x*‖ against t under each law: the mean, and the band from the closest closed loop to the furthest."""
-    figure = Figure(figsize=(5.6, 3.6), layout="constrained")
-    axes = figure.subplots()
-    drawn = {one.beyond: one.distance for one in found if one.distance is not None}
-    before = max(float(distance[: controller.horizon.steps + 1].max()) for distance in drawn.values())
-    for color, (beyond, distance) in zip(CYCLE, drawn.items(), strict=False):
-        t = numpy_of(controller.horizon.dt * torch.arange(len(distance)))
-        shown = numpy_of(distance.clamp(min=LEAST * LEAST * before))  # zero too is below the axis
-        axes.fill_between(t, shown.min(1), shown.max(1), color=color, alpha=0.15, lw=0)
-        axes.semilogy(t, shown.mean(1), color=color, linewidth=1.4, label=beyond)
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, LEAST * before), min(top, FAR * before))
-    axes.axvline(controller.horizon.duration, color="black", linewidth=0.8, linestyle=":", label="T")
-    axes.set_xlabel("time t (s)")
-    axes.set_ylabel("‖x − x*‖")
-    missing = [one.beyond for one in found if one.distance is None]
-    also = f"; none of {', '.join(missing)}" if missing else ""
-    axes.set_title(f"mean and range of {next(iter(drawn.values())).shape[1]} closed loops{also}", fontsize=8)
-    legend_below(figure, axes)
-    return figure

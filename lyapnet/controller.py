@@ -1,4 +1,4 @@
-"""What training leaves behind: V, the control law, and the closed loop of a checkpoint."""
+"""What training leaves behind: V, the control law, and the closed loop."""
 
 import inspect
 import logging

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 SMALL = 16  # products of entries that are cheaper without the library
+CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
 UNROLLED = 6  # unknowns of a linear system, up to which it is solved in whole batches
 
 
@@ -51,6 +52,11 @@ def is_positive_definite(A: Tensor) -> Tensor:
         A = A[..., 1:, 1:] - A[..., 1:, :1] * A[..., :1, 1:] / torch.where(pivot > 0, pivot, 1.0)
         definite = definite & (A[..., 0, 0] > 0)
     return definite
+
+
+def convex_or(A: Tensor, floor: Tensor, otherwise: Tensor) -> Tensor:
+    """Each symmetric A (*batch, d, d) that exceeds CONVEX times a positive definite floor, else another matrix."""
+    return torch.where(is_positive_definite(A - CONVEX * floor)[..., None, None], A, otherwise)
 
 
 class _Inverse(torch.autograd.Function):

@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
-from lyapnet.linear_algebra import apply, is_positive_definite, multiply
-from lyapnet.problem import CONVEX, Problem, Response
+from lyapnet.linear_algebra import apply, convex_or, multiply
+from lyapnet.problem import Problem, Response
 from lyapnet.types import Control, PerState, State, Time
 
 DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
@@ -208,7 +208,7 @@ class _HeldStep:
             own = dt * multiply(jacobian(along, z).detach(), B)
         own = paid + (own + own.mT) / 2
         model = paid + dt * multiply(B.mT, multiply(H.detach(), B))
-        return torch.where(is_positive_definite(own - CONVEX * paid)[..., None, None], own, model)
+        return convex_or(own, paid, model)
 
 
 POLICIES: dict[str, type[ValuePolicy]] = {

@@ -12,12 +12,11 @@ from lyapnet.contracts import called, check_function, copied
 from lyapnet.cost import Cost, PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
-from lyapnet.linear_algebra import apply, is_positive_definite
+from lyapnet.linear_algebra import apply, convex_or
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State
 
-CONVEX = 0.1  # share of 2R by which a curvature in u has to exceed zero
 TRIED = 64  # states at which functions of others are tried
 LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
@@ -116,8 +115,7 @@ class Problem(nn.Module):
     def _convex(self, curvature: Tensor, x: State) -> Tensor:
         """ℓ_uu, or 2R in its place where it is not well above zero."""
         least = 2 * self.cost.R(x)
-        usable = is_positive_definite(curvature - CONVEX * least)
-        return torch.where(usable[..., None, None], (curvature + curvature.mT) / 2, least)
+        return convex_or((curvature + curvature.mT) / 2, least, least)
 
     def _euler_response(self, x: State, u: Control | None) -> Response:
         rest = self.cost.rest

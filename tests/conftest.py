@@ -12,7 +12,7 @@ import jaxtyping
 import pytest
 import torch
 
-CHECKED_CALLS = 10  # of each function in each file; with all of them the tests take three times as long
+CHECKED_CALLS = 50  # of each function in each file; with all of them the tests take three times as long
 _calls = Counter()
 
 
@@ -69,14 +69,16 @@ def _cache(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _checked_anew():
-    """For what a file makes once, too."""
     _calls.clear()
-    torch.set_default_dtype(torch.float64)
-    torch.manual_seed(0)
+    _float64_and_seed_0()  # for what a file makes once
 
 
 @pytest.fixture(autouse=True)
 def _float64_and_seeded():
+    _float64_and_seed_0()
+
+
+def _float64_and_seed_0():
     torch.set_default_dtype(torch.float64)
     torch.manual_seed(0)
 

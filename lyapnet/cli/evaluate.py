@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -59,8 +59,7 @@ def evaluate(
     """
     from lyapnet.evaluation.afterwards import afterwards, check_multiple, in_plain_data
     from lyapnet.evaluation.measurement import evaluation
-    from lyapnet.evaluation.robustness import nominal, robustness
-    from lyapnet.evaluation.tables import afterwards_table, evaluation_table, robustness_table
+    from lyapnet.evaluation.robustness import robustness
 
     if table is not None and not table.parent.is_dir():
         raise UsageError(
@@ -88,23 +87,33 @@ def evaluate(
         if disturbed:
             rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]
-        later = [] if until is None else afterwards(controller, measured.table.x0[:count], until)
+        later = []
         if until is not None:
+            later = afterwards(controller, measured.table.x0[:count], until)
             result["afterwards"] = in_plain_data(later, controller, until)
     if as_json:
         print(json.dumps(result))
     else:
-        Console(highlight=False, markup=False).print(evaluation_table(titled(checkpoint, at), result))
-        if disturbed:
-            member = nominal(controller) if controller.system.constants else {}
-            Console(highlight=False, markup=False).print(robustness_table(result["robustness"], count, member))
-        if until is not None:
-            Console(highlight=False, markup=False).print(afterwards_table(result["afterwards"], count))
+        _print_tables(titled(checkpoint, at), result, controller, count)
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
         notes.print(_write_figures(figures, controller, measured, later), soft_wrap=True)
+
+
+def _print_tables(title: str, result: dict[str, Any], controller: "Controller", count: int) -> None:
+    """What was measured; of what was asked for besides, from `count` states."""
+    from lyapnet.evaluation.robustness import nominal
+    from lyapnet.evaluation.tables import afterwards_table, evaluation_table, robustness_table
+
+    console = Console(highlight=False, markup=False)
+    console.print(evaluation_table(title, result))
+    if "robustness" in result:
+        member = nominal(controller) if controller.system.constants else {}
+        console.print(robustness_table(result["robustness"], count, member))
+    if "afterwards" in result:
+        console.print(afterwards_table(result["afterwards"], count))
 
 
 def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation", later: "list[Afterwards]") -> str:

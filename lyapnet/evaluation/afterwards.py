@@ -37,22 +37,20 @@ def afterwards(controller: Controller, x0: State, multiple: float) -> list[After
         UsageError: see check_multiple.
     """
     check_multiple(controller, multiple, len(x0))
-    steps, found = last_node(controller, multiple), []
-    for beyond in LAWS:
-        try:
-            other = controller.continued(beyond)
-        except ValueError as error:  # of a goal that the law cannot hold
-            found.append(Afterwards(beyond, None, str(error)))
-            continue
-        try:
-            x = other.rollout(x0, steps).x
-        except DivergenceError as error:
-            found.append(Afterwards(beyond, None, f"{DIVERGES}: {error}"))
-            continue
-        distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
-        finite = bool(distance.isfinite().all())
-        found.append(Afterwards(beyond, distance if finite else None, "" if finite else DIVERGES))
-    return found
+    return [_under(controller, beyond, x0, last_node(controller, multiple)) for beyond in LAWS]
+
+
+def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterwards:
+    try:
+        other = controller.continued(beyond)
+    except ValueError as error:  # of a goal that the law cannot hold
+        return Afterwards(beyond, None, str(error))
+    try:
+        x = other.rollout(x0, steps).x
+    except DivergenceError as error:
+        return Afterwards(beyond, None, f"{DIVERGES}: {error}")
+    distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
+    return Afterwards(beyond, distance, "") if distance.isfinite().all() else Afterwards(beyond, None, DIVERGES)
 
 
 def check_multiple(controller: Controller, multiple: float, states: int) -> None:

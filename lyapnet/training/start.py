@@ -121,7 +121,9 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
-    return Start(chosen, tried, float(_costs(learners[0], x0, SUBSTEPS).mean()))
+    N, dt = problem.horizon.steps, problem.horizon.dt
+    in_time = problem.in_steps(steps=SUBSTEPS * N, dt=dt / SUBSTEPS, method="rk4")
+    return Start(chosen, tried, float(_costs(learners[0], in_time, x0).mean()))
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -210,17 +212,15 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
 
 def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    cost = _costs(learner, x0)
+    cost = _costs(learner, learner.problem, x0)
     share = float(cost.isfinite().double().mean())
     return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
 
 
-def _costs(learner: Learner, x0: State, substeps: int = 0) -> PerState:
-    """What the law of a learner costs, each control held for a step, which may be some rk4 steps."""
-    problem, policy, each = learner.problem, learner.rollout.closed_loop.policy, max(substeps, 1)
-    times, u = problem.horizon.times(x0), x0
-    if substeps:
-        problem = problem.in_steps(steps=each * problem.horizon.steps, dt=problem.horizon.dt / each, method="rk4")
+def _costs(learner: Learner, problem: Problem, x0: State) -> PerState:
+    """What the law of a learner costs in a problem, each control held for a step of the learner's own horizon."""
+    policy, own = learner.rollout.closed_loop.policy, learner.problem.horizon
+    times, each, u = own.times(x0), problem.horizon.steps // own.steps, x0
 
     def law(n: int, x: State) -> Control:
         nonlocal u

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from lyapnet.systems import SYSTEMS, ControlAffineSystem
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
-    from lyapnet.training.modules import OptimizerOptions, ValueModule
+    from lyapnet.training.modules import ValueModule
+    from lyapnet.training.optimizer import OptimizerOptions
 
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
@@ -45,7 +46,8 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "systems": ["SYSTEMS", "ControlAffineSystem"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
-    "training.modules": ["OptimizerOptions", "ValueModule"],
+    "training.modules": ["ValueModule"],
+    "training.optimizer": ["OptimizerOptions"],
 }
 
 __all__ = [

@@ -32,8 +32,16 @@ STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
     "rollout": {"policy": "sampled", "gradient": "discrete"},
-    "training": {"iterations": 400, "batch_size": 32, "learning_rate": 0.003, "warmup": 40, "validate_every": 20},
+    "training": {
+        "iterations": 400,
+        "batch_size": 32,
+        "learning_rate": 0.003,
+        "warmup": 40,
+        "validate_every": 20,
+        "lost_share": 0.5,
+    },
     "trainer": {"gradient_clip_val": 3},
+    "evaluation": {"validation_states": 512},
 }
 
 
@@ -189,6 +197,12 @@ class TrainingConfig:
         "CPU threads; in networks this small, more of them mostly wait for each other.",
         at_least=1,
         below=THREADS + 1,
+    )
+    lost_share: float = option(
+        0.0,
+        "Greatest share of a batch that is drawn from states whose closed loop costs more than V says.",
+        at_least=0,
+        below=1,
     )
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
 

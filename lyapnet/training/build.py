@@ -25,7 +25,8 @@ from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.learner import Learner
-from lyapnet.training.modules import EnsembleModule, OptimizerOptions, TrainingModule, ValueModule
+from lyapnet.training.modules import EnsembleModule, TrainingModule, ValueModule
+from lyapnet.training.optimizer import OptimizerOptions
 
 
 def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
@@ -107,8 +108,11 @@ def _points_of(path: Path, n: int) -> Tensor:
 
 def build_data(config: Config, problem: Problem) -> InitialStateDataModule:
     """The batches that a config trains and validates on."""
-    options = (problem, config.training.batch_size, config.evaluation.validation_states, config.seed)
-    return EnsembleDataModule(*options, config.seeds) if config.seeds > 1 else InitialStateDataModule(*options)
+    training = config.training
+    options = (problem, training.batch_size, config.evaluation.validation_states, config.seed)
+    if config.seeds > 1:
+        return EnsembleDataModule(*options, config.seeds, training.lost_share)
+    return InitialStateDataModule(*options, lost_share=training.lost_share)
 
 
 def build_callbacks(config: Config) -> list[L.Callback]:

@@ -1,5 +1,6 @@
 """Initial states: a fresh batch of X₀ for every training step, a fixed draw for validation."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import lightning as L
@@ -9,7 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from lyapnet.errors import CheckpointError
 from lyapnet.problem import Problem
-from lyapnet.random_streams import TRAINING, VALIDATION, stream
+from lyapnet.random_streams import LOST, TRAINING, VALIDATION, stream
 from lyapnet.types import State
 
 
@@ -24,7 +25,10 @@ class InitialStateDataModule(L.LightningDataModule):
         batch_size: initial states in each training batch, per process.
         validation_states: size of the one validation batch, the same at every validation.
         seed: of all streams.
-        steps_per_epoch: training steps that Lightning calls an epoch, after which it validates. No state is seen twice.
+        steps_per_epoch: training steps that Lightning calls an epoch, after which it validates. No state is seen twice,
+            but those that are lost.
+        lost_share: share of a batch, at the most, that is drawn from `lost` instead: states that need more training
+            than others, found by LostStates.
     """
 
     def __init__(
@@ -34,14 +38,23 @@ class InitialStateDataModule(L.LightningDataModule):
         validation_states: int = 64,
         seed: int = 0,
         steps_per_epoch: int = 1,
+        lost_share: float = 0.0,
     ):
         super().__init__()
         self.problem, self.batch_size = problem, batch_size
         self.validation_states, self.seed, self.steps_per_epoch = validation_states, seed, steps_per_epoch
+        self.lost_share, self.lost = lost_share, torch.empty(0, len(problem.initial_states.center))
 
     def batch(self, step: int, process: int = 0) -> State:
         """The training batch of a step in a process."""
-        return self.problem.initial_states.sample(self.batch_size, stream(self.seed, TRAINING, process, step))
+        x0 = self.problem.initial_states.sample(self.batch_size, stream(self.seed, TRAINING, process, step))
+        drawn = torch.randperm(len(self.lost), generator=stream(self.seed, LOST, step, process))
+        lost = self.lost[drawn[: int(self.lost_share * self.batch_size)]]
+        return torch.cat([x0[len(lost) :], lost.to(x0)])
+
+    def further(self, count: int, step: int) -> State:
+        """States of X₀ that are in no batch, another draw at each step: (count, n), or (E, count, n)."""
+        return self.problem.initial_states.sample(count, stream(self.seed, LOST, step))
 
     def train_dataloader(self) -> DataLoader:
         return DataLoader(_Epoch(self), batch_size=None)
@@ -57,9 +70,14 @@ class InitialStateDataModule(L.LightningDataModule):
         """The step whose batch comes next."""
         return self.trainer.global_step if self.trainer else 0
 
+    @property
+    def of_each(self) -> Sequence["InitialStateDataModule"]:
+        """What draws for each of the seeds."""
+        return [self]
+
     def state_dict(self) -> dict[str, Any]:
-        """The position of the training stream: its seed and the step whose batch comes next."""
-        return {"seed": self.seed, "step": self.position()}
+        """The position of the training stream, its seed and the step whose batch comes next, and each seed's `lost`."""
+        return {"seed": self.seed, "step": self.position(), "lost": [each.lost for each in self.of_each]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if state_dict["seed"] != self.seed:
@@ -67,6 +85,9 @@ class InitialStateDataModule(L.LightningDataModule):
                 f"Expected to resume the stream of seed {state_dict['seed']}, got seed {self.seed}; "
                 "keep the seed, or start a new run with --finetune."
             )
+        if "lost" in state_dict:  # since version 0.2
+            for each, lost in zip(self.of_each, state_dict["lost"], strict=True):
+                each.lost = lost
 
 
 class EnsembleDataModule(InitialStateDataModule):
@@ -76,12 +97,30 @@ class EnsembleDataModule(InitialStateDataModule):
         seeds: E.
     """
 
-    def __init__(self, problem: Problem, batch_size: int, validation_states: int, seed: int, seeds: int):
+    def __init__(
+        self,
+        problem: Problem,
+        batch_size: int,
+        validation_states: int,
+        seed: int,
+        seeds: int,
+        lost_share: float = 0.0,
+    ):
         super().__init__(problem, batch_size, validation_states, seed)
-        self.members = [InitialStateDataModule(problem, batch_size, validation_states, seed + k) for k in range(seeds)]
+        self.members = [
+            InitialStateDataModule(problem, batch_size, validation_states, seed + k, lost_share=lost_share)
+            for k in range(seeds)
+        ]
+
+    @property
+    def of_each(self) -> Sequence[InitialStateDataModule]:
+        return self.members
 
     def batch(self, step: int, process: int = 0) -> Tensor:
         return torch.stack([member.batch(step, process) for member in self.members])
+
+    def further(self, count: int, step: int) -> Tensor:
+        return torch.stack([member.further(count, step) for member in self.members])
 
     def validation_batch(self) -> Tensor:
         return torch.stack([member.validation_batch() for member in self.members])

@@ -7,7 +7,6 @@ import math
 import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,35 +28,7 @@ from lyapnet.rollout import ADAPTIVE_METHODS, DiscreteAdjoint, Rollout, Trajecto
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.learner import Learner
-
-
-@dataclass(frozen=True)
-class OptimizerOptions:
-    """Adam, or AdamW with decoupled weight decay; the learning rate rises, if asked to, and falls along half a cosine.
-
-    Adam's first steps have the full length along every weight, however small the gradient: from a good start they lead
-    away, unless they are short.
-    """
-
-    name: str = "adam"  # or adamw
-    learning_rate: float = 1e-2  # the greatest
-    final_learning_rate: float = 1e-4  # at the last step, and after it
-    betas: tuple[float, float] = (0.9, 0.99)
-    weight_decay: float = 0.0
-    warmup: int = 0  # steps in which it rises to that first
-    iterations: int | None = None  # steps of the schedule; None: those of the trainer
-
-    def optimizer(self, parameters: Sequence[nn.Parameter]) -> torch.optim.Optimizer:
-        """The optimizer of some parameters."""
-        cls = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.name]
-        return cls(parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
-
-    def rate(self, step: int, iterations: float) -> float:
-        """The learning rate at a step, as a share of the greatest."""
-        final = self.final_learning_rate / self.learning_rate
-        progress = min(step / iterations, 1.0)
-        fallen = final + (1 - final) * (1 + math.cos(math.pi * progress)) / 2
-        return fallen * min((step + 1) / (self.warmup + 1), 1.0)
+from lyapnet.training.optimizer import OptimizerOptions
 
 
 class TrainingModule(L.LightningModule):
@@ -103,8 +74,12 @@ class TrainingModule(L.LightningModule):
 
     def validate_on(self, x0: Tensor) -> list[Tensor]:
         """Fill each member's `validation` with the table of its states; the programs' losses on them."""
+        return self.without_gradient(x0, Learner.measure_on)
+
+    def without_gradient(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
+        """What `evaluate` makes of each member's trajectories."""
         with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
-            return self._for_each(x0.clone(), Learner.measure_on)
+            return self._for_each(x0.clone(), evaluate)
 
     def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
         """What `evaluate` makes of each member's trajectories; a divergence names iteration and member."""

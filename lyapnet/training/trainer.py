@@ -14,6 +14,7 @@ from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.dashboard import Dashboard
 from lyapnet.training.figure_logger import FigureLogger
 from lyapnet.training.loggers import loggers_of_run
+from lyapnet.training.lost_states import LostStates
 from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
 from lyapnet.training.recovery import RisingCost
@@ -57,6 +58,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         *([certified] if options.certify_every else []),
         TrainingProgress(console),
         RisingCost(),
+        *([LostStates()] if config.training.lost_share else []),
         *plan.callbacks,
         Checkpoints(run.last, best, every, partial(run.note, saved=True)),
     ]

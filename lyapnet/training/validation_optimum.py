@@ -5,18 +5,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from rich.console import Console
 from torch import Tensor
+from torch.nn.functional import pad
 
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import Report, oracle_of
 from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner
 
+COMPARED = 64  # of each member's validation states, the first: with these is the optimum sought
+
 
 class ValidationOptimum(Callback):
-    """Finds the optimum of the validation states before the first step, and says so.
+    """Finds the optimum of COMPARED validation states before the first step, and says so.
 
     A checkpoint keeps it, so that a run is compared with the same numbers to its end, whatever the cache has by then.
 
@@ -46,12 +50,13 @@ class ValidationOptimum(Callback):
                 member.validation_optimum = cost
 
     def _solve(self, member: Learner, states: Tensor) -> Tensor | None:
-        """J* (members, b) of states (members, b, n), or (1, b) of (b, n); None where there is no oracle."""
+        """J* (members, b) of states (members, b, n), or (1, b) of (b, n), NaN after the first; None without oracle."""
         started = time.perf_counter()
         try:
             with optimum_progress(self.console) as progress:
                 oracle = oracle_of(member.problem, member.rollout.method)
-                optima = oracle.solve(states.flatten(0, -2), progress=progress)
+                compared = states[..., :COMPARED, :]
+                optima = oracle.solve(compared.flatten(0, -2), progress=progress)
         except OracleError as error:
             self.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
             return None
@@ -61,7 +66,8 @@ class ValidationOptimum(Callback):
         if missing or seconds > 0.2:  # else nobody waits for it
             mean = f"mean {optima.cost.nanmean():.4g}, in {seconds:.0f} s"
             self.console.print(f"optimum of {len(optima.cost)} validation states: {mean}{missing}", soft_wrap=True)
-        return optima.cost.cpu().reshape(-1, states.shape[-2])
+        cost = optima.cost.cpu().reshape(-1, compared.shape[-2])
+        return pad(cost, (0, states.shape[-2] - cost.shape[-1]), value=torch.nan)
 
 
 @contextmanager

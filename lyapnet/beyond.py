@@ -24,6 +24,24 @@ BEYOND = {
 STILL = 1e-9  # by which a mode has to decay in each step
 
 
+class ContinuedValue(ValueFunction):
+    """V(t, x) up to T, and after it what goes with the law."""
+
+    def __init__(self, V: ValueFunction, duration: float, beyond: str | None, regulator: "Regulator | None"):
+        super().__init__()
+        self.V, self.duration, self.beyond, self.regulator = V, duration, beyond, regulator
+
+    def forward(self, t: Time, x: State) -> PerState:
+        late = t > self.duration + slack(t, self.duration)
+        return self.at_any_time(t, x) if late.any() else self.V(t, x)
+
+    def at_any_time(self, t: Time, x: State) -> PerState:
+        """The same by one course for all t, to be traced."""
+        late = t > self.duration + slack(t, self.duration)
+        value = self.V(_within(t, late, self.duration, self.beyond), x)
+        return value if self.regulator is None else torch.where(late, self.regulator.cost(x), value)
+
+
 class ContinuedPolicy(ValuePolicy):
     """u(t, x) = policy(t, x) before T, and from T on what `beyond` says; its V is continued likewise after T.
 
@@ -35,11 +53,13 @@ class ContinuedPolicy(ValuePolicy):
         ValueError: another `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
     """
 
+    V: ContinuedValue
+
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None = None):
         if beyond not in (None, *BEYOND):
             raise ValueError(f"Expected beyond as one of {', '.join(BEYOND)}, got {beyond!r}; choose one of them.")
         regulator = Regulator(problem) if beyond == "riccati" else None
-        super().__init__(problem, _ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
+        super().__init__(problem, ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
         self.held = policy.held
 
@@ -54,6 +74,11 @@ class ContinuedPolicy(ValuePolicy):
                 self.duration,
             )
             self.beyond = "hold"
+        return self.at_any_time(t, x)
+
+    def at_any_time(self, t: Time, x: State) -> Control:
+        """The same by one course for all t, to be traced; without a word on what follows T."""
+        late = t >= self.duration - slack(t, self.duration)
         u = self.policy(_within(t, late, self.duration, self.beyond), x)
         return u if self.regulator is None else torch.where(late[..., None], self.regulator(x), u)
 
@@ -130,21 +155,6 @@ class _LaterValue(ValueFunction):
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.V(t + self.start, x)
-
-
-class _ContinuedValue(ValueFunction):
-    """V(t, x) up to T, and after it what goes with the law."""
-
-    def __init__(self, V: ValueFunction, duration: float, beyond: str | None, regulator: Regulator | None):
-        super().__init__()
-        self.V, self.duration, self.beyond, self.regulator = V, duration, beyond, regulator
-
-    def forward(self, t: Time, x: State) -> PerState:
-        late = t > self.duration + slack(t, self.duration)
-        if not late.any():
-            return self.V(t, x)
-        value = self.V(_within(t, late, self.duration, self.beyond), x)
-        return value if self.regulator is None else torch.where(late, self.regulator.cost(x), value)
 
 
 def slack(t: Time, duration: float) -> float:

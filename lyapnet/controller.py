@@ -125,6 +125,11 @@ class Controller:
         """(t, (x, ∫ℓ)) ↦ its derivative under u(t, x), as a module."""
         return self._rollout.closed_loop
 
+    @property
+    def law(self) -> ContinuedPolicy:
+        """u(t, x) for all t ≥ 0 as a module, with its V."""
+        return self._continued
+
     @overload
     def value(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
     @overload
@@ -138,7 +143,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self._continued.V, t, x, parameters)
+        return self._answer(self.law.V, t, x, parameters)
 
     @overload
     def policy(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
@@ -154,7 +159,7 @@ class Controller:
         Raises:
             ValueError: the shapes do not fit; names the expected ones. Or t < 0.
         """
-        return self._answer(self._continued, t, x, parameters)
+        return self._answer(self.law, t, x, parameters)
 
     def with_(self, **parameters: float) -> "Controller":
         """The controller of one member of a family: of its own problem, with V(t, (x, p)) at these parameters.
@@ -211,7 +216,7 @@ class Controller:
     def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
         """A trajectory with further steps, under what follows the horizon."""
         problem = self.problem.in_steps(steps=steps)
-        law, solver = LaterPolicy(problem, self._continued, self.horizon.duration), self._rollout.solver_arguments
+        law, solver = LaterPolicy(problem, self.law, self.horizon.duration), self._rollout.solver_arguments
         rest = Rollout(problem, law, self.method, "backprop", solver["rtol"], solver["atol"])(first.x[-1])
         return Trajectory(
             self.problem.in_steps(steps=self.horizon.steps + steps).horizon.times(first.x),

@@ -73,6 +73,10 @@ class UntraceableError(CompilationError):
     """A function reads the values of tensors, for its control flow say; a closed loop then runs eagerly."""
 
 
+class ExportError(LyapnetError):
+    """A control law cannot be written in another language, or what was written is not that law."""
+
+
 class OracleError(LyapnetError):
     """There is no ground truth for a task; what is measured without it can still be reported."""
 

@@ -20,7 +20,7 @@ LEVELS = (
     {"config"},
     {"build"},
     {"controller"},
-    {"evaluation", "loading"},
+    {"evaluation", "export", "loading"},
     {"certification"},
     {"bench", "training"},
     {"comparison"},

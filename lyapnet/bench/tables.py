@@ -5,6 +5,7 @@ from typing import Any
 
 from rich.table import Column, Table
 
+from lyapnet.bench.latency import Latency
 from lyapnet.bench.proofs import Attempt
 from lyapnet.bench.routes import BASELINE
 from lyapnet.bench.tightness import Tightness
@@ -55,4 +56,13 @@ def proofs_table(rows: Sequence[Attempt], seconds: float) -> Table:
             str(row.states), "true" if row.holds else "false", row.method, row.verdict, f"{row.boxes:,}",
             f"{row.seconds:.3g}", end_section=following is not None and following.states != row.states,
         )  # fmt: skip
+    return table
+
+
+def latency_table(rows: Sequence[Latency], title: str) -> Table:
+    """Microseconds of one control, each way."""
+    table = Table("", *(Column(name, justify="right") for name in ("calls", "median", "99.9 %", "worst")))
+    table.title = f"{title}\nmicroseconds of u(t, x), 1 kHz"
+    for row in rows:
+        table.add_row(row.way, f"{row.calls:,}", *(f"{value:,.1f}" for value in (row.median, row.most, row.worst)))
     return table

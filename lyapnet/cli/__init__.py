@@ -1,4 +1,4 @@
-"""The command line: lyapnet check | train | evaluate | sweep | certify | compare | bench | systems.
+"""The command line: lyapnet check | train | evaluate | export | sweep | certify | compare | bench | systems.
 
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
@@ -15,6 +15,7 @@ from lyapnet.cli import bench, certify
 from lyapnet.cli.check import check
 from lyapnet.cli.compare import compare
 from lyapnet.cli.evaluate import evaluate
+from lyapnet.cli.export import export
 from lyapnet.cli.sweep import sweep
 from lyapnet.cli.systems import systems
 from lyapnet.cli.train import train
@@ -34,7 +35,7 @@ def lyapnet(
         print(__version__)
 
 
-for command in (check, train, evaluate, sweep, compare, systems):
+for command in (check, train, evaluate, export, sweep, compare, systems):
     app.command()(command)
 for group in (certify, bench):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

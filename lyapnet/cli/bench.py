@@ -1,4 +1,4 @@
-"""lyapnet bench gradient | certify."""
+"""lyapnet bench gradient | certify | law."""
 
 import json
 from dataclasses import asdict
@@ -32,9 +32,9 @@ app = typer.Typer(cls=WithDefault)
 
 @app.callback()
 def bench() -> None:
-    """Measure lyapnet against its alternatives: gradients of a loss, which is what no name means, or bounds.
+    """Measure gradients of a loss, which is what no name means, bounds, or one control, each against alternatives.
 
-    lyapnet bench gradient --help and lyapnet bench certify --help say more.
+    lyapnet bench gradient --help, and certify and law likewise, say more.
     """
 
 
@@ -169,6 +169,30 @@ def certify(
 
         certify_bench(bounds, proofs).savefig(figures / "certify_bench.png", dpi=130)
         notes.print(f"wrote {figures / 'certify_bench.png'}", soft_wrap=True)
+
+
+@app.command()
+def law(
+    checkpoint: Annotated[Path, typer.Argument(help="Whose control law is timed.", metavar="CKPT")],
+    seconds: Annotated[float, typer.Option(min=0.01, help="For each way.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Time one control in a loop of 1 kHz: in C as `lyapnet export` writes it, and in Python.
+
+    lyapnet bench law logs/double_integrator/version_0/checkpoints/best.ckpt --seconds 60
+    """
+    from lyapnet.bench.latency import latencies
+    from lyapnet.bench.tables import latency_table
+    from lyapnet.cli.options import load_controller
+
+    controller = load_controller(checkpoint)
+    with Console(stderr=True).status("writing, compiling, timing …"):
+        rows = latencies(controller, seconds)
+    if as_json:
+        print(json.dumps([asdict(row) for row in rows]))
+    else:
+        Console(highlight=False, markup=False).print(latency_table(rows, str(checkpoint)))
 
 
 def _items(values: list[str] | None) -> list[str]:

@@ -11,16 +11,11 @@ import casadi
 import numpy as np
 import torch
 from torch import Tensor
-from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lyapnet.errors import LyapnetError, OracleError, one_line
-from lyapnet.graphs.tracing import Tensors, is_view, name_of, trace
-
-# torch counts them among its core, but has them in simpler operators too
-aten = torch.ops.aten
-NOT_CORE = [aten.addmm, aten.elu, aten.gelu, aten.hardtanh, aten.leaky_relu]
+from lyapnet.graphs.tracing import SHAPED, Tensors, core_trace, is_view, name_of
 
 Symbols = np.ndarray  # dtype object: its entries are scalar casadi.SX
 
@@ -32,9 +27,7 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
         OracleError: the function reads the values of tensors.
     """
     try:
-        with torch.no_grad():
-            simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
-            return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
+        return core_trace(function, arguments)
     except LyapnetError as error:
         raise OracleError(str(error)) from error
     except Exception as error:  # any kind: the function is the user's
@@ -148,9 +141,6 @@ def _moved(target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
 def _of_shape(leaf: Any) -> Any:
     return torch.zeros(leaf.shape, dtype=torch.float64) if isinstance(leaf, Symbols) else leaf
 
-
-# constants that take their shape from an argument
-SHAPED = {"empty_like", "full_like", "new_empty", "new_full", "new_ones", "new_zeros", "ones_like", "zeros_like"}
 
 # what moves entries and is no view
 MOVES = {

@@ -92,7 +92,7 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch's, about itself
-            program = torch.export.export(_without_assigned_numbers(module), tuple(arguments))
+            program = torch.export.export(one_number_at_a_time(module), tuple(arguments))
             package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
         Path(package).chmod(0o600)
         write_atomically(digest, digest_of_file(Path(package)).encode())
@@ -100,7 +100,7 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
     return aoti_load_package(str(path))
 
 
-def _without_assigned_numbers(module: nn.Module) -> nn.Module:
+def one_number_at_a_time(module: nn.Module) -> nn.Module:
     """A copy with torch.where for g[2, 0] = 1, which the compiler refuses for a single number."""
     module, aten = copy.deepcopy(module), torch.ops.aten
     for graph_module in (each for each in module.modules() if isinstance(each, GraphModule)):

@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._decomp import core_aten_decompositions, get_decompositions
 from torch._functorch.compile_utils import fx_graph_cse
 from torch.func import functionalize, vmap
 from torch.fx import Graph, GraphModule, Node
@@ -75,6 +76,24 @@ def trace(
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
+
+
+def core_trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
+    """The trace of a function in torch's few core operators, for a reader that writes them in another language.
+
+    Raises:
+        Exception: as trace.
+    """
+    simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
+    with torch.no_grad():
+        return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
+
+
+# torch counts them among its core, but has them in simpler operators too
+NOT_CORE = [getattr(torch.ops.aten, name) for name in ("addmm", "elu", "gelu", "hardtanh", "leaky_relu")]
+
+# constants that take their shape from an argument
+SHAPED = {"empty_like", "full_like", "new_empty", "new_full", "new_ones", "new_zeros", "ones_like", "zeros_like"}
 
 
 def _overwrites(node: Node, memory: Node) -> bool:

@@ -1,0 +1,113 @@
+"""How long one control takes, in a loop of 1 kHz: in C as it is exported, and in Python."""
+
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lyapnet.controller import Controller
+from lyapnet.export import export
+from lyapnet.export.c import compile_c
+from lyapnet.export.verification import points
+from lyapnet.graphs.c_text import literal
+
+RATE = 1000  # controls per second
+STATES = 1000  # that are asked for in turn
+OPTIMISED = ("-O2", "-O3")
+LOOP = """#define _POSIX_C_SOURCE 200112L
+#include <stdio.h>
+#include <time.h>
+#include "policy.h"
+
+static const double states[{states}][{width}] = {{{table}}};
+
+int main(void)
+{{
+    double u[LYAPNET_CONTROLS];
+    struct timespec next, before, after;
+    clock_gettime(CLOCK_MONOTONIC, &next);
+    for (long k = 0; k < {count}; k++) {{
+        next.tv_nsec += {period};
+        if (next.tv_nsec >= 1000000000) {{ next.tv_nsec -= 1000000000; next.tv_sec++; }}
+        clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &next, NULL);
+        const double *z = states[k % {states}];
+        clock_gettime(CLOCK_MONOTONIC, &before);
+        lyapnet_control(z[0], {given}, u);
+        clock_gettime(CLOCK_MONOTONIC, &after);
+        double seconds = (double)(after.tv_sec - before.tv_sec) + 1e-9 * (double)(after.tv_nsec - before.tv_nsec);
+        printf("%.3f\\n", 1e6 * seconds);
+    }}
+    return 0;
+}}
+"""
+
+
+@dataclass(frozen=True)
+class Latency:
+    """One way to ask for u, and the microseconds that it took."""
+
+    way: str
+    calls: int
+    median: float
+    most: float  # the 99.9th percentile
+    worst: float
+
+
+def latencies(controller: Controller, seconds: float) -> list[Latency]:
+    """How long u takes, each way for so many seconds: C with each of OPTIMISED, and `Controller.policy` on an array.
+
+    Raises:
+        ExportError: the law cannot be written in C; or there is no compiler.
+    """
+    count = max(1, round(seconds * RATE))
+    t, x = (column[:: max(1, len(column) // STATES)][:STATES].double().numpy() for column in points(controller))
+    t = np.minimum(t, controller.horizon.duration)
+    found = []
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        export(controller, folder / "law", "c")
+        (folder / "law" / "loop.c").write_text(_loop(controller, t, x, count))
+        for option in OPTIMISED:
+            found.append(_summary(f"C, {option}", _in_c(folder / "law", option)))
+    return [*found, _summary("Python", _in_python(controller, t, x, count))]
+
+
+def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
+    """The text of a program that prints the microseconds of each call."""
+    table = np.concatenate([t[:, None], x], 1)
+    rows = ",\n    ".join("{" + ", ".join(map(literal, row)) + "}" for row in table.tolist())
+    constants = len(controller.system.constants)
+    given = "z + 1" if not constants else f"z + 1, z + {1 + x.shape[1] - constants}"
+    return LOOP.format(
+        states=len(table), width=table.shape[1], table=rows, count=count, period=10**9 // RATE,
+        given=given,
+    )  # fmt: skip
+
+
+def _in_c(folder: Path, option: str) -> NDArray:
+    program = folder / "loop"
+    compile_c([folder / "loop.c", folder / "policy.c"], program, ["-std=c99", option])
+    printed = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
+    return np.array(printed.split(), dtype=np.float64)
+
+
+def _in_python(controller: Controller, t: NDArray, x: NDArray, count: int) -> NDArray:
+    """As many calls as fit into the time, at most that number."""
+    taken, following = list[float](), time.perf_counter()
+    end = following + count / RATE
+    while len(taken) < count and following < end:
+        following = max(following + 1 / RATE, time.perf_counter())
+        time.sleep(max(0.0, following - time.perf_counter()))
+        k, started = len(taken) % len(t), time.perf_counter()
+        controller.policy(t[k], x[k])
+        taken.append(1e6 * (time.perf_counter() - started))
+    return np.array(taken)
+
+
+def _summary(way: str, microseconds: NDArray) -> Latency:
+    median, most = np.quantile(microseconds, (0.5, 0.999)).tolist()
+    return Latency(way, len(microseconds), median, most, float(microseconds.max()))

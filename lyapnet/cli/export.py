@@ -1,0 +1,39 @@
+"""lyapnet export."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from lyapnet.cli.options import At, Checkpoint, Controls, Cost, Debug, Network, System, load_controller
+
+
+def export(
+    checkpoint: Checkpoint,
+    to: Annotated[str, typer.Option(help="c, onnx or torch.")],
+    out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
+    beyond: Annotated[str, typer.Option(help="The law after T: hold, receding or riccati.")] = "hold",
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    at: At = None,
+    debug: Debug = False,
+) -> None:
+    """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
+
+    c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. onnx is a model (t, x) ↦ (u, V) of one
+    state, with p beside x for a family; torch is the same for torch.export.load.
+    """
+    from lyapnet.export import export as write
+
+    controller = load_controller(
+        checkpoint, at, system=system, network=network, cost=cost, controls=controls
+    ).continued(beyond)
+    notes = Console(highlight=False, markup=False)
+    with notes.status("writing and verifying …"):
+        paths, agreement = write(controller, out, to, checkpoint)
+    for path in paths:
+        notes.print(f"wrote {path}", soft_wrap=True)
+    notes.print(str(agreement), soft_wrap=True)

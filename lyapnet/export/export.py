@@ -1,0 +1,107 @@
+"""Writing a controller's law: traced, written, held against the controller, and only then kept."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lyapnet import __version__
+from lyapnet.beyond import BEYOND
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from lyapnet.export import c, programs
+from lyapnet.export.law import Law
+from lyapnet.export.verification import Agreement, verify
+from lyapnet.files import digest_of_file, write_atomically
+
+FORMATS = {"c": "", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
+PROGRAMS = {
+    "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
+    "torch": (programs.program_of, programs.write_torch, programs.run_torch),
+}
+NOT_YET = "not yet verified"
+
+
+class Exported(NamedTuple):
+    """What was written, and how far it is from the controller."""
+
+    paths: list[Path]
+    agreement: Agreement
+
+
+def export(controller: Controller, path: str | Path, to: str, checkpoint: Path | None = None) -> Exported:
+    """Write u(t, x) and V(t, x) of a controller for use without lyapnet.
+
+    Limits, target, parameters of a family and what follows T are inside; t below 0 counts as 0. What is written is run
+    on 10 000 states and held against the controller; where they differ by more than rounding, nothing is kept.
+
+    Args:
+        path: of a folder for c, of a file for onnx and torch.
+        to: a key of FORMATS: c, C99 without a library; onnx, a model (t, x[, p]) ↦ (u, V) of one state; torch, the
+            same for torch.export.load.
+        checkpoint: that the controller was loaded from, whose digest is then noted.
+
+    Raises:
+        UsageError: another format, or a place that cannot be written to.
+        ExportError: the law cannot be written in it, or what was written is not that law.
+    """
+    path = Path(path)
+    if to not in FORMATS:
+        raise UsageError(f"Expected a format among {', '.join(FORMATS)}, got {to!r}; choose one of them.")
+    if not path.parent.is_dir():
+        raise UsageError(
+            f"Expected a place in a folder that exists, got {str(path)!r}; make {str(path.parent)!r} first."
+        )
+    if path.is_dir() != (to == "c") and path.exists():
+        raise UsageError(f"Expected a {'folder' if to == 'c' else 'file'} for {to}, got {str(path)!r}; choose another.")
+    if not path.name.endswith(FORMATS[to]):
+        raise UsageError(f"Expected a name that ends in {FORMATS[to]} for {to}, got {path.name!r}; choose it so.")
+    about, law = _about(controller, checkpoint), Law(controller)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_") as place:
+        draft = Path(place)
+        if to == "c":
+            return _write_c(controller, law, about, draft, path)
+        make, write, run = PROGRAMS[to]
+        made, file = make(law), draft / path.name
+        write(made, file, about)
+        agreement = verify(controller, run(file, law))
+        write(made, file, {**about, "verified": str(agreement)})
+        write_atomically(path, file.read_bytes())
+    return Exported([path], agreement)
+
+
+def _write_c(controller: Controller, law: Law, about: dict[str, Any], draft: Path, folder: Path) -> Exported:
+    """The files of a C library."""
+    lines = [f"{key}: {value}" for key, value in about.items()]
+    written = c.sources(controller, law, [*lines, NOT_YET])
+    for name, text in written.items():
+        (draft / name).write_text(text, encoding="utf-8")
+    agreement = verify(controller, c.compiled(draft, law, controller.system.m))
+    folder.mkdir(exist_ok=True)
+    for name, text in written.items():
+        write_atomically(folder / name, text.replace(NOT_YET, f"verified: {agreement}", 1).encode())
+    return Exported([folder / name for name in written], agreement)
+
+
+def _about(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
+    """What an export is, in lines for its metadata."""
+    system, T = controller.system, controller.horizon.duration
+    constants = set(system.constants)
+    states = [i for i in range(system.n) if i not in constants]
+    beyond = controller.law.beyond or "hold"
+    about = {
+        "lyapnet": __version__,
+        "checkpoint": "none" if checkpoint is None else f"{checkpoint}, SHA-256 {digest_of_file(checkpoint)}",
+        "t": f"s, from 0 to {T:g}; after that {beyond}: {BEYOND[beyond]}",
+        "x": _named(system.state_names, system.state_units, states),
+        "u": _named(system.control_names, system.control_units, range(system.m)),
+    }
+    if constants:
+        about["p"] = _named(system.state_names, system.state_units, sorted(constants))
+    if controller.law.held:
+        about["Δt"] = f"u is made to be held for {controller.horizon.dt:g} s"
+    return about
+
+
+def _named(names: Sequence[str], units: Sequence[str], which: Sequence[int]) -> str:
+    return ", ".join(f"{names[i]} ({units[i]})" if units[i] else names[i] for i in which)

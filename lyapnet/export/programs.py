@@ -1,0 +1,123 @@
+"""The law as one graph (t, x[, p]) ↦ (u, V): an ONNX model, or a program of torch.export."""
+
+import copy
+import importlib
+import json
+import logging
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.fx import GraphModule
+
+from lyapnet.errors import ExportError, one_line
+from lyapnet.export.law import Law
+from lyapnet.export.verification import Evaluate
+from lyapnet.graphs.compilation import one_number_at_a_time
+from lyapnet.graphs.tracing import name_of
+
+RESULTS = ["u", "V"]
+ARITHMETIC = ("add", "sub", "mul", "div", "clamp")
+ABOUT = "lyapnet.json"  # in a program of torch.export
+
+
+def program_of(law: Law) -> torch.export.ExportedProgram:
+    """The law as torch.export has it."""
+    graph = one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
+    with torch.no_grad():
+        return torch.export.export(graph, tuple(law.arguments.values()))
+
+
+def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
+    """A copy with tensors for the numbers in its arithmetic, which ONNX would round to float32."""
+    graph = copy.deepcopy(graph)
+    for node in [
+        node for node in graph.graph.nodes if node.op == "call_function" and name_of(node.target) in ARITHMETIC
+    ]:
+        for place, number in enumerate(node.args):
+            if isinstance(number, int | float):
+                name = f"number_{node.name}_{place}"
+                graph.register_buffer(name, torch.tensor(number, dtype=dtype))
+                with graph.graph.inserting_before(node):
+                    constant = graph.graph.get_attr(name)
+                constant.meta["val"] = torch.tensor(number, dtype=dtype)
+                node.update_arg(place, constant)
+        if node.target is torch.ops.aten.clamp.default and not node.kwargs:
+            node.target = torch.ops.aten.clamp.Tensor
+    graph.recompile()
+    return graph
+
+
+def write_torch(program: torch.export.ExportedProgram, path: Path, about: dict[str, Any]) -> None:
+    """A file for `torch.export.load`, with what it is in its extra file ABOUT."""
+    torch.export.save(program, path, extra_files={ABOUT: json.dumps(about)})
+
+
+def run_torch(path: Path, law: Law) -> Evaluate:
+    """What a saved program says of many states at once."""
+    module, like = torch.export.load(path).module(), law.arguments["x"]
+
+    def evaluate(t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
+        with torch.no_grad():
+            u, V = torch.vmap(module)(*law.given(*(torch.as_tensor(part).to(like) for part in (t, x))))
+        return u.cpu().numpy(), V.cpu().numpy()
+
+    return evaluate
+
+
+def onnx_model_of(law: Law) -> Any:
+    """The law as an ONNX model, with inputs t, x and, of a family, p.
+
+    Raises:
+        ExportError: onnx, onnxscript or onnxruntime is missing; or an operation has no counterpart in ONNX.
+    """
+    try:
+        for name in ("onnx", "onnxscript", "onnxruntime"):
+            importlib.import_module(name)
+    except ImportError as error:
+        raise ExportError(
+            f"Expected onnx, onnxscript and onnxruntime, got {error}; pip install 'lyapnet[onnx]'."
+        ) from error
+    program, log = program_of(law), logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # about libraries that are not installed
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, about itself
+            return torch.onnx.export(
+                program, dynamo=True, input_names=[*law.arguments], output_names=RESULTS, verbose=False
+            )
+    except Exception as error:  # of many kinds
+        line = one_line(error)[:200]
+        raise ExportError(
+            f"Expected operations that ONNX has, got {type(error).__name__}: {line}; take --to torch or c."
+        ) from error
+    finally:
+        log.setLevel(level)
+
+
+def write_onnx(model: Any, path: Path, about: dict[str, Any]) -> None:
+    """A model's file, with what it is in its metadata."""
+    model.model.metadata_props.update({key: str(value) for key, value in about.items()})
+    model.save(path)
+
+
+def run_onnx(path: Path, law: Law) -> Evaluate:
+    """What a model says in onnxruntime, one state after another."""
+    import onnxruntime  # pyright: ignore[reportMissingImports]
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    kind = law.arguments["x"].cpu().numpy().dtype
+
+    def answer(t: float, state: NDArray) -> Any:
+        arguments = (np.asarray(argument, kind) for argument in law.given(t, state))
+        return session.run(RESULTS, dict(zip(law.arguments, arguments, strict=True)))
+
+    def evaluate(t: NDArray, x: NDArray) -> tuple[NDArray, NDArray]:
+        u, V = zip(*map(answer, t, x), strict=True)
+        return np.stack(u), np.stack(V)
+
+    return evaluate

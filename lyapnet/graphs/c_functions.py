@@ -1,0 +1,119 @@
+"""Functions of tensors as C99: their traces written again as loops over arrays, operation by operation.
+
+An operation on constants alone is torch's own, and its result a table. One that only looks at entries in another way, a
+transposition or a slice, writes nothing: an array is a place in memory with strides, on which torch itself does the
+operation. What is left are loops, of which RULES has the inner line. Nothing is allocated but on the stack.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import GraphModule, Interpreter
+from torch.utils._pytree import tree_leaves, tree_map
+
+from lyapnet.errors import ExportError
+from lyapnet.graphs.c_rules import RULES
+from lyapnet.graphs.c_text import Array, Tables, Text
+from lyapnet.graphs.tracing import SHAPED, is_view, name_of
+
+
+def c_function(
+    signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
+) -> str:
+    """A trace as the text of a C function.
+
+    Args:
+        signature: of the function, without its body, as in `void f(const double *x, double *y)`.
+        graph: of `core_trace`, on one state.
+        arguments: the names of the arrays that it takes, and tensors of their shapes.
+        results: the names of the arrays that take its results.
+        tables: takes the constants.
+
+    Raises:
+        ExportError: an operator has no rule; names it.
+    """
+    text = Text(tables)
+    inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
+    outputs = _Reader(graph, text).run(*inputs)
+    for name, output in zip(results, outputs, strict=True):
+        text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
+    return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n"
+
+
+def helpers(code: str) -> list[str]:
+    """The functions that some functions call, as text."""
+    return [text for call, text in HELPERS.items() if call in code]
+
+
+HELPERS = {
+    "larger(": "static double larger(double a, double b) { return a > b || a != a ? a : b; }\n",
+    "smaller(": "static double smaller(double a, double b) { return a < b || a != a ? a : b; }\n",
+    "solve(": """static void exchange(int n, double *a, double *b)
+{
+    for (int i = 0; i < n; i++) {
+        double kept = a[i];
+        a[i] = b[i];
+        b[i] = kept;
+    }
+}
+
+/* b = A^-1 b by Gaussian elimination with rows exchanged, in A (n, n) and b (n, k); returns det A. */
+static double solve(int n, int k, double *A, double *b)
+{
+    double determinant = 1.0;
+    for (int p = 0; p < n; p++) {
+        int best = p;
+        for (int i = p + 1; i < n; i++)
+            if (fabs(A[i * n + p]) > fabs(A[best * n + p])) best = i;
+        if (best != p) {
+            exchange(n, A + p * n, A + best * n);
+            exchange(k, b + p * k, b + best * k);
+            determinant = -determinant;
+        }
+        determinant *= A[p * n + p];
+        for (int i = p + 1; i < n; i++) {
+            double factor = A[i * n + p] / A[p * n + p];
+            for (int j = p; j < n; j++) A[i * n + j] -= factor * A[p * n + j];
+            for (int j = 0; j < k; j++) b[i * k + j] -= factor * b[p * k + j];
+        }
+    }
+    for (int j = 0; j < k; j++)
+        for (int p = n - 1; p >= 0; p--) {
+            for (int i = p + 1; i < n; i++) b[p * k + j] -= A[p * n + i] * b[i * k + j];
+            b[p * k + j] /= A[p * n + p];
+        }
+    return determinant;
+}
+""",
+}
+
+
+class _Reader(Interpreter):
+    """Runs a trace on values that are tensors where they are constant, else Arrays, and writes down what it does."""
+
+    def __init__(self, graph: GraphModule, text: Text):
+        super().__init__(graph)
+        self.extra_traceback = False  # the messages below are for users
+        self.text = text
+
+    def call_function(self, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
+        if not any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
+            return target(*args, **kwargs)
+        name = name_of(target)
+        try:
+            if name in SHAPED:
+                return target(*tree_map(_of_shape, args), **kwargs)
+            if is_view(target):
+                return self.text.viewed(target, *args, **kwargs)
+            return RULES[name](self.text, *args, **kwargs)
+        except (KeyError, TypeError, NotImplementedError) as error:  # no rule, or not for these options
+            raise ExportError(
+                f"Expected operations that can be written in C, got {target}; write f, g, the cost or V in others, add "
+                "a rule to lyapnet.graphs.c_rules.RULES, or take --to torch."
+            ) from error
+
+
+def _of_shape(leaf: Any) -> Any:
+    return torch.zeros(leaf.shape, dtype=torch.float64) if isinstance(leaf, Array) else leaf

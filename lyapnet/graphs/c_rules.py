@@ -1,0 +1,297 @@
+"""Torch's core operators in C: (text, *an operator's arguments) ↦ the array that its result is written to."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch.utils._pytree import tree_leaves
+
+from lyapnet.graphs.c_text import Array, Text, literal, shape_of
+
+aten = torch.ops.aten
+
+
+def _elementwise(expression: str) -> Callable[..., Array]:
+    line = f"{{into}} = {expression};"
+
+    def rule(text: Text, *values: Any) -> Array:
+        shape = torch.broadcast_shapes(*map(shape_of, values))
+        return text.each(shape, values, line, text.new(shape))
+
+    return rule
+
+
+def _sum(sign: str) -> Callable[..., Array]:
+    """a ± alpha · b."""
+    return lambda text, a, b, *, alpha=1: _elementwise(
+        f"{{0}} {sign} {{1}}" if alpha == 1 else f"{{0}} {sign} {literal(alpha)} * {{1}}"
+    )(text, a, b)
+
+
+def _power(text: Text, base: Any, exponent: Any) -> Array:
+    short = {2: "{0} * {0}", 1: "{0}", 3: "{0} * {0} * {0}", -1: "1.0 / {0}", 0.5: "sqrt({0})"}
+    if isinstance(exponent, int | float) and exponent in short:
+        return _elementwise(short[exponent])(text, base)
+    return _elementwise("pow({0}, {1})")(text, base, exponent)
+
+
+def _clamp(text: Text, x: Array, min: Any = None, max: Any = None) -> Array:
+    x = x if min is None else RULES["maximum"](text, x, min)
+    return x if max is None else RULES["minimum"](text, x, max)
+
+
+def _reduction(start: float, line: str) -> Callable[..., Array]:
+    """A line that takes one entry after another into the result."""
+
+    def rule(text: Text, x: Array, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Array:
+        every = range(len(x.shape)) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
+        gone = {axis % len(x.shape) for axis in every}
+        total = text.new([1 if axis in gone else size for axis, size in enumerate(x.shape)])
+        text.each(total.shape, [start], "{into} = {0};", total)
+        strided = Array(total.name, total.layout.expand(x.shape))
+        text.each(x.shape, [x], line, strided)
+        if keepdim:
+            return total
+        return Array(total.name, total.layout.reshape([size for axis, size in enumerate(x.shape) if axis not in gone]))
+
+    return rule
+
+
+def _mean(text: Text, x: Array, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Array:
+    total = RULES["sum"](text, x, dim, keepdim)
+    count = x.layout.numel() // max(1, total.layout.numel())
+    return _elementwise(f"{{0}} / {literal(count)}")(text, total)
+
+
+def _norm(text: Text, x: Array, ord: float = 2, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Array:
+    if ord != 2:
+        raise NotImplementedError
+    return _elementwise("sqrt({0})")(text, RULES["sum"](text, _power(text, x, 2), dim, keepdim))
+
+
+def _product(text: Text, A: Any, B: Any) -> Array:
+    """AB, of matrices, vectors or batches of matrices: row by row, so that the innermost loop is over neighbours."""
+    a, b = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
+    shape = (torch.empty(a.shape, device="meta") @ torch.empty(b.shape, device="meta")).shape
+    left = a.layout if a.layout.ndim > 1 else a.layout[None]
+    right = b.layout if b.layout.ndim > 1 else b.layout[:, None]
+    k, columns = left.shape[-2], right.shape[-1]
+    batch = torch.broadcast_shapes(left.shape[:-2], right.shape[:-2])
+    whole = (*batch, k, left.shape[-1], columns)
+    result = text.new((*batch, k, columns))
+    text.each(result.shape, [0.0], "{into} = {0};", result)
+    text.each(
+        whole,
+        [Array(a.name, left[..., None].expand(whole)), Array(b.name, right[..., None, :, :].expand(whole))],
+        "{into} += {0} * {1};",
+        Array(result.name, result.layout[..., None, :].expand(whole)),
+    )
+    return Array(result.name, result.layout.reshape(shape))
+
+
+def _same(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **options: Any) -> Any:
+    """The value itself: arrays are never written to again. A whole number is a double too."""
+    if dtype is not None and not dtype.is_floating_point:
+        raise NotImplementedError
+    return x
+
+
+def _cat(text: Text, parts: Sequence[Any], dim: int = 0) -> Array:
+    parts = [part for part in parts if tuple(shape_of(part)) != (0,)]  # torch lets an empty one have any shape
+    shape = torch.cat([torch.empty(shape_of(part), device="meta") for part in parts], dim).shape
+    whole, start = text.new(shape), 0
+    for part in parts:
+        length = shape_of(part)[dim]
+        text.copy(part, Array(whole.name, whole.layout.narrow(dim, start, length)))
+        start += length
+    return whole
+
+
+def _stack(text: Text, parts: Sequence[Any], dim: int = 0) -> Array:
+    shape = torch.stack([torch.empty(shape_of(part), device="meta") for part in parts], dim).shape
+    whole = text.new(shape)
+    for i, part in enumerate(parts):
+        text.copy(part, Array(whole.name, whole.layout.select(dim, i)))
+    return whole
+
+
+def _scattered(view: Any) -> Callable[..., Array]:
+    """A copy, of which what `view` shows is another array."""
+
+    def rule(text: Text, x: Any, source: Any, *place: Any) -> Array:
+        whole = text.copy(x, text.new(shape_of(x)))
+        text.copy(source, Array(whole.name, view(whole.layout, *place)))
+        return whole
+
+    return rule
+
+
+def _copied(text: Text, x: Any, source: Any, *_: Any) -> Array:
+    return text.copy(source, text.new(shape_of(x)))
+
+
+def _moved(target: Any) -> Callable[..., Array]:
+    """An operation that moves entries by constant indices: done on their places, by torch."""
+
+    def rule(text: Text, x: Any, *args: Any, **kwargs: Any) -> Array:
+        if any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
+            raise NotImplementedError
+        x = text.contiguous(x)
+        places = target(torch.arange(x.layout.numel()).reshape(x.shape), *args, **kwargs)
+        result = text.new(places.shape)
+        for i, place in enumerate(places.flatten().tolist()):
+            text.lines.append(f"{result.name}[{i}] = {x.name}[{place}];")
+        return result
+
+    return rule
+
+
+def _extreme(relation: str) -> Callable[..., list[Array]]:
+    """The first entry along an axis that all others are not < or > than, and its index."""
+
+    def rule(text: Text, x: Array, dim: int, keepdim: bool = False) -> list[Array]:
+        value = text.copy(Array(x.name, x.layout.select(dim, 0)), text.new(x.layout.select(dim, 0).shape))
+        index = text.each(value.shape, [0.0], "{into} = {0};", text.new(value.shape))
+        line = f"if ({{0}} {relation} {{1}}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
+        for k in range(1, x.shape[dim]):
+            text.each(value.shape, [Array(x.name, x.layout.select(dim, k)), value, float(k)], line, index)
+        found = value, index
+        return [Array(y.name, y.layout.unsqueeze(dim)) if keepdim else y for y in found]
+
+    return rule
+
+
+def _index_of_extreme(relation: str) -> Callable[..., Array]:
+    def rule(text: Text, x: Array, dim: int | None = None, keepdim: bool = False) -> Array:
+        if dim is None:
+            raise NotImplementedError
+        return _extreme(relation)(text, x, dim, keepdim)[1]
+
+    return rule
+
+
+def _gather(text: Text, x: Any, dim: int, index: Any, *, sparse_grad: bool = False) -> Array:
+    """Entries at computed places along an axis."""
+    if not isinstance(index, Array):
+        return _moved(aten.gather)(text, x, dim, index)
+    x = text.contiguous(x)
+    first = x.layout.narrow(dim, 0, 1).as_strided(index.shape, [
+        0 if axis == dim % len(x.shape) else stride for axis, stride in enumerate(x.layout.stride())
+    ])  # fmt: skip
+    line = f"{{into}} = (&{{0}})[{x.layout.stride(dim)} * (int){{1}}];"
+    return text.each(index.shape, [Array(x.name, first), index], line, text.new(index.shape))
+
+
+def _solution(text: Text, A: Any, B: Any, *, left: bool = True, check_errors: bool = False) -> list[Any]:
+    """A⁻¹B, or BA⁻¹, of one matrix after another; B may be a batch of vectors."""
+    A, B = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
+    vectors = len(B.shape) == 1 or B.shape == A.shape[:-1]
+    right = B.layout[..., None] if vectors else B.layout
+    batch = torch.broadcast_shapes(A.shape[:-2], right.shape[:-2])
+    whole = text.new((*batch, *right.shape[-2:]))
+    matrix, given = A.layout.expand(*batch, *A.shape[-2:]), right.expand(*batch, *right.shape[-2:])
+    for place in itertools.product(*map(range, batch)):
+        parts = Array(A.name, matrix[place]), Array(B.name, given[place])
+        if not left:
+            parts = tuple(Array(part.name, part.layout.mT) for part in parts)
+        copied, answer = (text.copy(part, text.new(part.shape)) for part in parts)
+        n, columns = answer.shape
+        text.lines.append(f"solve({n}, {columns}, {copied.name}, {answer.name});")
+        text.copy(answer if left else Array(answer.name, answer.layout.mT), Array(whole.name, whole.layout[place]))
+    return [Array(whole.name, whole.layout[..., 0]) if vectors else whole, None, None, NO_ERROR]
+
+
+NO_ERROR = torch.zeros((), dtype=torch.int32)  # what torch's linear algebra returns beside its result
+
+
+def _inverse(text: Text, A: Array, *, check_errors: bool = False) -> list[Any]:
+    solution, *_ = _solution(text, A, torch.eye(A.shape[-1], dtype=torch.float64))
+    return [solution, NO_ERROR]
+
+
+def _determinant(text: Text, A: Array) -> list[Array]:
+    whole = text.new(A.shape[:-2])
+    for k, place in enumerate(itertools.product(*map(range, A.shape[:-2]))):
+        copied = text.copy(Array(A.name, A.layout[place]), text.new(A.shape[-2:]))
+        text.lines.append(f"{whole.name}[{k}] = solve({A.shape[-1]}, 0, {copied.name}, {copied.name});")
+    return [whole]
+
+
+def _cumulative_sum(text: Text, x: Array, dim: int, *, dtype: Any = None) -> Array:
+    total = text.copy(x, text.new(x.shape))
+    for k in range(1, x.shape[dim] if x.shape else 0):
+        before, now = (Array(total.name, total.layout.select(dim, i)) for i in (k - 1, k))
+        text.each(now.shape, [before], "{into} += {0};", now)
+    return total
+
+
+RULES: dict[str, Callable[..., Any]] = {
+    **{
+        name: _elementwise(f"{name}({{0}})")
+        for name in (
+            "acos", "acosh", "asin", "asinh", "atan", "atanh", "ceil", "cos", "cosh", "erf", "erfc", "exp", "exp2",
+            "expm1", "floor", "log", "log10", "log1p", "log2", "sin", "sinh", "sqrt", "tan", "tanh", "trunc",
+        )
+    },
+    "abs": _elementwise("fabs({0})"),
+    "neg": _elementwise("-{0}"),
+    "sign": _elementwise("({0} > 0) - ({0} < 0)"),
+    "reciprocal": _elementwise("1.0 / {0}"),
+    "rsqrt": _elementwise("1.0 / sqrt({0})"),
+    "relu": _elementwise("larger({0}, 0.0)"),
+    "sigmoid": _elementwise("1.0 / (1.0 + exp(-{0}))"),
+    "add": _sum("+"),
+    "sub": _sum("-"),
+    "mul": _elementwise("{0} * {1}"),
+    "div": _elementwise("{0} / {1}"),
+    "pow": _power,
+    "atan2": _elementwise("atan2({0}, {1})"),
+    "fmod": _elementwise("fmod({0}, {1})"),
+    "remainder": _elementwise("{0} - {1} * floor({0} / {1})"),
+    "maximum": _elementwise("larger({0}, {1})"),
+    "minimum": _elementwise("smaller({0}, {1})"),
+    "eq": _elementwise("{0} == {1}"),
+    "ne": _elementwise("{0} != {1}"),
+    "lt": _elementwise("{0} < {1}"),
+    "le": _elementwise("{0} <= {1}"),
+    "gt": _elementwise("{0} > {1}"),
+    "ge": _elementwise("{0} >= {1}"),
+    **{f"{kind}_and": _elementwise("{0} != 0 && {1} != 0") for kind in ("logical", "bitwise")},
+    **{f"{kind}_or": _elementwise("{0} != 0 || {1} != 0") for kind in ("logical", "bitwise")},
+    **{f"{kind}_not": _elementwise("{0} == 0") for kind in ("logical", "bitwise")},
+    "where": _elementwise("{0} != 0 ? {1} : {2}"),
+    "clamp": _clamp,
+    "sum": _reduction(0.0, "{into} += {0};"),
+    "prod": _reduction(1.0, "{into} *= {0};"),
+    "amax": _reduction(-math.inf, "{into} = larger({into}, {0});"),
+    "amin": _reduction(math.inf, "{into} = smaller({into}, {0});"),
+    "any": _reduction(0.0, "{into} = {into} != 0 || {0} != 0;"),
+    "all": _reduction(1.0, "{into} = {into} != 0 && {0} != 0;"),
+    "mean": _mean,
+    "min": _extreme("<"),
+    "max": _extreme(">"),
+    "argmin": _index_of_extreme("<"),
+    "argmax": _index_of_extreme(">"),
+    "gather": _gather,
+    "linalg_vector_norm": _norm,
+    **dict.fromkeys(("mm", "bmm", "mv", "dot"), _product),
+    "_linalg_solve_ex": _solution,
+    "linalg_inv_ex": _inverse,
+    "_linalg_det": _determinant,
+    "cumsum": _cumulative_sum,
+    **dict.fromkeys(("_to_copy", "clone", "alias", "lift_fresh_copy"), _same),
+    "_unsafe_view": lambda text, x, shape: text.viewed(aten.view.default, x, shape),
+    "cat": _cat,
+    "stack": _stack,
+    "copy": _copied,
+    "select_scatter": _scattered(aten.select.int),
+    "slice_scatter": _scattered(aten.slice.Tensor),
+    "diagonal_scatter": _scattered(aten.diagonal.default),
+    **{
+        name: _moved(getattr(aten, name))
+        for name in ("flip", "index", "index_select", "repeat", "roll")
+    },
+    "getitem": lambda text, results, index: results[index],
+}  # fmt: skip

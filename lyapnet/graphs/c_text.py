@@ -1,0 +1,146 @@
+"""C99 as it is written: arrays in memory, tables of constants, and loops over them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_map
+
+PER_LINE = 8  # numbers of a table
+
+
+@dataclass(frozen=True)
+class Array:
+    """A place in memory: an array's name, and a tensor without entries for its shape, strides and offset."""
+
+    name: str
+    layout: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.layout.shape
+
+
+class Tables:
+    """The constants of C functions: each written once."""
+
+    def __init__(self) -> None:
+        self.text: list[str] = []
+        self._known: dict[tuple[Any, ...], Array] = {}
+
+    def of(self, constant: Tensor) -> Array:
+        """The table of a constant."""
+        numbers = constant.detach().cpu().contiguous().to(torch.float64)
+        key = tuple(numbers.shape), numbers.numpy().tobytes()
+        if key not in self._known:
+            name = f"w{len(self._known)}"
+            entries = [literal(number) for number in numbers.flatten().tolist()]
+            rows = [", ".join(entries[i : i + PER_LINE]) for i in range(0, len(entries), PER_LINE)]
+            self.text.append(
+                f"static const double {name}[{len(entries)}] = {{\n    {f',{chr(10)}    '.join(rows)}}};\n"
+            )
+            self._known[key] = Array(name, torch.empty(numbers.shape, device="meta"))
+        return self._known[key]
+
+
+class Text:
+    """The body of a C function, line by line.
+
+    Args:
+        tables: takes its constants.
+    """
+
+    def __init__(self, tables: Tables):
+        self.tables, self.lines, self._count = tables, list[str](), 0
+
+    def new(self, shape: Sequence[int]) -> Array:
+        """A new array."""
+        name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
+        self._count += 1
+        self.lines.append(f"double {name}[{max(1, layout.numel())}];")
+        return Array(name, layout)
+
+    def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
+        """Write a line at every index of a shape: {0}, {1}, … are the values there, and {into} is where it goes.
+
+        Args:
+            values: Arrays, tensors or numbers, each broadcast.
+            into: of that shape, or with strides of zero.
+        """
+        arrays = [value if isinstance(value, Array) else self._constant(value) for value in (*values, into)]
+        layouts = [array.layout.expand(tuple(shape)) if isinstance(array, Array) else None for array in arrays]
+        axes = _axes(shape, [layout for layout in layouts if layout is not None])
+        places, column = list[str](), 0
+        for array, layout in zip(arrays, layouts, strict=True):
+            if isinstance(array, str) or layout is None:
+                places.append(str(array))
+                continue
+            steps = [(f"i{k}", strides[column]) for k, (_, strides) in enumerate(axes)]
+            places.append(f"{array.name}[{_index(int(layout.storage_offset()), steps)}]")
+            column += 1
+        for k, (size, _) in enumerate(axes):
+            self.lines.append(f"{'    ' * k}for (int i{k} = 0; i{k} < {size}; i{k}++)")
+        self.lines.append("    " * len(axes) + line.format(*places[:-1], into=places[-1]))
+        return into
+
+    def copy(self, source: Any, into: Array) -> Array:
+        """Write a copy."""
+        return self.each(into.shape, [source], "{into} = {0};", into)
+
+    def contiguous(self, value: Any) -> Array:
+        """A value with its entries one after another."""
+        array = value if isinstance(value, Array) else self.tables.of(torch.as_tensor(value, dtype=torch.float64))
+        is_whole = array.layout.is_contiguous() and array.layout.storage_offset() == 0
+        return array if is_whole else self.copy(array, self.new(array.shape))
+
+    def viewed(self, target: Any, array: Array, *args: Any, **kwargs: Any) -> Any:
+        """Another look at an array's entries; of a copy where its strides do not allow it."""
+        try:
+            found = target(array.layout, *args, **kwargs)
+        except RuntimeError:
+            array = self.contiguous(array)
+            found = target(array.layout, *args, **kwargs)
+        return tree_map(lambda layout: Array(array.name, layout), found)
+
+    def _constant(self, value: Any) -> Array | str:
+        """A number as it is written, or a table."""
+        if isinstance(value, Tensor) and value.numel() != 1:
+            return self.tables.of(value)
+        number = literal(float(value))
+        return f"({number})" if number.startswith("-") else number
+
+
+def literal(number: float) -> str:
+    """A number in C, to its last bit."""
+    if math.isnan(number):
+        return "NAN"
+    if math.isinf(number):
+        return "INFINITY" if number > 0 else "-INFINITY"
+    return repr(float(number))
+
+
+def _axes(shape: Sequence[int], layouts: Sequence[Tensor]) -> list[tuple[int, tuple[int, ...]]]:
+    """The axes to loop over, each with a stride for each array: those that follow one another in all arrays as one."""
+    axes = list[tuple[int, tuple[int, ...]]]()
+    for size, strides in zip(shape, zip(*(layout.stride() for layout in layouts), strict=True), strict=True):
+        if size == 1:
+            continue
+        if axes and axes[-1][1] == tuple(size * stride for stride in strides):
+            axes[-1] = axes[-1][0] * size, strides
+        else:
+            axes.append((size, strides))
+    return axes
+
+
+def _index(offset: int, steps: Sequence[tuple[str, int]]) -> str:
+    """offset + Σ stride · counter, as short as it can be written."""
+    terms = [counter if stride == 1 else f"{stride} * {counter}" for counter, stride in steps if stride]
+    return " + ".join([*([str(offset)] if offset or not terms else []), *terms])
+
+
+def shape_of(value: Any) -> torch.Size:
+    """The shape of an array or a tensor; a number has none."""
+    return value.shape if isinstance(value, Array | Tensor) else torch.Size()

@@ -1,0 +1,26 @@
+"""The time of one control: as many calls as a loop of 1 kHz makes, of C that is far faster than Python."""
+
+import json
+import shutil
+
+import pytest
+
+from lyapnet.cli import main
+from tests.runs import tiny_checkpoint
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+
+
+def test_each_way_is_timed(tmp_path, capsys):
+    checkpoint = tiny_checkpoint(tmp_path)
+    capsys.readouterr()
+    assert main(["bench", "law", str(checkpoint), "--seconds", "0.2", "--json"]) == 0
+    rows = {row["way"]: row for row in json.loads(capsys.readouterr().out)}
+    assert [*rows] == ["C, -O2", "C, -O3", "Python"]
+    for row in rows.values():
+        assert 0 < row["median"] <= row["most"] <= row["worst"]
+        assert 0 < row["calls"] <= 200
+    assert rows["C, -O2"]["calls"] == 200
+    assert rows["C, -O3"]["median"] < rows["Python"]["median"]
+    assert main(["bench", "law", str(checkpoint), "--seconds", "0.05"]) == 0
+    assert "microseconds of u(t, x), 1 kHz" in capsys.readouterr().out

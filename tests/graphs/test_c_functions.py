@@ -1,0 +1,104 @@
+"""Traced torch functions as C: equal to torch at points, compiled without a warning, and what has no rule is named."""
+
+import ctypes
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.errors import ExportError
+from lyapnet.graphs import c_rules
+from lyapnet.graphs.c_functions import c_function, helpers
+from lyapnet.graphs.c_text import Tables, literal
+from lyapnet.graphs.tracing import core_trace
+from tests.graphs.test_casadi_functions import FUNCTIONS
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+POINT = torch.tensor([[0.3, -0.8, 1.7, -2.2]], dtype=torch.float64)
+DOUBLES = ctypes.POINTER(ctypes.c_double)
+
+
+def written(functions, folder):
+    """name ↦ a Python function of one of several functions of x (1, 4), all in one C library."""
+    tables, bodies = Tables(), []
+    for name, function in functions.items():
+        graph = core_trace(lambda x, function=function: (function(x),), [torch.zeros(1, 4)])
+        signature = f"void {name.replace(' ', '_')}(const double *x, double *y)"
+        bodies.append(signature + ";\n" + c_function(signature, graph, {"x": POINT}, ["y"], tables))
+    code = "\n".join(bodies)
+    (folder / "f.c").write_text("\n".join(["#include <math.h>", *helpers(code), *tables.text, code]))
+    library = folder / "f.so"
+    command = ["cc", *STRICT, "-shared", "-fPIC", "-o", str(library), str(folder / "f.c"), "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    loaded = ctypes.CDLL(str(library))
+
+    def calling(name, size):
+        def call(x):
+            y = np.empty(size)
+            getattr(loaded, name.replace(" ", "_"))(x.numpy().copy().ctypes.data_as(DOUBLES), y.ctypes.data_as(DOUBLES))
+            return torch.from_numpy(y)
+
+        return call
+
+    return {name: calling(name, function(POINT).numel()) for name, function in functions.items()}
+
+
+@pytest.fixture(scope="module")
+def in_c(tmp_path_factory):
+    return written(FUNCTIONS, tmp_path_factory.mktemp("c"))
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_operations_of_user_systems_are_written(name, in_c):
+    for x in (POINT, POINT.flip(-1) / 2, torch.zeros_like(POINT)):
+        assert_close(in_c[name](x), FUNCTIONS[name](x).flatten(), rtol=1e-12, atol=1e-13, equal_nan=True)
+
+
+def test_what_is_not_a_number_stays_so(in_c):
+    x = torch.tensor([[torch.nan, 1.0, 2.0, 3.0]])
+    for name in ("extremes", "branches", "products"):
+        expected = FUNCTIONS[name](x).flatten()
+        assert torch.equal(in_c[name](x).isnan(), expected.isnan())
+        assert expected.isnan().any()
+
+
+def test_a_wrong_rule_is_another_function(monkeypatch, tmp_path):
+    monkeypatch.setitem(c_rules.RULES, "sin", c_rules.RULES["cos"])
+    name = "trigonometry"
+    wrong = written({name: FUNCTIONS[name]}, tmp_path)[name](POINT)
+    assert not torch.allclose(wrong, FUNCTIONS[name](POINT).flatten())
+
+
+@pytest.mark.parametrize(
+    ("function", "named"),
+    [
+        (lambda x: torch.special.bessel_j0(x), "bessel_j0"),
+        (lambda x: x.sort(-1).values, "sort"),
+        (lambda x: torch.linalg.eigvalsh(x.mT @ x), "eigh"),
+        (lambda x: x.long() * 1.0, "_to_copy"),
+    ],
+    ids=["bessel", "sort", "eigenvalues", "whole numbers"],
+)
+def test_what_has_no_rule_is_named(function, named):
+    graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)])
+    with pytest.raises(ExportError, match=named):
+        c_function("void f(const double *x, double *y)", graph, {"x": POINT}, ["y"], Tables())
+
+
+def test_numbers_are_written_to_the_last_bit():
+    numbers = [0.1, -1 / 3, 1e-320, 1.7976931348623157e308, 2.0, 1e22]
+    assert [float(literal(number)) for number in numbers] == numbers
+    assert [literal(number) for number in (torch.inf, -torch.inf, torch.nan)] == ["INFINITY", "-INFINITY", "NAN"]
+
+
+def test_a_table_is_written_once():
+    tables = Tables()
+    first, again = tables.of(torch.tensor([1.0, 2.0])), tables.of(torch.tensor([1.0, 2.0]))
+    other = tables.of(torch.tensor([1.0, -2.0]))
+    assert first.name == again.name != other.name
+    assert len(tables.text) == 2

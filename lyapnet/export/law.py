@@ -31,10 +31,8 @@ class Law:
                 "riccati."
             )
         centre, constants = controller.initial_states.center, len(controller.system.constants)
-        parts = centre.split([len(centre) - constants, constants])
-        self.arguments: dict[str, Tensor] = dict(zip(("t", "x", "p"), (torch.zeros_like(centre[0]), *parts), strict=True))
-        if not constants:
-            del self.arguments["p"]
+        x, p = centre.split([len(centre) - constants, constants])
+        self.arguments = {"t": torch.zeros_like(centre[0]), "x": x, **({"p": p} if constants else {})}
 
     def given(self, t: Any, state: Any) -> list[Any]:
         """The arguments of t and a state (…, n + k), an array or a tensor."""

@@ -64,7 +64,7 @@ def latencies(controller: Controller, seconds: float) -> list[Latency]:
         ExportError: the law cannot be written in C; or there is no compiler.
     """
     count = max(1, round(seconds * RATE))
-    t, x = (column[:: max(1, len(column) // STATES)][:STATES].double().numpy() for column in points(controller))
+    t, x = (column[:: max(1, len(column) // STATES)][:STATES].double().cpu().numpy() for column in points(controller))
     t = np.minimum(t, controller.horizon.duration)
     found = []
     with tempfile.TemporaryDirectory() as place:

@@ -4,7 +4,7 @@ import ctypes
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,45 +20,55 @@ from lyapnet.graphs.c_text import Tables, literal
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 
 
-def sources(controller: Controller, law: Law, about: Sequence[str]) -> dict[str, str]:
+def sources(controller: Controller, law: Law, about: Mapping[str, str]) -> dict[str, str]:
     """File name ↦ text.
 
     Args:
-        about: lines that say what was exported.
+        about: what is exported, for the comment at the top.
 
     Raises:
-        ExportError: an operation has no rule in C.
+        ExportError: an operation has no rule in C; or the law is too large for a stack.
     """
-    comment = "/* " + "\n   ".join(about).replace("*/", "* /").replace("/*", "/ *") + " */\n"
+    tables, arrays = Tables(), "".join(f"const double *{name}, " for name in law.arguments)
+    functions, stack = zip(
+        *(
+            c_function(f"static void {name}_of({arrays}double *y)", graph, law.arguments, ["y"], tables)
+            for name, graph in (("control", law.control), ("value", law.value))
+        ),
+        strict=True,
+    )
+    lines = "\n   ".join(f"{key}: {value}" for key, value in {**about, "stack": f"{max(stack)} bytes"}.items())
+    comment = "/* " + lines.replace("*/", "* /").replace("/*", "/ *") + " */\n"
+    parameter = ", const double p[LYAPNET_PARAMETERS]" if "p" in law.arguments else ""
+    control = f"void lyapnet_control(double t, const double x[LYAPNET_STATES]{parameter}, double u[LYAPNET_CONTROLS])"
+    value = f"double lyapnet_value(double t, const double x[LYAPNET_STATES]{parameter})"
+    given = ", ".join("&t" if name == "t" else name for name in law.arguments)
+    entries = (
+        f"{control}\n{{\n    control_of({given}, u);\n}}\n\n"
+        f"{value}\n{{\n    double V[1];\n    value_of({given}, V);\n    return V[0];\n}}\n"
+    )
+    code, includes = "\n".join(functions), '#include "policy.h"\n\n#include <math.h>\n'
+    return {
+        "policy.h": comment + _header(controller, law, control, value),
+        "policy.c": "\n".join([comment + includes, *helpers(code), *tables.text, code, entries]),
+        "main.c": _example(law),
+        "CMakeLists.txt": CMAKE,
+    }
+
+
+def _header(controller: Controller, law: Law, control: str, value: str) -> str:
     sizes = {"STATES": len(law.arguments["x"]), "CONTROLS": controller.system.m}
     if "p" in law.arguments:
         sizes["PARAMETERS"] = len(law.arguments["p"])
     defines = "".join(f"#define LYAPNET_{name} {size}\n" for name, size in sizes.items())
-    told = ", const double p[LYAPNET_PARAMETERS]" if "p" in law.arguments else ""
-    control = f"void lyapnet_control(double t, const double x[LYAPNET_STATES]{told}, double u[LYAPNET_CONTROLS])"
-    value = f"double lyapnet_value(double t, const double x[LYAPNET_STATES]{told})"
-    header = (
-        f"{comment}#ifndef LYAPNET_POLICY_H\n#define LYAPNET_POLICY_H\n\n{defines}\n"
+    return (
+        f"#ifndef LYAPNET_POLICY_H\n#define LYAPNET_POLICY_H\n\n{defines}\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif\n\n/* u(t, x) */\n{control};\n\n/* V(t, x) */\n{value};\n\n'
         "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
     )
-    tables, arrays = Tables(), "".join(f"const double *{name}, " for name in law.arguments)
-    bodies = [
-        c_function(f"static void {name}_of({arrays}double *y)", graph, law.arguments, ["y"], tables)
-        for name, graph in (("control", law.control), ("value", law.value))
-    ]
-    given = ", ".join("&t" if name == "t" else name for name in law.arguments)
-    ends = (
-        f"{control}\n{{\n    control_of({given}, u);\n}}\n\n"
-        f"{value}\n{{\n    double V[1];\n    value_of({given}, V);\n    return V[0];\n}}\n"
-    )
-    code = "\n".join(bodies)
-    policy = "\n".join(
-        [comment + '#include "policy.h"\n\n#include <math.h>\n', *helpers(code), *tables.text, code, ends]
-    )
-    return {"policy.h": header, "policy.c": policy, "main.c": _example(law), "CMakeLists.txt": CMAKE}
 
 
+YOURS = ("main.c", "CMakeLists.txt")  # which are left as they are where they exist
 CMAKE = """cmake_minimum_required(VERSION 3.10)
 project(policy C)
 set(CMAKE_C_STANDARD 99)
@@ -66,6 +76,7 @@ if(NOT CMAKE_BUILD_TYPE)
   set(CMAKE_BUILD_TYPE Release)
 endif()
 add_library(policy policy.c)
+target_include_directories(policy PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
 target_link_libraries(policy PUBLIC m)
 add_executable(main main.c)
 target_link_libraries(main policy)

@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lyapnet import __version__
 from lyapnet.beyond import BEYOND
@@ -19,7 +19,6 @@ PROGRAMS = {
     "onnx": (programs.onnx_model_of, programs.write_onnx, programs.run_onnx),
     "torch": (programs.program_of, programs.write_torch, programs.run_torch),
 }
-NOT_YET = "not yet verified"
 
 
 class Exported(NamedTuple):
@@ -46,19 +45,14 @@ def export(controller: Controller, path: str | Path, to: str, checkpoint: Path |
         ExportError: the law cannot be written in it, or what was written is not that law.
     """
     path = Path(path)
-    if to not in FORMATS:
-        raise UsageError(f"Expected a format among {', '.join(FORMATS)}, got {to!r}; choose one of them.")
-    if not path.parent.is_dir():
-        raise UsageError(
-            f"Expected a place in a folder that exists, got {str(path)!r}; make {str(path.parent)!r} first."
-        )
-    if path.is_dir() != (to == "c") and path.exists():
-        raise UsageError(f"Expected a {'folder' if to == 'c' else 'file'} for {to}, got {str(path)!r}; choose another.")
-    if not path.name.endswith(FORMATS[to]):
-        raise UsageError(f"Expected a name that ends in {FORMATS[to]} for {to}, got {path.name!r}; choose it so.")
+    _require_place(path, to)
     about, law = _about(controller, checkpoint), Law(controller)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_") as place:
-        draft = Path(place)
+    try:
+        place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
+    except OSError as error:
+        raise UsageError(f"Expected a place that can be written to, got {str(path)!r} ({error.strerror}).") from error
+    with place as name:
+        draft = Path(name)
         if to == "c":
             return _write_c(controller, law, about, draft, path)
         make, write, run = PROGRAMS[to]
@@ -70,17 +64,39 @@ def export(controller: Controller, path: str | Path, to: str, checkpoint: Path |
     return Exported([path], agreement)
 
 
-def _write_c(controller: Controller, law: Law, about: dict[str, Any], draft: Path, folder: Path) -> Exported:
-    """The files of a C library."""
-    lines = [f"{key}: {value}" for key, value in about.items()]
-    written = c.sources(controller, law, [*lines, NOT_YET])
-    for name, text in written.items():
+def _require_place(path: Path, to: str) -> None:
+    """Refuse another format, and a place where something else stands."""
+    if to not in FORMATS:
+        raise UsageError(f"Expected a format among {', '.join(FORMATS)}, got {to!r}; choose one of them.")
+    if not path.parent.is_dir():
+        raise UsageError(
+            f"Expected a place in a folder that exists, got {str(path)!r}; make {str(path.parent)!r} first."
+        )
+    if path.is_dir() != (to == "c") and path.exists():
+        raise UsageError(f"Expected a {'folder' if to == 'c' else 'file'} for {to}, got {str(path)!r}; choose another.")
+    if not path.name.endswith(FORMATS[to]):
+        raise UsageError(f"Expected a name that ends in {FORMATS[to]} for {to}, got {path.name!r}; choose it so.")
+    header = path / "policy.h"
+    if (
+        path.is_dir()
+        and any(path.iterdir())
+        and not (header.is_file() and header.read_bytes().startswith(b"/* lyapnet:"))
+    ):
+        raise UsageError(f"Expected a new folder, or that of an earlier export, got {str(path)!r}; choose another.")
+
+
+def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Path, folder: Path) -> Exported:
+    """The files of a C library; in a folder that has them, those of the law alone."""
+    for name, text in c.sources(controller, law, about).items():
         (draft / name).write_text(text, encoding="utf-8")
     agreement = verify(controller, c.compiled(draft, law, controller.system.m))
     folder.mkdir(exist_ok=True)
-    for name, text in written.items():
-        write_atomically(folder / name, text.replace(NOT_YET, f"verified: {agreement}", 1).encode())
-    return Exported([folder / name for name in written], agreement)
+    paths = []
+    for name, text in c.sources(controller, law, {**about, "verified": str(agreement)}).items():
+        if name not in c.YOURS or not (folder / name).exists():
+            paths.append(folder / name)
+            write_atomically(paths[-1], text.encode())
+    return Exported(paths, agreement)
 
 
 def _about(controller: Controller, checkpoint: Path | None) -> dict[str, str]:

@@ -5,50 +5,92 @@ import importlib
 import json
 import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.fx import GraphModule
+from torch.fx import GraphModule, Node
 
-from lyapnet.errors import ExportError, one_line
+from lyapnet.errors import ExportError, LyapnetError, one_line
 from lyapnet.export.law import Law
 from lyapnet.export.verification import Evaluate
 from lyapnet.graphs.compilation import one_number_at_a_time
 from lyapnet.graphs.tracing import name_of
 
 RESULTS = ["u", "V"]
-ARITHMETIC = ("add", "sub", "mul", "div", "clamp")
+aten = torch.ops.aten
+FILLED = ("full", "full_like", "new_full")
+WITH_TENSORS = {  # operators ↦ those that take tensors in the place of numbers
+    **{getattr(aten, name).Tensor: getattr(aten, name).Tensor for name in ("add", "sub", "mul", "div", "remainder")},
+    **{getattr(aten, name).Scalar: getattr(aten, name).Tensor for name in ("add", "sub", "mul", "div", "remainder")},
+    aten.clamp.default: aten.clamp.Tensor,
+}
 ABOUT = "lyapnet.json"  # in a program of torch.export
 
 
 def program_of(law: Law) -> torch.export.ExportedProgram:
-    """The law as torch.export has it."""
-    graph = one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
-    with torch.no_grad():
+    """The law as torch.export has it.
+
+    Raises:
+        ExportError: it has operations that torch.export does not take.
+    """
+    with _quiet("torch.export does not take"), torch.no_grad():
+        graph = one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
         return torch.export.export(graph, tuple(law.arguments.values()))
+
+
+@contextmanager
+def _quiet(what: str) -> Iterator[None]:
+    """Nothing of what torch says about itself, and one line of what it raises."""
+    log = logging.getLogger("torch")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except LyapnetError:
+        raise
+    except Exception as error:  # of many kinds
+        line = one_line(error)[:200]
+        raise ExportError(
+            f"Expected a law without operations that {what}, got {type(error).__name__}: {line}; choose another --to."
+        ) from error
+    finally:
+        log.setLevel(level)
 
 
 def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
     """A copy with tensors for the numbers in its arithmetic, which ONNX would round to float32."""
     graph = copy.deepcopy(graph)
-    for node in [
-        node for node in graph.graph.nodes if node.op == "call_function" and name_of(node.target) in ARITHMETIC
-    ]:
-        for place, number in enumerate(node.args):
-            if isinstance(number, int | float):
-                name = f"number_{node.name}_{place}"
-                graph.register_buffer(name, torch.tensor(number, dtype=dtype))
-                with graph.graph.inserting_before(node):
-                    constant = graph.graph.get_attr(name)
-                constant.meta["val"] = torch.tensor(number, dtype=dtype)
-                node.update_arg(place, constant)
-        if node.target is torch.ops.aten.clamp.default and not node.kwargs:
-            node.target = torch.ops.aten.clamp.Tensor
+    for node in [node for node in graph.graph.nodes if node.op == "call_function"]:
+        value = node.meta.get("val")
+        if not isinstance(value, torch.Tensor) or not value.is_floating_point():
+            continue
+        if name_of(node.target) in FILLED:
+            filled = _constant_before(node, graph, torch.full(value.shape, float(node.args[1]), dtype=value.dtype))
+            node.replace_all_uses_with(filled)
+            graph.graph.erase_node(node)
+        elif node.target in WITH_TENSORS and not node.kwargs:
+            for place, number in enumerate(node.args):
+                if isinstance(number, int | float):
+                    node.update_arg(place, _constant_before(node, graph, torch.tensor(number, dtype=dtype), place))
+            node.target = WITH_TENSORS[node.target]
     graph.recompile()
     return graph
+
+
+def _constant_before(node: Node, graph: GraphModule, value: torch.Tensor, place: int = 0) -> Node:
+    name = f"number_{node.name}_{place}"
+    graph.register_buffer(name, value)
+    with graph.graph.inserting_before(node):
+        constant = graph.graph.get_attr(name)
+    constant.meta["val"] = value
+    return constant
 
 
 def write_torch(program: torch.export.ExportedProgram, path: Path, about: dict[str, Any]) -> None:
@@ -81,22 +123,11 @@ def onnx_model_of(law: Law) -> Any:
         raise ExportError(
             f"Expected onnx, onnxscript and onnxruntime, got {error}; pip install 'lyapnet[onnx]'."
         ) from error
-    program, log = program_of(law), logging.getLogger("torch.onnx")
-    level = log.level
-    log.setLevel(logging.ERROR)  # about libraries that are not installed
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, about itself
-            return torch.onnx.export(
-                program, dynamo=True, input_names=[*law.arguments], output_names=RESULTS, verbose=False
-            )
-    except Exception as error:  # of many kinds
-        line = one_line(error)[:200]
-        raise ExportError(
-            f"Expected operations that ONNX has, got {type(error).__name__}: {line}; take --to torch or c."
-        ) from error
-    finally:
-        log.setLevel(level)
+    program = program_of(law)
+    with _quiet("ONNX does not have"):
+        return torch.onnx.export(
+            program, dynamo=True, input_names=[*law.arguments], output_names=RESULTS, verbose=False
+        )
 
 
 def write_onnx(model: Any, path: Path, about: dict[str, Any]) -> None:

@@ -15,10 +15,8 @@ from lyapnet.random_streams import TEST, stream
 
 STATES = 10_000
 LOOPS = 100  # closed loops, of whose states half of them are
-AROUND, AFTER = (
-    0.2,
-    1.25,
-)  # what the others may leave the box of those states by, of its widths; their latest time, of T
+AROUND = 0.2  # of the widths of the box of those states, by which the others may leave it
+AFTER = 1.25  # of T: their latest time
 TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # relative to the largest |u| and |V|
 LOOSER = 1e3  # for a law that compares costs: rounding decides between controls that cost the same
 

@@ -10,19 +10,21 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.fx import GraphModule, Interpreter
+from torch.fx import GraphModule, Interpreter, Node
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import ExportError
+from lyapnet.errors import ExportError, one_line
 from lyapnet.graphs.c_rules import RULES
 from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of
 
+STACK = 1_000_000  # bytes of arrays in one function, at the most
+
 
 def c_function(
     signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
-) -> str:
-    """A trace as the text of a C function.
+) -> tuple[str, int]:
+    """A trace as the text of a C function, and the bytes of its arrays on the stack.
 
     Args:
         signature: of the function, without its body, as in `void f(const double *x, double *y)`.
@@ -32,14 +34,19 @@ def c_function(
         tables: takes the constants.
 
     Raises:
-        ExportError: an operator has no rule; names it.
+        ExportError: an operator has no rule; names it. Or its arrays take more than STACK bytes.
     """
     text = Text(tables)
+    text.lines += [f"(void){name};" for name in arguments]  # not all functions need all of them
     inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
     outputs = _Reader(graph, text).run(*inputs)
     for name, output in zip(results, outputs, strict=True):
         text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
-    return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n"
+    if text.bytes > STACK:
+        raise ExportError(
+            f"Expected a law whose arrays fit on a stack, got {text.bytes / 1e6:.3g} MB; take --to torch or onnx."
+        )
+    return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n", text.bytes
 
 
 def helpers(code: str) -> list[str]:
@@ -48,6 +55,13 @@ def helpers(code: str) -> list[str]:
 
 
 HELPERS = {
+    "remainder_of(": """/* a - b floor(a / b), of the sign of b */
+static double remainder_of(double a, double b)
+{
+    double r = fmod(a, b);
+    return r != 0 && (r < 0) != (b < 0) ? r + b : r;
+}
+""",
     "larger(": "static double larger(double a, double b) { return a > b || a != a ? a : b; }\n",
     "smaller(": "static double smaller(double a, double b) { return a < b || a != a ? a : b; }\n",
     "solve(": """static void exchange(int n, double *a, double *b)
@@ -73,6 +87,7 @@ static double solve(int n, int k, double *A, double *b)
             determinant = -determinant;
         }
         determinant *= A[p * n + p];
+        if (k == 0 && determinant == 0) return 0.0;
         for (int i = p + 1; i < n; i++) {
             double factor = A[i * n + p] / A[p * n + p];
             for (int j = p; j < n; j++) A[i * n + j] -= factor * A[p * n + j];
@@ -96,23 +111,42 @@ class _Reader(Interpreter):
     def __init__(self, graph: GraphModule, text: Text):
         super().__init__(graph)
         self.extra_traceback = False  # the messages below are for users
-        self.text = text
+        self.text, self.logical = text, False
+
+    def get_attr(self, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
+        return _in_double(super().get_attr(target, args, kwargs))
+
+    def run_node(self, n: Node) -> Any:
+        value = n.meta.get("val")
+        self.logical = isinstance(value, Tensor) and value.dtype == torch.bool
+        return super().run_node(n)
 
     def call_function(self, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
         if not any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
-            return target(*args, **kwargs)
+            return tree_map(_in_double, target(*args, **kwargs))
         name = name_of(target)
+        if name in SHAPED:
+            return _in_double(target(*tree_map(_of_shape, args), **kwargs))
+        rule = self.text.viewing(target) if is_view(target) else RULES.get(name)
         try:
-            if name in SHAPED:
-                return target(*tree_map(_of_shape, args), **kwargs)
-            if is_view(target):
-                return self.text.viewed(target, *args, **kwargs)
-            return RULES[name](self.text, *args, **kwargs)
-        except (KeyError, TypeError, NotImplementedError) as error:  # no rule, or not for these options
+            if rule is None or name == "as_strided" or (self.logical and name in ("add", "sub")):
+                raise NotImplementedError
+            return rule(self.text, *args, **kwargs)
+        except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise ExportError(
                 f"Expected operations that can be written in C, got {target}; write f, g, the cost or V in others, add "
                 "a rule to lyapnet.graphs.c_rules.RULES, or take --to torch."
             ) from error
+        except Exception as error:  # of any kind: shapes that no rule expected
+            raise ExportError(
+                f"Expected operations that can be written in C, got {target}, and {type(error).__name__}: "
+                f"{one_line(error)[:200]}; take --to torch."
+            ) from error
+
+
+def _in_double(value: Any) -> Any:
+    """A constant as C has it."""
+    return value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
 
 
 def _of_shape(leaf: Any) -> Any:

@@ -30,6 +30,12 @@ def _sum(sign: str) -> Callable[..., Array]:
     )(text, a, b)
 
 
+def _divided(text: Text, a: Any, b: Any, *, rounding_mode: str | None = None) -> Array:
+    if rounding_mode == "floor":
+        return _elementwise("({0} - remainder_of({0}, {1})) / {1}")(text, a, b)
+    return _elementwise("{0} / {1}" if rounding_mode is None else "trunc({0} / {1})")(text, a, b)
+
+
 def _power(text: Text, base: Any, exponent: Any) -> Array:
     short = {2: "{0} * {0}", 1: "{0}", 3: "{0} * {0} * {0}", -1: "1.0 / {0}", 0.5: "sqrt({0})"}
     if isinstance(exponent, int | float) and exponent in short:
@@ -47,7 +53,7 @@ def _reduction(start: float, line: str) -> Callable[..., Array]:
 
     def rule(text: Text, x: Array, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Array:
         every = range(len(x.shape)) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
-        gone = {axis % len(x.shape) for axis in every}
+        gone = {axis % max(1, len(x.shape)) for axis in every}
         total = text.new([1 if axis in gone else size for axis, size in enumerate(x.shape)])
         text.each(total.shape, [start], "{into} = {0};", total)
         strided = Array(total.name, total.layout.expand(x.shape))
@@ -99,7 +105,7 @@ def _same(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **optio
 
 
 def _cat(text: Text, parts: Sequence[Any], dim: int = 0) -> Array:
-    parts = [part for part in parts if tuple(shape_of(part)) != (0,)]  # torch lets an empty one have any shape
+    parts = [part for part in parts if 0 not in shape_of(part)] or list(parts[:1])
     shape = torch.cat([torch.empty(shape_of(part), device="meta") for part in parts], dim).shape
     whole, start = text.new(shape), 0
     for part in parts:
@@ -148,15 +154,19 @@ def _moved(target: Any) -> Callable[..., Array]:
     return rule
 
 
-def _extreme(relation: str) -> Callable[..., list[Array]]:
+def _extreme(relation: str) -> Callable[..., Any]:
     """The first entry along an axis that all others are not < or > than, and its index."""
 
-    def rule(text: Text, x: Array, dim: int, keepdim: bool = False) -> list[Array]:
+    def rule(text: Text, x: Array, dim: int | None = None, keepdim: bool = False) -> Any:
+        if dim is None or not x.shape:
+            return RULES["amin" if relation == "<" else "amax"](text, x)
         value = text.copy(Array(x.name, x.layout.select(dim, 0)), text.new(x.layout.select(dim, 0).shape))
         index = text.each(value.shape, [0.0], "{into} = {0};", text.new(value.shape))
-        line = f"if ({{0}} {relation} {{1}}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
+        further = f"{{0}} {relation} {{1}} || ({{0}} != {{0}} && {{1}} == {{1}})"  # what is not a number is the extreme
+        line = f"if ({further}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
         for k in range(1, x.shape[dim]):
             text.each(value.shape, [Array(x.name, x.layout.select(dim, k)), value, float(k)], line, index)
+        text.lines.append(f"(void){index.name};")
         found = value, index
         return [Array(y.name, y.layout.unsqueeze(dim)) if keepdim else y for y in found]
 
@@ -182,6 +192,35 @@ def _gather(text: Text, x: Any, dim: int, index: Any, *, sparse_grad: bool = Fal
     ])  # fmt: skip
     line = f"{{into}} = (&{{0}})[{x.layout.stride(dim)} * (int){{1}}];"
     return text.each(index.shape, [Array(x.name, first), index], line, text.new(index.shape))
+
+
+def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
+    """A copy, with other entries at computed places along an axis."""
+    whole = text.copy(x, text.new(shape_of(x)))
+    if not isinstance(index, Array):
+        raise NotImplementedError
+    steps = [0 if axis == dim % len(whole.shape) else step for axis, step in enumerate(whole.layout.stride())]
+    first = Array(whole.name, whole.layout.as_strided(index.shape, steps))
+    text.each(index.shape, [index, source], f"(&{{into}})[{whole.layout.stride(dim)} * (int){{0}}] = {{1}};", first)
+    return whole
+
+
+def _softmax(text: Text, x: Array, dim: int, half_to_float: bool = False) -> Array:
+    raised = RULES["exp"](text, RULES["sub"](text, x, RULES["amax"](text, x, [dim], True)))
+    return RULES["div"](text, raised, RULES["sum"](text, raised, [dim], True))
+
+
+def _padded(text: Text, x: Array, pad: Sequence[int], value: float = 0.0) -> Array:
+    if min(pad) < 0:
+        raise NotImplementedError
+    sides = [(0, 0)] * (len(x.shape) - len(pad) // 2) + list(zip(pad[::2], pad[1::2], strict=True))[::-1]
+    whole = text.new([low + size + high for size, (low, high) in zip(x.shape, sides, strict=True)])
+    text.each(whole.shape, [float(value)], "{into} = {0};", whole)
+    inner = whole.layout
+    for axis, (low, _) in enumerate(sides):
+        inner = inner.narrow(axis, low, x.shape[axis])
+    text.copy(x, Array(whole.name, inner))
+    return whole
 
 
 def _solution(text: Text, A: Any, B: Any, *, left: bool = True, check_errors: bool = False) -> list[Any]:
@@ -236,6 +275,8 @@ RULES: dict[str, Callable[..., Any]] = {
         )
     },
     "abs": _elementwise("fabs({0})"),
+    "isnan": _elementwise("{0} != {0}"),
+    "hypot": _elementwise("hypot({0}, {1})"),
     "neg": _elementwise("-{0}"),
     "sign": _elementwise("({0} > 0) - ({0} < 0)"),
     "reciprocal": _elementwise("1.0 / {0}"),
@@ -245,11 +286,11 @@ RULES: dict[str, Callable[..., Any]] = {
     "add": _sum("+"),
     "sub": _sum("-"),
     "mul": _elementwise("{0} * {1}"),
-    "div": _elementwise("{0} / {1}"),
+    "div": _divided,
     "pow": _power,
     "atan2": _elementwise("atan2({0}, {1})"),
     "fmod": _elementwise("fmod({0}, {1})"),
-    "remainder": _elementwise("{0} - {1} * floor({0} / {1})"),
+    "remainder": _elementwise("remainder_of({0}, {1})"),
     "maximum": _elementwise("larger({0}, {1})"),
     "minimum": _elementwise("smaller({0}, {1})"),
     "eq": _elementwise("{0} == {1}"),
@@ -275,6 +316,9 @@ RULES: dict[str, Callable[..., Any]] = {
     "argmin": _index_of_extreme("<"),
     "argmax": _index_of_extreme(">"),
     "gather": _gather,
+    "scatter": _scatter,
+    "_softmax": _softmax,
+    "constant_pad_nd": _padded,
     "linalg_vector_norm": _norm,
     **dict.fromkeys(("mm", "bmm", "mv", "dot"), _product),
     "_linalg_solve_ex": _solution,

@@ -1,7 +1,7 @@
 """C99 as it is written: arrays in memory, tables of constants, and loops over them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +37,7 @@ class Tables:
         key = tuple(numbers.shape), numbers.numpy().tobytes()
         if key not in self._known:
             name = f"w{len(self._known)}"
-            entries = [literal(number) for number in numbers.flatten().tolist()]
+            entries = [literal(number) for number in numbers.flatten().tolist()] or ["0.0"]
             rows = [", ".join(entries[i : i + PER_LINE]) for i in range(0, len(entries), PER_LINE)]
             self.text.append(
                 f"static const double {name}[{len(entries)}] = {{\n    {f',{chr(10)}    '.join(rows)}}};\n"
@@ -54,13 +54,14 @@ class Text:
     """
 
     def __init__(self, tables: Tables):
-        self.tables, self.lines, self._count = tables, list[str](), 0
+        self.tables, self.lines, self.bytes, self._count = tables, list[str](), 0, 0
 
     def new(self, shape: Sequence[int]) -> Array:
         """A new array."""
         name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
-        self._count += 1
-        self.lines.append(f"double {name}[{max(1, layout.numel())}];")
+        size = max(1, layout.numel())
+        self._count, self.bytes = self._count + 1, self.bytes + 8 * size
+        self.lines.append(f"double {name}[{size}];")
         return Array(name, layout)
 
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
@@ -95,6 +96,10 @@ class Text:
         array = value if isinstance(value, Array) else self.tables.of(torch.as_tensor(value, dtype=torch.float64))
         is_whole = array.layout.is_contiguous() and array.layout.storage_offset() == 0
         return array if is_whole else self.copy(array, self.new(array.shape))
+
+    def viewing(self, target: Any) -> Callable[..., Any]:
+        """The rule of an operator that looks at an array's entries in another way."""
+        return lambda text, *args, **kwargs: text.viewed(target, *args, **kwargs)
 
     def viewed(self, target: Any, array: Array, *args: Any, **kwargs: Any) -> Any:
         """Another look at an array's entries; of a copy where its strides do not allow it."""

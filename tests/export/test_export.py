@@ -158,9 +158,51 @@ class Reading(ControlAffineSystem):
         return (-1 if self.reads and float(x.sum()) > 9 else 1) * torch.ones(*x.shape, 1).to(x)
 
 
-def own_controller(**options):
-    problem = problem_of(Reading(**options), controls=ControlBox([-1.0], [1.0]))
-    return Controller(problem, Formula(lambda t, x: (x**2).sum(-1) * (1 + t)))
+def own_controller(V=lambda t, x: (x**2).sum(-1) * (1 + t), **options):
+    return Controller(problem_of(Reading(**options), controls=ControlBox([-1.0], [1.0])), Formula(V))
+
+
+OWN = {
+    "a square": lambda t, x: (x**2).sum(-1) * (1 + t),
+    "no time": lambda t, x: (x**2).sum(-1),
+    "numbers": lambda t, x: torch.remainder(x[..., 0], 0.7) * x[..., 0] * (1 + t) + torch.full_like(x[..., 0], 0.1),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("to", ["c", "torch", "onnx"])
+def test_networks_of_ones_own(name, to, tmp_path):
+    if to == "onnx":
+        pytest.importorskip("onnxscript")
+    controller = own_controller(OWN[name], reads=False)
+    path, agreement = export(controller, tmp_path / {"c": "law", "torch": "law.pt2", "onnx": "law.onnx"}[to], to)
+    assert path
+    assert max(agreement.control, agreement.value) < 1e-12
+
+
+@needs_compiler
+def test_single_precision_is_exported_too(tmp_path):
+    controller = untrained("double_integrator", *SHORT, "training.precision=float32")
+    _, agreement = export(controller, tmp_path / "law", "c")
+    assert max(agreement.control, agreement.value) < 1e-4
+
+
+@needs_compiler
+def test_files_of_the_users_own_are_kept(tmp_path):
+    controller = own_controller(OWN["no time"], reads=False)
+    folder = tmp_path / "law"
+    export(controller, folder, "c")
+    (folder / "main.c").write_text("mine")
+    before = (folder / "policy.c").stat().st_mtime_ns
+    paths, _ = export(controller, folder, "c")
+    assert (folder / "main.c").read_text() == "mine"
+    assert (folder / "policy.c").stat().st_mtime_ns > before
+    assert [path.name for path in paths] == ["policy.h", "policy.c"]
+    (folder / "policy.h").write_text("mine")
+    with pytest.raises(UsageError, match="new folder"):
+        export(controller, folder, "c")
+    assert (folder / "policy.h").read_text() == "mine"
 
 
 @needs_compiler

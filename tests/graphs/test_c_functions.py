@@ -14,10 +14,21 @@ from lyapnet.graphs import c_rules
 from lyapnet.graphs.c_functions import c_function, helpers
 from lyapnet.graphs.c_text import Tables, literal
 from lyapnet.graphs.tracing import core_trace
-from tests.graphs.test_casadi_functions import FUNCTIONS
+from tests.graphs.test_casadi_functions import FUNCTIONS as OF_CASADI
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 STRICT = ("-std=c99", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+FUNCTIONS = OF_CASADI | {
+    "one extreme": lambda x: x.min(-1).values,
+    "places of extremes": lambda x: x.max(-1).indices + x.argmin(-1, keepdim=True) + x.min() + x[0].sum(-1).sum(-1),
+    "computed places": lambda x: x.gather(-1, x.argmax(-1, True)) * x,
+    "written places": lambda x: torch.zeros_like(x).scatter(-1, x.argmax(-1, True), x[:, :1]),
+    "wrapped": lambda x: torch.remainder(x, 0.7) + torch.remainder(x, -0.7) + torch.floor_divide(x, 0.3),
+    "nothing": lambda x: torch.cat([x[:, :0], x, x[:, 4:]], -1) + 0.0 * x[:, :0].sum(),
+    "singular": lambda x: torch.linalg.det(torch.zeros(3, 3).to(x) * x[0, 0]) + x,
+    "shares": lambda x: torch.softmax(x, -1) + torch.nn.functional.pad(x, (1, 0))[:, :4] + torch.hypot(x, x + 1),
+    "undefined": lambda x: torch.nan_to_num(x / x - 1, nan=2.0),
+}  # fmt: skip
 POINT = torch.tensor([[0.3, -0.8, 1.7, -2.2]], dtype=torch.float64)
 DOUBLES = ctypes.POINTER(ctypes.c_double)
 
@@ -28,7 +39,7 @@ def written(functions, folder):
     for name, function in functions.items():
         graph = core_trace(lambda x, function=function: (function(x),), [torch.zeros(1, 4)])
         signature = f"void {name.replace(' ', '_')}(const double *x, double *y)"
-        bodies.append(signature + ";\n" + c_function(signature, graph, {"x": POINT}, ["y"], tables))
+        bodies.append(signature + ";\n" + c_function(signature, graph, {"x": POINT}, ["y"], tables)[0])
     code = "\n".join(bodies)
     (folder / "f.c").write_text("\n".join(["#include <math.h>", *helpers(code), *tables.text, code]))
     library = folder / "f.so"
@@ -61,10 +72,12 @@ def test_operations_of_user_systems_are_written(name, in_c):
 
 def test_what_is_not_a_number_stays_so(in_c):
     x = torch.tensor([[torch.nan, 1.0, 2.0, 3.0]])
-    for name in ("extremes", "branches", "products"):
-        expected = FUNCTIONS[name](x).flatten()
-        assert torch.equal(in_c[name](x).isnan(), expected.isnan())
-        assert expected.isnan().any()
+    for name in ("extremes", "branches", "products", "one extreme", "places of extremes"):
+        for place in (0, 2):
+            z = x.roll(place, -1)
+            expected = FUNCTIONS[name](z).flatten()
+            assert_close(in_c[name](z), expected, rtol=1e-12, atol=1e-13, equal_nan=True)
+            assert expected.isnan().any()
 
 
 def test_a_wrong_rule_is_another_function(monkeypatch, tmp_path):
@@ -81,8 +94,11 @@ def test_a_wrong_rule_is_another_function(monkeypatch, tmp_path):
         (lambda x: x.sort(-1).values, "sort"),
         (lambda x: torch.linalg.eigvalsh(x.mT @ x), "eigh"),
         (lambda x: x.long() * 1.0, "_to_copy"),
+        (lambda x: ((x > 0) + (x > -1)) * 1.0, "add"),
+        (lambda x: x.exp().as_strided((2, 2), (1, 2), 0), "as_strided"),
+        (lambda x: x.expand(300_000, 4).exp().sum(), "fit on a stack"),
     ],
-    ids=["bessel", "sort", "eigenvalues", "whole numbers"],
+    ids=["bessel", "sort", "eigenvalues", "whole numbers", "sum of Booleans", "strides", "large"],
 )
 def test_what_has_no_rule_is_named(function, named):
     graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)])

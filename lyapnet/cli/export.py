@@ -6,7 +6,18 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import At, Checkpoint, Controls, Cost, Debug, Network, System, load_controller
+from lyapnet.cli.options import (
+    At,
+    Checkpoint,
+    Constraints,
+    Controls,
+    Cost,
+    Debug,
+    Network,
+    Program,
+    System,
+    load_controller,
+)
 
 
 def export(
@@ -18,6 +29,8 @@ def export(
     network: Network = None,
     cost: Cost = None,
     controls: Controls = None,
+    constraints: Constraints = None,
+    program: Program = None,
     at: At = None,
     debug: Debug = False,
 ) -> None:
@@ -29,7 +42,14 @@ def export(
     from lyapnet.export import export as write
 
     controller = load_controller(
-        checkpoint, at, system=system, network=network, cost=cost, controls=controls
+        checkpoint,
+        at,
+        system=system,
+        network=network,
+        cost=cost,
+        controls=controls,
+        constraints=constraints,
+        program=program,
     ).continued(beyond)
     notes = Console(highlight=False, markup=False)
     with notes.status("writing and verifying …"):

@@ -84,7 +84,7 @@ target_link_libraries(main policy)
 
 
 def _example(law: Law) -> str:
-    """A program that asks for u and V at the centre of X₀."""
+    """A program that asks for u and V at a state of X₀."""
     lists = {name: ", ".join(map(literal, law.arguments[name].tolist())) for name in law.arguments if name != "t"}
     arrays = "".join(f"    const double {name}[] = {{{numbers}}};\n" for name, numbers in lists.items())
     given = ", ".join(lists)

@@ -30,9 +30,10 @@ class Law:
                 "Expected a law after T that another language can follow, got beyond=error; take hold, receding or "
                 "riccati."
             )
-        centre, constants = controller.initial_states.center, len(controller.system.constants)
-        x, p = centre.split([len(centre) - constants, constants])
-        self.arguments = {"t": torch.zeros_like(centre[0]), "x": x, **({"p": p} if constants else {})}
+        x0, constants = controller.initial_states, len(controller.system.constants)
+        example = (x0.center + x0.upper) / 2
+        x, p = example.split([len(example) - constants, constants])
+        self.arguments = {"t": torch.zeros_like(example[0]), "x": x, **({"p": p} if constants else {})}
 
     def given(self, t: Any, state: Any) -> list[Any]:
         """The arguments of t and a state (…, n + k), an array or a tensor."""

@@ -3,6 +3,7 @@
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyapnet.controller import Controller
-from lyapnet.export import export
+from lyapnet.export import compiled, export
 from lyapnet.export.c import compile_c
 from lyapnet.export.verification import points
 from lyapnet.graphs.c_text import literal
@@ -58,7 +59,7 @@ class Latency:
 
 
 def latencies(controller: Controller, seconds: float) -> list[Latency]:
-    """How long u takes, each way for so many seconds: C with each of OPTIMISED, and `Controller.policy` on an array.
+    """How long u takes, each way for so many seconds: in C, compiled in Python, and `Controller.policy`.
 
     Raises:
         ExportError: the law cannot be written in C; or there is no compiler.
@@ -73,7 +74,10 @@ def latencies(controller: Controller, seconds: float) -> list[Latency]:
         (folder / "law" / "loop.c").write_text(_loop(controller, t, x, count))
         for option in OPTIMISED:
             found.append(_summary(f"C, {option}", _in_c(folder / "law", option)))
-    return [*found, _summary("Python", _in_python(controller, t, x, count))]
+    fast = compiled(controller)
+    for way, policy in (("Python, compiled", fast.policy), ("Python", controller.policy)):
+        found.append(_summary(way, _in_python(policy, t, x, count)))
+    return found
 
 
 def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
@@ -95,7 +99,7 @@ def _in_c(folder: Path, option: str) -> NDArray:
     return np.array(printed.split(), dtype=np.float64)
 
 
-def _in_python(controller: Controller, t: NDArray, x: NDArray, count: int) -> NDArray:
+def _in_python(policy: Callable[..., NDArray], t: NDArray, x: NDArray, count: int) -> NDArray:
     """As many calls as fit into the time, at most that number."""
     taken, following = list[float](), time.perf_counter()
     end = following + count / RATE
@@ -103,7 +107,7 @@ def _in_python(controller: Controller, t: NDArray, x: NDArray, count: int) -> ND
         following = max(following + 1 / RATE, time.perf_counter())
         time.sleep(max(0.0, following - time.perf_counter()))
         k, started = len(taken) % len(t), time.perf_counter()
-        controller.policy(t[k], x[k])
+        policy(t[k], x[k])
         taken.append(1e6 * (time.perf_counter() - started))
     return np.array(taken)
 

@@ -13,7 +13,7 @@ import lyapnet
 from lyapnet.cli import main
 from lyapnet.controller import Controller
 from lyapnet.errors import ExportError, UsageError
-from lyapnet.export import export
+from lyapnet.export import compiled, export
 from lyapnet.export.verification import STATES, points
 from lyapnet.files import digest_of_file
 from lyapnet.graphs import c_rules
@@ -69,6 +69,21 @@ def test_c_says_what_the_controller_says(kind, tmp_path):
     assert u == pytest.approx(controller.policy(0.0, x).tolist(), rel=1e-4, abs=1e-6)
     assert pytest.approx(float(controller.value(0.0, x)), rel=1e-4, abs=1e-6) == V
     assert ("PARAMETERS" in (tmp_path / "law" / "policy.h").read_text()) == (kind == "a family")
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", ["a limit, held", "a family"])
+def test_in_python_it_is_one_state_after_another(kind):
+    controller = controller_of(kind)
+    law = compiled(controller)
+    x = controller.initial_states.upper
+    assert law.policy(0.2, x.tolist()) == pytest.approx(controller.policy(0.2, x.numpy()), rel=1e-9)
+    assert law.value(0.2, x.numpy()) == pytest.approx(float(controller.value(0.2, x)), rel=1e-9)
+    assert law.policy(-1.0, x.numpy()) == pytest.approx(controller.policy(0.0, x.numpy()), rel=1e-9)
+    with pytest.raises(ValueError, match="one state"):
+        law.policy(0.0, [[0.0] * len(x)])
+    with pytest.raises(ValueError, match="one state"):
+        law.value(0.0, [0.0] * (len(x) - 1))
 
 
 @needs_compiler

@@ -64,6 +64,23 @@ def export(controller: Controller, path: str | Path, to: str, checkpoint: Path |
     return Exported([path], agreement)
 
 
+def compiled(controller: Controller) -> c.CompiledLaw:
+    """A controller's law as machine code, for a loop in Python: `.policy(t, x)` and `.value(t, x)` of one state.
+
+    It is what `export` writes in C, held against the controller likewise.
+
+    Raises:
+        ExportError: as export.
+    """
+    law = Law(controller)
+    with tempfile.TemporaryDirectory() as place:
+        for name, text in c.sources(controller, law, {}).items():
+            (Path(place) / name).write_text(text, encoding="utf-8")
+        fast = c.CompiledLaw(Path(place), law, controller.system.m, ["-std=c99", "-O3"])
+    verify(controller, fast.of_many)
+    return fast
+
+
 def _require_place(path: Path, to: str) -> None:
     """Refuse another format, and a place where something else stands."""
     if to not in FORMATS:
@@ -89,7 +106,7 @@ def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Pat
     """The files of a C library; in a folder that has them, those of the law alone."""
     for name, text in c.sources(controller, law, about).items():
         (draft / name).write_text(text, encoding="utf-8")
-    agreement = verify(controller, c.compiled(draft, law, controller.system.m))
+    agreement = verify(controller, c.CompiledLaw(draft, law, controller.system.m, c.FLAGS).of_many)
     folder.mkdir(exist_ok=True)
     paths = []
     for name, text in c.sources(controller, law, {**about, "verified": str(agreement)}).items():

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lyapnet.controller import Controller
-from lyapnet.export import compiled, export
-from lyapnet.export.c import compile_c
+from lyapnet.export import export
+from lyapnet.export.c import FAST, CompiledLaw, compile_c
+from lyapnet.export.law import Law
 from lyapnet.export.verification import points
 from lyapnet.graphs.c_text import literal
 
@@ -74,7 +75,7 @@ def latencies(controller: Controller, seconds: float) -> list[Latency]:
         (folder / "law" / "loop.c").write_text(_loop(controller, t, x, count))
         for option in OPTIMISED:
             found.append(_summary(f"C, {option}", _in_c(folder / "law", option)))
-    fast = compiled(controller)
+        fast = CompiledLaw(folder / "law", Law(controller), controller.system.m, FAST)
     for way, policy in (("Python, compiled", fast.policy), ("Python", controller.policy)):
         found.append(_summary(way, _in_python(policy, t, x, count)))
     return found
@@ -87,9 +88,8 @@ def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
     constants = len(controller.system.constants)
     given = "z + 1" if not constants else f"z + 1, z + {1 + x.shape[1] - constants}"
     return LOOP.format(
-        states=len(table), width=table.shape[1], table=rows, count=count, period=10**9 // RATE,
-        given=given,
-    )  # fmt: skip
+        states=len(table), width=table.shape[1], table=rows, count=count, period=10**9 // RATE, given=given
+    )
 
 
 def _in_c(folder: Path, option: str) -> NDArray:

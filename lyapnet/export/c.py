@@ -17,6 +17,7 @@ from lyapnet.graphs.c_functions import c_function, helpers
 from lyapnet.graphs.c_text import Tables, literal
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
+FAST = ("-std=c99", "-O3")
 
 
 def sources(controller: Controller, law: Law, about: Mapping[str, str]) -> dict[str, str]:

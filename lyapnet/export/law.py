@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.controller import Controller
-from lyapnet.errors import ExportError, LyapnetError, one_line
+from lyapnet.errors import ExportError
 from lyapnet.graphs.tracing import core_trace
 
 
@@ -59,10 +59,4 @@ class Law:
         def of_one(t: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             return function(t.clamp(min=0), torch.cat(state)[None])
 
-        try:
-            return core_trace(of_one, list(self.arguments.values()))
-        except LyapnetError as error:
-            raise ExportError(str(error)) from error
-        except Exception as error:  # of any kind: f, g, the cost and V may be the user's
-            line = one_line(error)[:200]
-            raise ExportError(f"Expected a law that can be traced, got {type(error).__name__}: {line}") from error
+        return core_trace(of_one, list(self.arguments.values()), "f, g, a cost and V", ExportError)

@@ -25,8 +25,11 @@ RESULTS = ["u", "V"]
 aten = torch.ops.aten
 FILLED = ("full", "full_like", "new_full")
 WITH_TENSORS = {  # operators ↦ those that take tensors in the place of numbers
-    **{getattr(aten, name).Tensor: getattr(aten, name).Tensor for name in ("add", "sub", "mul", "div", "remainder")},
-    **{getattr(aten, name).Scalar: getattr(aten, name).Tensor for name in ("add", "sub", "mul", "div", "remainder")},
+    **{
+        getattr(operator, kind): operator.Tensor
+        for operator in (aten.add, aten.sub, aten.mul, aten.div, aten.remainder)
+        for kind in ("Tensor", "Scalar")
+    },
     aten.clamp.default: aten.clamp.Tensor,
 }
 ABOUT = "lyapnet.json"  # in a program of torch.export

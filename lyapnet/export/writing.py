@@ -72,13 +72,18 @@ def compiled(controller: Controller) -> c.CompiledLaw:
     Raises:
         ExportError: as export.
     """
-    law = Law(controller)
     with tempfile.TemporaryDirectory() as place:
-        for name, text in c.sources(controller, law, {}).items():
-            (Path(place) / name).write_text(text, encoding="utf-8")
-        fast = c.CompiledLaw(Path(place), law, controller.system.m, ["-std=c99", "-O3"])
-    verify(controller, fast.of_many)
-    return fast
+        return _verified(controller, Law(controller), {}, Path(place), c.FAST)[0]
+
+
+def _verified(
+    controller: Controller, law: Law, about: dict[str, str], folder: Path, options: Sequence[str]
+) -> tuple[c.CompiledLaw, Agreement]:
+    """The C of a law written into a folder, compiled, and held against the controller."""
+    for name, text in c.sources(controller, law, about).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    compiled_law = c.CompiledLaw(folder, law, controller.system.m, options)
+    return compiled_law, verify(controller, compiled_law.of_many)
 
 
 def _require_place(path: Path, to: str) -> None:
@@ -104,9 +109,7 @@ def _require_place(path: Path, to: str) -> None:
 
 def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Path, folder: Path) -> Exported:
     """The files of a C library; in a folder that has them, those of the law alone."""
-    for name, text in c.sources(controller, law, about).items():
-        (draft / name).write_text(text, encoding="utf-8")
-    agreement = verify(controller, c.CompiledLaw(draft, law, controller.system.m, c.FLAGS).of_many)
+    _, agreement = _verified(controller, law, about, draft, c.FLAGS)
     folder.mkdir(exist_ok=True)
     paths = []
     for name, text in c.sources(controller, law, {**about, "verified": str(agreement)}).items():

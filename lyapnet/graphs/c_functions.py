@@ -127,11 +127,14 @@ class _Reader(Interpreter):
         name = name_of(target)
         if name in SHAPED:
             return _in_double(target(*tree_map(_of_shape, args), **kwargs))
-        rule = self.text.viewing(target) if is_view(target) else RULES.get(name)
         try:
-            if rule is None or name == "as_strided" or (self.logical and name in ("add", "sub")):
+            if name == "as_strided" or (self.logical and name in ("add", "sub")):
                 raise NotImplementedError
-            return rule(self.text, *args, **kwargs)
+            if is_view(target):
+                return self.text.viewed(target, *args, **kwargs)
+            if name not in RULES:
+                raise NotImplementedError
+            return RULES[name](self.text, *args, **kwargs)
         except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise ExportError(
                 f"Expected operations that can be written in C, got {target}; write f, g, the cost or V in others, add "

@@ -1,7 +1,7 @@
 """C99 as it is written: arrays in memory, tables of constants, and loops over them."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,10 +96,6 @@ class Text:
         array = value if isinstance(value, Array) else self.tables.of(torch.as_tensor(value, dtype=torch.float64))
         is_whole = array.layout.is_contiguous() and array.layout.storage_offset() == 0
         return array if is_whole else self.copy(array, self.new(array.shape))
-
-    def viewing(self, target: Any) -> Callable[..., Any]:
-        """The rule of an operator that looks at an array's entries in another way."""
-        return lambda text, *args, **kwargs: text.viewed(target, *args, **kwargs)
 
     def viewed(self, target: Any, array: Array, *args: Any, **kwargs: Any) -> Any:
         """Another look at an array's entries; of a copy where its strides do not allow it."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import LyapnetError, OracleError, one_line
+from lyapnet.errors import OracleError
 from lyapnet.graphs.tracing import SHAPED, Tensors, core_trace, is_view, name_of
 
 Symbols = np.ndarray  # dtype object: its entries are scalar casadi.SX
@@ -26,16 +26,7 @@ def traced(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> Gra
     Raises:
         OracleError: the function reads the values of tensors.
     """
-    try:
-        return core_trace(function, arguments)
-    except LyapnetError as error:
-        raise OracleError(str(error)) from error
-    except Exception as error:  # any kind: the function is the user's
-        line = one_line(error)[:200]
-        raise OracleError(
-            f"Expected dynamics and cost that torch can trace, got {type(error).__name__}: {line}; write them in torch "
-            "operations, with torch.where for a course that depends on values."
-        ) from error
+    return core_trace(function, arguments, "dynamics and cost", OracleError)
 
 
 def symbolic(graph: GraphModule, arguments: Sequence[Tensor]) -> casadi.Function:

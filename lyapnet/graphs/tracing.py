@@ -18,7 +18,7 @@ from torch.fx.node import map_aggregate
 from torch.overrides import TorchFunctionMode
 from torch.testing import assert_close
 
-from lyapnet.errors import UntraceableError, UsageError, own_line
+from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line
 
 Tensors = tuple[Tensor, ...]
 
@@ -78,15 +78,27 @@ def trace(
     return graph_module
 
 
-def core_trace(function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> GraphModule:
+def core_trace(
+    function: Callable[..., Tensors], arguments: Sequence[Tensor], what: str, refusal: type[LyapnetError]
+) -> GraphModule:
     """The trace of a function in torch's few core operators, for a reader that writes them in another language.
 
-    Raises:
-        Exception: as trace.
+    Args:
+        what: the function is, for messages.
+        refusal: raised where there is no trace.
     """
     simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
-    with torch.no_grad():
-        return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
+    try:
+        with torch.no_grad():
+            return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
+    except LyapnetError as error:
+        raise refusal(str(error)) from error
+    except Exception as error:  # any kind: the function is the user's
+        line = one_line(error)[:200]
+        raise refusal(
+            f"Expected {what} that torch can trace, got {type(error).__name__}: {line}; write them in torch "
+            "operations, with torch.where for a course that depends on values."
+        ) from error
 
 
 # torch counts them among its core, but has them in simpler operators too

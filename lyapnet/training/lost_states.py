@@ -1,6 +1,6 @@
 """Initial states from which the closed loop costs more than V says: a training sees them again."""
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -30,7 +30,7 @@ class LostStates(Callback):
             self.on_validation_end(trainer, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        data, module = data_of(trainer), _untyped(pl_module)
+        data, module = data_of(trainer), cast(Any, pl_module)
         x0 = data.further(SOUGHT, trainer.global_step)
         try:
             found = module.without_gradient(x0.to(module.device), _excess_of)
@@ -50,7 +50,3 @@ def excess(cost: PerState, value: PerState) -> PerState:
 
 def _excess_of(_: Learner, trajectory: Trajectory) -> PerState:
     return excess(trajectory.cost, trajectory.require_value()[0])
-
-
-def _untyped(pl_module: LightningModule) -> Any:
-    return pl_module

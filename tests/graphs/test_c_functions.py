@@ -37,7 +37,7 @@ def written(functions, folder):
     """name ↦ a Python function of one of several functions of x (1, 4), all in one C library."""
     tables, bodies = Tables(), []
     for name, function in functions.items():
-        graph = core_trace(lambda x, function=function: (function(x),), [torch.zeros(1, 4)])
+        graph = core_trace(lambda x, function=function: (function(x),), [torch.zeros(1, 4)], "a function", ExportError)
         signature = f"void {name.replace(' ', '_')}(const double *x, double *y)"
         bodies.append(signature + ";\n" + c_function(signature, graph, {"x": POINT}, ["y"], tables)[0])
     code = "\n".join(bodies)
@@ -101,7 +101,7 @@ def test_a_wrong_rule_is_another_function(monkeypatch, tmp_path):
     ids=["bessel", "sort", "eigenvalues", "whole numbers", "sum of Booleans", "strides", "large"],
 )
 def test_what_has_no_rule_is_named(function, named):
-    graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)])
+    graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)], "a function", ExportError)
     with pytest.raises(ExportError, match=named):
         c_function("void f(const double *x, double *y)", graph, {"x": POINT}, ["y"], Tables())
 

@@ -124,9 +124,23 @@ def riccati(problem: Problem) -> Expansion:
 
     Limits of the controls are left out: near a goal that needs no control none is active.
     """
+    return _at_goal(problem).expansion
+
+
+def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
+    """(ū, K) of the law ū_n + K_n(x − x*) whose value `riccati` is: the linear-quadratic regulator of N steps.
+
+    ū_n (N, m) is the control that holds x*, or what is least dear where none does; K is (N, m, n).
+    """
+    backward = _at_goal(problem)
+    return problem.rest.double().cpu() + backward.k, backward.K
+
+
+def _at_goal(problem: Problem) -> "_Backward":
+    """The backward pass around x*, without limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
-    return _backward(problem, x, u, curved=False).expansion
+    return _backward(problem, x, u, curved=False)
 
 
 def optimal_trajectories(

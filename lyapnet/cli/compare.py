@@ -34,7 +34,7 @@ def compare(
     ] = None,
     debug: Debug = False,
 ) -> None:
-    """Compare lyapnet with PPO and SAC: same tasks, states and evaluator.
+    """Compare lyapnet with PPO, SAC, LQR, iLQR and MPC: same tasks and states.
 
     What is finished is taken as it is, and what was stopped goes on: the same
     command again only fills in what is missing, and writes the report anew.
@@ -99,16 +99,16 @@ def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console
     return failed
 
 
-def _report(comparison: Any, chosen: Sequence[Any], command: Sequence[str], console: Console) -> None:
+def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console) -> None:
     """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
     from lyapnet.comparison.execution import controllers_of
     from lyapnet.comparison.plan import begun_jobs, jobs_of
-    from lyapnet.comparison.report import summary, write_report
-    from lyapnet.comparison.results import with_cold_compilation, with_common_optima
+    from lyapnet.comparison.report import brief, summary, write_report
+    from lyapnet.comparison.results import PLANNED, with_cold_compilation, with_common_optima
     from lyapnet.comparison.statistics import compared
     from lyapnet.tables import terminal
 
-    jobs = list({job.name: job for job in (*jobs_of(comparison), *chosen, *begun_jobs(comparison))}.values())
+    jobs = list({job.name: job for job in (*jobs_of(config), *chosen, *begun_jobs(config))}.values())
     finished = [result for job in jobs if (result := job.result) is not None]
     results = with_cold_compilation(with_common_optima(finished))
     if not results:
@@ -116,10 +116,14 @@ def _report(comparison: Any, chosen: Sequence[Any], command: Sequence[str], cons
         return
     planned = [(job.task, job.method, job.seed) for job in jobs]
     wrote = write_report(
-        results, comparison.folder / "report", command=shlex.join(["lyapnet", *command]), planned=planned,
+        results, config.folder / "report", command=shlex.join(["lyapnet", *command]), planned=planned,
         controllers=controllers_of(jobs),
     )  # fmt: skip
-    console.print(terminal(summary(compared(results))))
+    comparison = compared(results)
+    if (learned := comparison.without(PLANNED)).groups:
+        console.print(terminal(summary(learned)))
+    if set(PLANNED).intersection(comparison.methods):
+        console.print(terminal(brief(comparison)))
     if lacking := len(planned) - len(results):
         console.print(f"{lacking} of {len(planned)} jobs are missing; the same command goes on", soft_wrap=True)
     console.print(f"wrote {wrote[0]} and {len(wrote) - 1} files beside it", soft_wrap=True)

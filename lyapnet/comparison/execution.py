@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,12 +12,14 @@ import torch
 from rich.console import Console
 
 from lyapnet.build import parts_of
-from lyapnet.comparison.baselines.training import BaselineTraining, costs_of_best
+from lyapnet.comparison.baselines.training import BaselineTraining, best_policy
 from lyapnet.comparison.controller_policy import ControllerPolicy
 from lyapnet.comparison.plan import RESULT, Job
-from lyapnet.comparison.results import OURS, Measurement, Result
+from lyapnet.comparison.planners import PlannerPolicy
+from lyapnet.comparison.results import OURS, PLANNED, ControlTimes, Measurement, Result
 from lyapnet.comparison.scoring import Costs, costs_of, optima_of
 from lyapnet.comparison.sweep.points import Point
+from lyapnet.comparison.timing import times_of_controller, times_of_policy
 from lyapnet.config import ControlsConfig, CostConfig, config_from_plain, to_plain
 from lyapnet.controller import Controller
 from lyapnet.errors import LyapnetError, UsageError
@@ -46,7 +49,8 @@ def run_job(job: Job, console: Console) -> Result:
             return done
         write_json(job.folder / RECORD, _description(job))
         torch.set_num_threads(1)  # jobs run side by side
-        result = _lyapnet(job, console) if job.method == OURS else _baseline(job, console)
+        make = _lyapnet if job.method == OURS else _planner if job.method in PLANNED else _baseline
+        result = make(job, console)
         result.write(job.folder / RESULT)
         return result
 
@@ -80,7 +84,8 @@ def _description(job: Job) -> dict[str, Any]:
     if job.method == OURS:
         return {"evaluation": evaluation, "control_scale": scale, "config": {**config, "logs": ""}}
     task = [config[key] for key in ("system", "cost", "controls", "initial_states", "horizon")]
-    return {"evaluation": evaluation, "control_scale": scale, "task": task, **job.baseline.description}
+    method = {} if job.method in PLANNED else job.baseline.description
+    return {"evaluation": evaluation, "control_scale": scale, "task": task, **method}
 
 
 def _with_defaults(kept: dict[str, Any]) -> dict[str, Any]:
@@ -107,9 +112,14 @@ def _lyapnet(job: Job, console: Console) -> Result:
     costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states)
     with torch.no_grad():
         constraint_loss = measure(controller.problem, controller.program, controller.rollout(states)).constraint_loss
-    compilation = run.record().get("compilation_seconds", 0.0)
-    validations = _validations(run, config.training.batch_size * config.horizon.steps, compilation)
-    return _result(job, states, costs, validations, run.best, compilation, float(constraint_loss.mean()))
+    record = run.record()
+    compilation, start = record.get("compilation_seconds", 0.0), record.get("start", {}).get("seconds", {})
+    before = compilation + max(start.values(), default=0.0)
+    validations = _validations(run, config.training.batch_size * config.horizon.steps, before)
+    return _result(
+        job, states, costs, str(run.best), validations, compilation,
+        constraint_loss=float(constraint_loss.mean()), times=times_of_controller(controller, states),
+    )  # fmt: skip
 
 
 def _controller(job: Job, checkpoint: Path) -> Controller:
@@ -127,8 +137,9 @@ def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
     return found
 
 
-def _validations(run: Run, steps: int, compilation: float) -> list[Measurement]:
-    """The validations of a run, `steps` environment steps to an iteration, from its metrics.csv.
+def _validations(run: Run, steps: int, before: float) -> list[Measurement]:
+    """The validations of a run, `steps` environment steps to an iteration and `before` seconds before it,
+    from its metrics.csv.
 
     Raises:
         LyapnetError: the run has none there.
@@ -137,7 +148,7 @@ def _validations(run: Run, steps: int, compilation: float) -> list[Measurement]:
 
     names = ("trajectory_cost/val", STEP, "training_seconds", "optimality_gap/val", "constraint_loss/val")
     validations = [
-        Measurement(int(iteration) * steps, compilation + seconds, cost, None if gap is None else 1 + gap, loss)
+        Measurement(int(iteration) * steps, before + seconds, cost, None if gap is None else 1 + gap, loss)
         for cost, iteration, seconds, gap, loss in read_curves(run.folder, *names)
     ]
     if not validations:
@@ -157,8 +168,21 @@ def _baseline(job: Job, console: Console) -> Result:
         console.print(f"{point.environment_steps}/{baseline.steps}  cost {point.cost:.4g}{ratio}", soft_wrap=True)
 
     training.run(report)
-    path, costs = costs_of_best(baseline, job.folder, states)
-    return _result(job, states, costs, training.curve, path)
+    path, policy = best_policy(baseline, job.folder)
+    costs = costs_of(policy, job.bounded, baseline.setting.observe_time, states)
+    times = times_of_policy(policy, job.bounded, baseline.setting.observe_time, states)
+    return _result(job, states, costs, str(path), training.curve, times=times)
+
+
+def _planner(job: Job, console: Console) -> Result:
+    began = time.process_time()
+    policy, states = PlannerPolicy(job.planner, job.bounded), _states(job)
+    prepared = time.process_time() - began
+    costs = costs_of(policy, job.bounded, True, states)
+    console.print(f"{job.name}: mean cost {float(costs.cost.mean()):.4g}", soft_wrap=True)
+    return _result(
+        job, states, costs, "", [], seconds=prepared, times=policy.times, unsolved_fraction=policy.unsolved_fraction
+    )
 
 
 def _states(job: Job) -> State:
@@ -172,18 +196,21 @@ def _result(
     job: Job,
     states: State,
     costs: Costs,
+    checkpoint: str,
     validations: Sequence[Measurement],
-    checkpoint: Path,
     compilation: float = 0.0,
+    seconds: float | None = None,
     constraint_loss: float | None = None,
+    times: ControlTimes | None = None,
+    unsolved_fraction: float | None = None,
 ) -> Result:
     optima = optima_of(job.bounded, states)
     return Result(
         task=job.task,
         method=job.method,
         seed=job.seed,
-        environment_steps=validations[-1].environment_steps,
-        seconds=validations[-1].seconds,
+        environment_steps=validations[-1].environment_steps if validations else 0,
+        seconds=validations[-1].seconds if seconds is None else seconds,
         compilation_seconds=compilation,
         costs=costs.cost.tolist(),
         sums=costs.sum.tolist(),
@@ -191,6 +218,8 @@ def _result(
         constraint_loss=constraint_loss,
         clipped_fraction=costs.clipped_fraction,
         horizon_steps=job.bounded.problem.horizon.steps,
-        checkpoint=str(checkpoint),
+        checkpoint=checkpoint,
         curve=validations,
+        times=times,
+        unsolved_fraction=unsolved_fraction,
     )

@@ -11,8 +11,9 @@ from omegaconf import MISSING
 from lyapnet.build import build_problem
 from lyapnet.comparison.baselines.baseline import VALIDATIONS, Baseline
 from lyapnet.comparison.baselines.settings import SETTINGS
+from lyapnet.comparison.planners import Planner, planner_of
 from lyapnet.comparison.reference_problems import CONTROL_SCALES, BoundedProblem, bounded_problem
-from lyapnet.comparison.results import METHODS, OURS, Result
+from lyapnet.comparison.results import METHODS, OURS, PLANNED, Result
 from lyapnet.comparison.workers import Runnable
 from lyapnet.config import Config, load_config
 from lyapnet.errors import UsageError, did_you_mean
@@ -86,7 +87,7 @@ def load_comparison(path: str | Path, overrides: Sequence[str] = ()) -> Comparis
 
 @dataclass(frozen=True, eq=False)
 class Job(Runnable):
-    """A method trained on a task from a seed, in a folder of its own."""
+    """A method on a task, trained from a seed if it is to be, in a folder of its own."""
 
     comparison: ComparisonConfig
     task: str
@@ -160,14 +161,25 @@ class Job(Runnable):
             self.bounded, method, self.seed, compared.steps[method], compared.hidden, options, validations
         )  # fmt: skip
 
-    def check(self) -> None:
-        """Refuse what cannot be trained, before anything is.
+    @property
+    def planner(self) -> Planner:
+        """What plans.
 
         Raises:
-            UsageError: see `config` and `baseline`.
+            UsageError: see planner_of.
+        """
+        return planner_of(self.method, self.bounded.problem)
+
+    def check(self) -> None:
+        """Refuse what cannot be trained or planned, before anything is.
+
+        Raises:
+            UsageError: see `config`, `baseline` and `planner`.
         """
         if self.method == OURS:
             _ = self.bounded
+        elif self.method in PLANNED:
+            _ = self.planner
         else:
             self.baseline.check()
 
@@ -187,10 +199,11 @@ def jobs_of(
         _require_among(task, config.tasks, "--tasks")
     for method in methods or ():
         _require_among(method, METHODS, "--methods")
-        if method != OURS and not any(method in config.tasks[task].steps for task in tasks or config.tasks):
+        if _needs_steps(method) and not any(method in config.tasks[task].steps for task in tasks or config.tasks):
             raise UsageError(f"Expected {method} under steps of a task, got none; give its environment steps.")
     tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
     count = {m: seeds or (config.seeds if m == OURS else config.baseline_seeds) for m in methods}
+    count |= {m: 1 for m in methods if m in PLANNED}  # which draw nothing
     jobs = [
         Job(config, task, method, seed)
         for seed in range(max(count.values()))
@@ -209,7 +222,11 @@ def jobs_of(
 
 
 def _is_compared(config: ComparisonConfig, task: str, method: str) -> bool:
-    return method == OURS or method in config.tasks[task].steps
+    return not _needs_steps(method) or method in config.tasks[task].steps
+
+
+def _needs_steps(method: str) -> bool:
+    return method in SETTINGS
 
 
 def begun_jobs(config: ComparisonConfig) -> list[Job]:

@@ -1,4 +1,4 @@
-"""What one job of a comparison leaves behind: a method trained on a task with a seed, and what it then costs."""
+"""What one job of a comparison leaves behind: what a method costs on a task, and how it was trained, if it was."""
 
 import json
 from collections.abc import Sequence
@@ -11,7 +11,9 @@ import torch
 from lyapnet.files import write_json
 
 OURS = "lyapnet"
-METHODS = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")  # the order of tables and figures
+LEARNED = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
+PLANNED = ("lqr", "ilqr", "mpc_10", "mpc_25", "mpc_100")  # from the model, without training; MPC: its horizon in % of T
+METHODS = (*LEARNED, *PLANNED)  # the order of tables and figures
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,15 @@ class Measurement:
     cost: float  # mean J_N of the validation states
     cost_ratio: float | None  # to their optimum, where there is an oracle
     constraint_loss: float | None  # where the program is a lyapnet program
+
+
+@dataclass(frozen=True)
+class ControlTimes:
+    """Milliseconds that one control took, of one state at a time on one thread."""
+
+    median: float
+    most: float  # the 99.9th percentile
+    first: float | None = None  # at t = 0, median over the states, where that is when a plan is made
 
 
 @dataclass(frozen=True)
@@ -42,7 +53,9 @@ class Result:
     clipped_fraction: float | None  # share of controls at the bounds of the action box
     horizon_steps: int
     checkpoint: str
-    curve: Sequence[Measurement]
+    curve: Sequence[Measurement]  # empty without training
+    times: ControlTimes | None = None
+    unsolved_fraction: float | None = None  # of the optimisations of a planner, that did not converge
 
     def write(self, path: Path) -> None:
         """As JSON, all or nothing: its presence says that the job is finished."""
@@ -52,7 +65,8 @@ class Result:
     def read(path: Path) -> "Result":
         """The result that `write` left."""
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return Result(**{**content, "curve": [Measurement(**point) for point in content["curve"]]})
+        curve, times = [Measurement(**point) for point in content["curve"]], content.get("times")
+        return Result(**{**content, "curve": curve, "times": times and ControlTimes(**times)})
 
 
 def with_cold_compilation(results: Sequence[Result]) -> list[Result]:

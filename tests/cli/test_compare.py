@@ -15,7 +15,7 @@ import lyapnet
 from lyapnet.cli import main
 from lyapnet.cli.compare import tell_of_missing_optima
 from lyapnet.comparison.plan import jobs_of, load_comparison
-from lyapnet.comparison.results import METHODS, OURS, Result, with_common_optima
+from lyapnet.comparison.results import LEARNED, OURS, Result, with_common_optima
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.measurement import evaluate
 
@@ -77,7 +77,7 @@ def test_the_whole_comparison(tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     tasks = load_comparison(SMOKE).tasks
     # four steps of training leave swing-up beyond its box
-    require_complete(tmp_path, compared(tmp_path, "--workers", "2"), tasks, METHODS, unclipped=3)
+    require_complete(tmp_path, compared(tmp_path, "--workers", "2"), tasks, LEARNED, unclipped=3)
 
 
 @pytest.fixture

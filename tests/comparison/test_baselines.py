@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lyapnet.comparison.baselines.baseline import Baseline
 from lyapnet.comparison.baselines.checkpoints import best_checkpoint, checkpoints
 from lyapnet.comparison.baselines.settings import SETTINGS
-from lyapnet.comparison.baselines.training import BaselineTraining, costs_of_best
+from lyapnet.comparison.baselines.training import BaselineTraining, best_policy
 from lyapnet.comparison.reference_problems import bounded_problem
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.horizon import Horizon
@@ -82,7 +82,8 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
     assert best.step == steps[int(np.argmin(costs))]
     model = {"ppo": PPO, "sac": SAC}[method[:3]].load(best.folder / "model.zip")
     assert model.policy.net_arch == [8]
-    path, measured = costs_of_best(baseline, tmp_path, training.states)
+    path, policy = best_policy(baseline, tmp_path)
+    measured = costs_of(policy, baseline.bounded, baseline.setting.observe_time, training.states)
     assert path == best.folder / "model.zip"
     assert float(measured.cost.mean()) == pytest.approx(min(costs), rel=1e-5), "the best one is what is measured"
     assert len(list((tmp_path / "checkpoints").iterdir())) <= 2

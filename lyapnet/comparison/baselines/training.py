@@ -31,11 +31,10 @@ from lyapnet.comparison.baselines.checkpoints import (
     checkpoints,
 )
 from lyapnet.comparison.results import Measurement
-from lyapnet.comparison.scoring import Costs, costs_of, optima_of
+from lyapnet.comparison.scoring import costs_of, optima_of
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.files import write_json
 from lyapnet.random_streams import VALIDATION, stream
-from lyapnet.types import State
 
 VALIDATION_STATES = 64  # those of a lyapnet run of the same seed
 
@@ -164,11 +163,10 @@ class BaselineTraining:
         self.curve = [Measurement(**point) for point in progress["curve"]]
 
 
-def costs_of_best(baseline: Baseline, folder: Path, x0: State) -> tuple[Path, Costs]:
-    """The model file of a training's best checkpoint, and what it costs from each of x₀ (b, n)."""
+def best_policy(baseline: Baseline, folder: Path) -> tuple[Path, BaselinePolicy]:
+    """The model file of a training's best checkpoint, and its policy."""
     checkpoint = best_checkpoint(folder)
-    costs = costs_of(checkpoint.policy(baseline), baseline.bounded, baseline.setting.observe_time, x0)
-    return checkpoint.folder / MODEL, costs
+    return checkpoint.folder / MODEL, checkpoint.policy(baseline)
 
 
 def _logger(folder: Path, resumed_at: int | None) -> Logger:

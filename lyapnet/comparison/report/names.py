@@ -1,6 +1,7 @@
 """Names of tasks and methods for readers."""
 
 ALGORITHMS = {"ppo": "PPO", "sac": "SAC"}
+PLANNERS = {"lqr": "LQR", "ilqr": "iLQR"}
 
 
 def name_of(task: str) -> str:
@@ -9,6 +10,10 @@ def name_of(task: str) -> str:
 
 
 def method_name(method: str) -> str:
-    """A method for readers: PPO (tuned)."""
+    """A method for readers: PPO (tuned), MPC (25 % of T)."""
     algorithm, _, setting = method.partition("_")
-    return f"{ALGORITHMS[algorithm]} ({setting})" if algorithm in ALGORITHMS and setting else method
+    if algorithm == "mpc":
+        return f"MPC ({setting} % of T)"
+    if algorithm in ALGORITHMS and setting:
+        return f"{ALGORITHMS[algorithm]} ({setting})"
+    return PLANNERS.get(method, method)

@@ -31,6 +31,15 @@ NOTES = (
     "one that did not counts with all its training, which bounds the factor from below; a bound below 1 says nothing.",
     "diverged: in some state of so many seeds the closed loop left the finite numbers; inf in the CSV files, ∞ as a "
     "factor.",
+    "fail: share of the states from which the closed loop costs more than twice the optimum, or left the finite "
+    "numbers. Worst state: the greatest J/J* of any state and seed.",
+    "Before use: seconds until the first control can be asked for. Of what learns, those of its start, compilation "
+    "and training; of LQR its Riccati equation; of MPC the reading of the model. LQR is that of the task linearised at "
+    "its goal. iLQR plans at t = 0, from the control that costs nothing, and then follows the plan. MPC plans at each "
+    "step, warm-started; what follows its horizon costs as LQR's value says. All of them know the model, as lyapnet.",
+    "A control: wall-clock time of one state's control on one thread; first: at t = 0, where a planner has no plan "
+    "yet. Of lyapnet it is the law as machine code, called from Python; of PPO and SAC their `predict`.",
+    "Not solved: share of a planner's optimisations that did not converge; MPC then follows its last plan.",
     "The sum form weighs the running cost 1/Δt times as much as J_N, which every method here minimises: it stands "
     "beside the paper's numbers and ranks nothing.",
     "Clipped: share of controls at the bounds of the action box, in the evaluation.",

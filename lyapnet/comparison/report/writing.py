@@ -9,12 +9,13 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from torch.utils.tensorboard.writer import SummaryWriter
 
+from lyapnet.comparison.report.alternatives import alternatives
 from lyapnet.comparison.report.details import details, overview, tasks_table
 from lyapnet.comparison.report.figures import caption, figure3, final, pictures
 from lyapnet.comparison.report.notes import NOTES
 from lyapnet.comparison.report.rows import curve_rows, missing, result_rows
 from lyapnet.comparison.report.table1 import table1
-from lyapnet.comparison.results import Result
+from lyapnet.comparison.results import PLANNED, Result
 from lyapnet.comparison.statistics import Comparison, compared
 from lyapnet.controller import Controller
 from lyapnet.drawing import pixels
@@ -23,7 +24,7 @@ from lyapnet.files import write_atomically
 from lyapnet.provenance import versions
 from lyapnet.tables import Table, csv_text, latex, markdown
 
-TITLE = "Ours against PPO and SAC"
+TITLE = "Ours against others"
 PACKAGES = ("torch", "numpy", "stable-baselines3", "gymnasium")
 DPI = 200
 
@@ -51,8 +52,10 @@ def write_report(
     comparison = compared(results)
     if not comparison.groups:
         raise UsageError("Expected at least one finished job to report on, got none; run lyapnet compare first.")
-    figures = {"figure3": figure3(comparison), "final": final(comparison), **pictures(controllers or {})}
-    tables = {"table1": table1(comparison), "details": [tasks_table(comparison), details(comparison)]}
+    learned, figures, tables = comparison.without(PLANNED), {}, {"alternatives": [alternatives(comparison)]}
+    if learned.groups:
+        figures = {"figure3": figure3(learned), "final": final(learned), **pictures(controllers or {})}
+        tables |= {"table1": table1(learned), "details": [tasks_table(learned), details(learned)]}
     text = report_text(comparison, tables, list(figures), command, missing(comparison, planned))
     files = {
         "report.md": text.encode(),
@@ -104,17 +107,27 @@ def report_text(
         f"```bash\n{command}\n```",
         "\n".join([f"- {fact}" for fact in _facts()]),
         *(["**Missing so far**", "\n".join(f"- {line}" for line in lacking)] if lacking else []),
-        markdown(overview(comparison)),
-        "## Costs",
-        *map(markdown, tables["table1"]),
-        "## Figures",
-        *(part for name in figures for part in (f"![{name}]({name}.png)", caption(name, comparison))),
-        "## Details",
-        *map(markdown, tables["details"]),
+        *map(markdown, tables["alternatives"]),
+        *_of_learning(comparison.without(PLANNED), tables, figures),
         *_notes(),
         "Every result: [results.csv](results.csv); every validation: [curves.csv](curves.csv).",
     ]
     return "\n\n".join(sections) + "\n"
+
+
+def _of_learning(learned: Comparison, tables: Mapping[str, Sequence[Table]], figures: Sequence[str]) -> list[str]:
+    """What is to be said of methods that learn, if there are any."""
+    if not learned.groups:
+        return []
+    return [
+        markdown(overview(learned)),
+        "## Costs",
+        *map(markdown, tables["table1"]),
+        "## Figures",
+        *(part for name in figures for part in (f"![{name}]({name}.png)", caption(name, learned))),
+        "## Details",
+        *map(markdown, tables["details"]),
+    ]
 
 
 def _notes() -> list[str]:

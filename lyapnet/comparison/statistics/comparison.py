@@ -36,6 +36,10 @@ class Comparison:
         """Ours first."""
         return in_order((method for _, method in self.groups), METHODS)
 
+    def without(self, methods: Sequence[str]) -> "Comparison":
+        """That of all other methods."""
+        return Comparison({key: group for key, group in self.groups.items() if group.method not in methods})
+
     def of(self, task: str, method: str) -> Group | None:
         """The seeds of a method on a task."""
         return self.groups.get((task, method))

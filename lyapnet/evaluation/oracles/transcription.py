@@ -15,11 +15,11 @@ from lyapnet.contracts import copied
 from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
+from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
 from lyapnet.expansions import riccati
-from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.problem import Problem
-from lyapnet.types import Control, ControlPath, PerState, State, StatePath
+from lyapnet.types import ControlPath, PerState, State, StatePath
 
 VIOLATED = 1e-6  # h that is still taken for zero
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
@@ -49,21 +49,12 @@ class Transcription(Oracle):
     def __init__(self, problem: Problem, method: str | None = None, iterations: int = 500):
         self.problem = copied(problem).in_steps(method=method or problem.horizon.method)
         system, horizon = self.problem.system, self.problem.horizon
-        x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
-        graphs = [traced(self.step, (x, u)), traced(self.end, (x,))]
-        step, end = symbolic(graphs[0], (x, u)), symbolic(graphs[1], (x,))
-        require_equal(step, self.step, (x, u))
-        require_equal(end, self.end, (x,))
-        inside = None
-        if self.problem.constraints is not None:
-            graphs.append(traced(self.inside, (x,)))
-            inside = symbolic(graphs[2], (x,))
-            require_equal(inside, self.inside, (x,))
-        self.cache = OptimaCache(graphs, horizon.steps, system.m, self.problem.controls)
+        self.task = CasadiTask(self.problem)
+        self.cache = OptimaCache(self.task.graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
         limits = self.problem.controls.limits
-        bounded = self.problem.controls.limited or inside is not None
-        self._solver = _solver(step, end, inside, horizon.steps, iterations, bounded)
+        bounded = self.problem.controls.limited or self.task.inside is not None
+        self._solver = _solver(self.task, horizon.steps, iterations, bounded)
         self._riccati = riccati(self.problem) if bounded else None
         assert limits is not None  # oracle_of asks before
         free = np.full(system.n * horizon.steps, np.inf)
@@ -72,30 +63,17 @@ class Transcription(Oracle):
             for side, sign in zip(limits, (-1, 1), strict=True)
         ]
         # the defects of the steps vanish, and h ≤ 0
-        more = 0 if inside is None else horizon.steps * inside.size1_out(0)
+        more = 0 if self.task.inside is None else horizon.steps * self.task.inside.size1_out(0)
         defects = np.zeros(system.n * horizon.steps)
         self._held = [np.concatenate([defects, np.full(more, side)]) for side in (-np.inf, 0.0)]
-
-    def step(self, x: State, u: Control) -> tuple[State, PerState]:
-        """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
-        return self.problem.step(x, u)
-
-    def end(self, x: State) -> tuple[PerState]:
-        """(φ(x_N),)."""
-        return (self.problem.cost.terminal(x),)
-
-    def inside(self, x: State) -> tuple[Tensor]:
-        """(h(x_n),)."""
-        assert self.problem.constraints is not None
-        return (self.problem.constraints(x),)
 
     def rollout(self, x0: State, u: ControlPath) -> tuple[StatePath, PerState]:
         """(x, J_N) under given controls, by the torch system."""
         x, J = [x0], torch.zeros_like(x0[..., 0])
         for control in u:
-            following, step_cost = self.step(x[-1], control)
+            following, step_cost = self.problem.step(x[-1], control)
             x, J = [*x, following], J + step_cost
-        return torch.stack(x), J + self.end(x[-1])[0]
+        return torch.stack(x), J + self.problem.cost.terminal(x[-1])
 
     def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
         """The optima of a batch (b, n): from disk, unless `known` controls cost less than those."""
@@ -217,25 +195,18 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
     return ""
 
 
-def _solver(
-    step: casadi.Function,
-    end: casadi.Function,
-    inside: casadi.Function | None,
-    steps: int,
-    iterations: int,
-    limited: bool,
-) -> casadi.Function:
+def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> casadi.Function:
     """IPOPT for the transcribed task, with exact sparse derivatives.
 
     Variables are (u, x), parameters x₀ and what J is divided by.
     """
-    n, m = step.size1_in(0), step.size1_in(1)
+    n, m = task.step.size1_in(0), task.step.size1_in(1)
     x0, x, u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
-    following, step_cost = step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
-    J = casadi.sum2(step_cost) + end(x[:, -1])
+    following, step_cost = task.step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
+    J = casadi.sum2(step_cost) + task.end(x[:, -1])
     variables, scale = casadi.veccat(u, x), casadi.MX.sym("scale")
     zero = casadi.vec(following - x)
-    held = zero if inside is None else casadi.veccat(zero, inside.map(steps)(x))
+    held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
     problem = {"x": variables, "p": casadi.vertcat(x0, scale), "f": J / scale, "g": held}
     # within the limits themselves, and with a barrier of which nothing is seen in J
     exact = {"ipopt.bound_relax_factor": 0.0, "ipopt.tol": 1e-10} if limited else {}

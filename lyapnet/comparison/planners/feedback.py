@@ -1,0 +1,48 @@
+"""Regulators: feedback around the goal, and around an optimal trajectory from where a closed loop starts."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lyapnet.comparison.planners.planner import LoopLaw, Planner
+from lyapnet.expansions import at_rest, in_float64, optimal_trajectories, path_under, regulator
+from lyapnet.problem import Problem
+
+
+class Regulator(Planner):
+    """LQR: u_n = ū_n + K_n(x − x*) of the task linearised at its goal, for its own horizon; cut to U by the plant."""
+
+    def __init__(self, problem: Problem):
+        self.goal = problem.goal.double().cpu().numpy()
+        self.feedforward, self.gain = (part.numpy() for part in regulator(problem))
+
+    def law(self) -> LoopLaw:
+        return lambda step, x: self.feedforward[step] + self.gain[step] @ (x - self.goal)
+
+
+class IterativeRegulator(Planner):
+    """iLQR, with second derivatives at the end, from x₀ at t = 0; its plan is then followed, the plant being the model.
+
+    It begins with the control that costs nothing, as a user does who knows no better. Its optimisation has converged
+    where the plan is finite.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = in_float64(problem)
+
+    def law(self) -> LoopLaw:
+        plan: list[NDArray] = []
+
+        def control(step: int, x: NDArray) -> NDArray:
+            if not plan:
+                plan.append(self._plan(x))
+            return plan[0][step]
+
+        return control
+
+    def _plan(self, x: NDArray) -> NDArray:
+        x0 = torch.from_numpy(x)[None]
+        idle = path_under(self.problem, at_rest(self.problem), x0)
+        path = optimal_trajectories(self.problem, x0, idle.u).path
+        self.count(bool(path.cost.isfinite()))
+        return np.ascontiguousarray(path.u[:, 0].numpy())

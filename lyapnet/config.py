@@ -31,7 +31,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
-    "rollout": {"policy": "sampled", "gradient": "discrete"},
+    "rollout": {"policy": "sampled", "gradient": "discrete", "costate_limit": 5},
     "training": {
         "iterations": 400,
         "batch_size": 32,
@@ -173,6 +173,9 @@ class RolloutConfig:
     gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
     compile: str = option(
         "auto", "Run gradient discrete as machine code; auto where that earns its compilation.", choices=SWITCH
+    )
+    costate_limit: float | None = option(
+        None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", above=0
     )
     rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
     atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)

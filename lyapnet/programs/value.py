@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from types import MappingProxyType
 
+from jaxtyping import Bool
 from torch import Tensor
 
 from lyapnet.programs.base import Program
@@ -11,6 +12,7 @@ from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
 LEAST = 0.05  # of the mean cost, against which an error of V counts where the cost itself is less
+LOST = 1.5  # times as much as V(0, x₀) promises, the batch's median of which being one: the law is lost there, not V
 
 
 @dataclass(frozen=True)
@@ -18,9 +20,13 @@ class ValueProgram(Program):
     """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244.
 
     The loss has a further term, cost_to_go · D, with D the mean over the nodes of (V_n − J_n)², J_n being what the
-    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly. With
-    `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is then
-    right in relation to what it costs from where that is little, too.
+    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly.
+
+    With `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is
+    then right in relation to what it costs from where that is little, too. And D then leaves out trajectories that cost
+    far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀): what a law that is lost pays is no better
+    guess of the optimum than V. Taken for the truth it would raise V where the way to the goal begins, and lead the
+    laws of the states around away from it, until all of them are lost.
     """
 
     degree = 2
@@ -32,6 +38,8 @@ class ValueProgram(Program):
 
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
         error = cost_to_go_error(values, trajectory.step_cost, trajectory.terminal_cost)
+        if self.relative:
+            error = error.where(~lost(values, trajectory), 0)
         return {**super().per_state(values, trajectory), "cost_to_go": error}
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
@@ -47,3 +55,10 @@ class ValueProgram(Program):
 
     def terminal_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
         return terminal_residual(values, trajectory.terminal_cost)
+
+
+def lost(values: ValuePath, trajectory: Trajectory) -> Bool[Tensor, "*batch"]:
+    """Whether a trajectory costs LOST times as much as V(0, x₀) says, in units of the batch's median of that ratio."""
+    J = trajectory.cost.detach()
+    ratio = J / values[0].detach().maximum(LEAST * J.median())
+    return ratio > LOST * ratio.median().clamp_min(1)

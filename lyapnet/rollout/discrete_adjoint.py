@@ -27,6 +27,7 @@ from lyapnet.types import ControlPath, Jacobians, StagePath, State, StatePath, V
 _LOG = logging.getLogger(__name__)
 Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
 VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
+EVERY = 4  # nodes from one limit of the costates to the next
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 
 
@@ -44,10 +45,13 @@ class DiscreteAdjoint:
         loop: the closed loop.
         steps, dt: N and Δt in s.
         method: a key of TABLEAUX.
+        costate_limit: L; backwards, at each EVERY-th node, the costates of a batch longer than L times their median are
+            cut to that length. None: no limit, and the exact gradient. It is the exact one too where none is so long.
     """
 
-    def __init__(self, loop: ClosedLoop, steps: int, dt: float, method: str):
+    def __init__(self, loop: ClosedLoop, steps: int, dt: float, method: str, costate_limit: float | None = None):
         self.loop, self.steps, self.dt, self.stages = loop, steps, dt, len(TABLEAUX[method].b)
+        self.costate_limit = costate_limit
         self._step, self._linearise = Step(loop, TABLEAUX[method]), Linearise(loop, TABLEAUX[method])
         self._traced: dict[tuple[Any, ...], TracedRoutines] = {}
         self._routines: dict[tuple[Any, ...], Routines] = {}
@@ -143,7 +147,7 @@ class DiscreteAdjoint:
         for start in reversed(range(0, length, K)):
             block = [column[start : start + K] for column in columns]
             transition, source, *intermediate = routines.linearise(*state, *block)
-            costate, after = _run_costate(transition, source, costate)
+            costate, after = _run_costate(transition, source, costate, start, self.costate_limit)
             share = routines.product(*state, *block, after, *intermediate)
             gradient = [total + part for total, part in zip(gradient, share, strict=True)]
         return costate, gradient
@@ -313,15 +317,36 @@ def _read(nodes: Nodes) -> Rolled:
     return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]
 
 
-def _run_costate(transition: Jacobians, source: StatePath, costate: State) -> tuple[State, StatePath]:
-    """λ = Φᵀλ' + source backwards through a block: (λ before its first step, λ' after each of its steps)."""
+def _run_costate(
+    transition: Jacobians, source: StatePath, costate: State, first: int = 0, limit: float | None = None
+) -> tuple[State, StatePath]:
+    """λ = Φᵀλ' + source backwards through a block: (λ before its first step, λ' after each of its steps).
+
+    Args:
+        first: the index of its first node.
+        limit: of the length of λ.
+    """
     K, n = len(source), source.shape[-1]
     transition, source = transition.reshape(K, -1, n, n), source.reshape(K, -1, n, 1)
     after, running = torch.empty_like(source), costate.reshape(-1, n, 1)
     for k in reversed(range(K)):
         after[k] = running
         running = torch.baddbmm(source[k], transition[k], running)
+        if limit is not None and (first + k) % EVERY == 0:
+            running = limited(running.reshape(costate.shape), limit).reshape(running.shape)
     return running.reshape(costate.shape), after.reshape(K, *costate.shape)
+
+
+def limited(costate: State, limit: float) -> State:
+    """Costates (*members, b, n), none longer than `limit` times the median length of its batch.
+
+    The median says how long a costate is where a small change of x is a small change of what follows. Where a closed
+    loop is unstable, or a change of x decides whether the goal is reached, λ grows exponentially backwards, and one
+    such trajectory outweighs all others in the gradient of their mean, while it says little about where to go.
+    """
+    length = torch.linalg.vector_norm(costate, dim=-1, keepdim=True)
+    longest = limit * length.median(-2, keepdim=True).values
+    return costate * (longest / length).clamp_max(1).where(longest > 0, 1)
 
 
 def padded(column: Tensor, length: int) -> Tensor:

@@ -72,11 +72,14 @@ class Rollout(nn.Module):
                 times faster than either, in memory that grows with neither the network nor the graph of the steps.
                 For fixed-step methods.
         rtol, atol: tolerances of adaptive methods.
+        costate_limit: with gradient discrete, times the median of its batch that a costate may be long; None: any, the
+            exact gradient (see DiscreteAdjoint).
         held: whether u is held over each step; None: as the law is made to be.
 
     Raises:
         ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
-            an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler.
+            an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler; or a
+            limit of the costates that is not positive, or of another gradient.
     """
 
     def __init__(
@@ -87,6 +90,7 @@ class Rollout(nn.Module):
         gradient: str = "adjoint",
         rtol: float = 1e-6,
         atol: float = 1e-8,
+        costate_limit: float | None = None,
         held: bool | None = None,
     ):
         super().__init__()
@@ -98,6 +102,10 @@ class Rollout(nn.Module):
             raise ValueError(
                 f"Expected method as one of {', '.join(FIXED_STEP_METHODS)} for gradient discrete, got {method!r}; "
                 "choose one of them, or gradient adjoint."
+            )
+        if costate_limit is not None and not (gradient == "discrete" and costate_limit > 0):
+            raise ValueError(
+                f"Expected a costate_limit > 0 of gradient discrete, got {costate_limit} of {gradient}; leave it out."
             )
         wanted = getattr(policy, "held", False) if held is None else held
         held = bool(wanted) and method in FIXED_STEP_METHODS[1:]  # with Euler steps every law is held
@@ -113,9 +121,10 @@ class Rollout(nn.Module):
         self.solver_arguments: dict[str, Any] = {"method": step, "rtol": rtol, "atol": atol}
         if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
             self.solver_arguments["options"] = {"max_num_steps": 10_000}
-        self.discrete = (
-            DiscreteAdjoint(self.stepped, self.horizon.steps, self.horizon.dt, step) if gradient == "discrete" else None
-        )
+        self.discrete = None
+        if gradient == "discrete":
+            steps, dt = self.horizon.steps, self.horizon.dt
+            self.discrete = DiscreteAdjoint(self.stepped, steps, dt, step, costate_limit)
 
     def forward(self, x0: State) -> Trajectory:
         """The closed loop from x₀ (*batch, n).

@@ -129,6 +129,22 @@ def test_a_relative_distance_counts_against_the_cost_of_its_own_trajectory():
     assert absolute.terms["cost_to_go"] == (0.75 + 1.1875) / 2
 
 
+def test_a_lost_trajectory_does_not_teach_V_what_it_costs():
+    """Its cost is no guess of the optimum: V is held against what the others still pay."""
+    shares = torch.tensor([1.0, 1.1, 0.9, 1.0, 1.0])
+    value = (torch.tensor([10.0, 7.0, 5.0, 1.0])[:, None] * shares).requires_grad_()
+    step_cost, terminal_cost = torch.tensor([3.0, 2.0, 4.0])[:, None] * shares, shares.clone()
+    terminal_cost[4] = 60.0
+    trajectory, program = trajectory_of(value, step_cost, terminal_cost), ValueProgram(0, cost_to_go=1, relative=True)
+    (slope,) = torch.autograd.grad(program(trajectory).loss, value)
+    assert not slope[:, 4].any()
+    (pulled,) = torch.autograd.grad(ValueProgram(0, cost_to_go=1)(trajectory).loss, value)
+    assert (pulled[:, 4] < 0).all(), "without `relative` it is"
+    low = (0.1 * value.detach()).requires_grad_()
+    (slope,) = torch.autograd.grad(program(trajectory_of(low, step_cost, terminal_cost)).loss, low)
+    assert (slope[:, :4] < 0).all(), "a V that is too low everywhere finds none of them lost"
+
+
 @programs
 @pytest.mark.parametrize("name", TERMS)
 def test_a_weight_of_zero_leaves_a_term_out(program, name):

@@ -1,0 +1,93 @@
+"""The limit of the costates: what it cuts, what it leaves alone to the last bit, and each member's own median."""
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.build import build_rollout, build_value_function
+from lyapnet.build.problem import build_problem
+from lyapnet.config import load_config
+from lyapnet.policy import HJBPolicy
+from lyapnet.rollout import Rollout
+from lyapnet.rollout.discrete_adjoint import limited
+from tests.problems import CONF, untrained
+
+
+@pytest.fixture
+def pendulum():
+    """limit ↦ the closed loop of a pendulum whose V has random weights."""
+    controller = untrained("pendulum_swingup", "horizon.steps=30", "network.hidden=[8, 8]", "network.name=fcn")
+    policy = HJBPolicy(controller.problem, controller.V.requires_grad_())
+    return lambda limit: Rollout(controller.problem, policy, "euler", "discrete", costate_limit=limit)
+
+
+def slopes(rollout, x0):
+    """∂ mean J / ∂ x₀, and by the weights of V."""
+    leaf = x0.clone().requires_grad_()
+    leaves = [leaf, *(p for p in rollout.parameters() if p.requires_grad)]
+    of_x0, *rest = torch.autograd.grad(rollout(leaf).cost.mean(), leaves, allow_unused=True, materialize_grads=True)
+    return of_x0, rest
+
+
+def test_by_hand():
+    costate = torch.tensor([[1.0, 0.0], [0.0, -2.0], [3.0, 0.0], [30.0, 40.0]])
+    cut = limited(costate, 5.0)
+    assert_close(cut[:3], costate[:3], rtol=0, atol=0)
+    assert_close(cut[3], torch.tensor([6.0, 8.0]))  # the lower median is 2
+    assert_close(limited(costate, 25.0), costate, rtol=0, atol=0)
+    both = torch.stack([costate, 100 * costate])
+    assert_close(limited(both, 5.0), torch.stack([cut, 100 * cut]))
+    resting = torch.tensor([[0.0, 0.0], [0.0, 0.0], [7.0, 0.0]])
+    assert_close(limited(resting, 5.0), resting, rtol=0, atol=0)
+
+
+def test_costates_of_one_size_are_left_as_they_are(pendulum):
+    x0 = torch.tensor([[0.3, 0.1], [0.31, 0.1], [0.3, 0.11], [0.29, 0.1]])
+    (exact, weights), (cut, same) = (slopes(pendulum(limit), x0) for limit in (None, 5.0))
+    assert_close(cut, exact, rtol=0, atol=0)
+    assert all(torch.equal(one, other) for one, other in zip(weights, same, strict=True))
+
+
+def test_long_ones_are_cut_to_a_multiple_of_the_median(pendulum):
+    x0 = torch.tensor([[2.9, 0.0], [3.1, 0.1], [3.0, 0.0], [0.01, 0.0]])
+    (exact, weights), (cut, _), (_, less) = (slopes(pendulum(limit), x0) for limit in (None, 1.2, 0.5))
+    length, shorter = exact.norm(dim=1), cut.norm(dim=1)
+    assert length.max() > 2 * length.median(), "else there is nothing to cut"
+    assert shorter.max() <= 1.2 * shorter.median() * (1 + 1e-12)
+    assert sum(p.norm() for p in less) < sum(p.norm() for p in weights)
+
+
+@pytest.mark.parametrize("traced", [True], ids=["traced"])
+def test_members_have_medians_of_their_own(pendulum):
+    rollout = pendulum(2.0)
+    near, far = (
+        torch.tensor([[0.01, 0.0], [0.012, 0.0], [2.5, 3.0]]),
+        torch.tensor([[2.0, 1.0], [2.2, 1.0], [0.01, 0.0]]),
+    )
+    assert rollout.discrete.trained()
+    theta = [torch.stack([p, 1.1 * p]).detach().requires_grad_() for p in rollout.discrete.trained()]
+    leaf = torch.stack([near, far]).requires_grad_()
+    together = sum(trajectory.cost.mean() for trajectory in rollout.together(leaf, theta))
+    gradient = torch.autograd.grad(together, [leaf, *theta])
+    for k, x0 in enumerate((near, far)):
+        for parameter, own in zip(rollout.discrete.trained(), theta, strict=True):
+            parameter.data.copy_(own[k].detach())
+        of_x0, of_weights = slopes(rollout, x0)
+        assert_close(gradient[0][k], of_x0, rtol=1e-9, atol=1e-12)
+        for mine, alone in zip(gradient[1:], of_weights, strict=True):
+            assert_close(mine[k], alone, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize(("gradient", "limit"), [("adjoint", 5.0), ("backprop", 5.0), ("discrete", 0.0)])
+def test_a_limit_without_meaning_is_refused(gradient, limit, pendulum):
+    rollout = pendulum(None)
+    with pytest.raises(ValueError, match="costate_limit > 0 of gradient discrete"):
+        Rollout(rollout.problem, rollout.closed_loop.policy, "euler", gradient, costate_limit=limit)
+
+
+@pytest.mark.parametrize(("gradient", "expected"), [("discrete", 5.0), ("adjoint", None)])
+def test_the_recipe_has_one_where_there_is_a_discrete_costate(gradient, expected):
+    config = load_config(CONF / "pendulum_swingup.yaml", [f"rollout.gradient={gradient}", "horizon.steps=5"])
+    problem = build_problem(config)
+    rollout = build_rollout(config, problem, build_value_function(config, problem))
+    assert (rollout.discrete and rollout.discrete.costate_limit) == expected

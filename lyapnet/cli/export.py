@@ -24,6 +24,7 @@ def export(
     checkpoint: Checkpoint,
     to: Annotated[str, typer.Option(help="c, onnx or torch.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
+    name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
     beyond: Annotated[str, typer.Option(help="The law after T: hold, receding or riccati.")] = "hold",
     system: System = None,
     network: Network = None,
@@ -53,7 +54,7 @@ def export(
     ).continued(beyond)
     notes = Console(highlight=False, markup=False)
     with notes.status("writing and verifying …"):
-        paths, agreement = write(controller, out, to, checkpoint)
+        paths, agreement = write(controller, out, to, checkpoint, name)
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)

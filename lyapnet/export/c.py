@@ -18,51 +18,54 @@ from lyapnet.graphs.c_text import Tables, literal
 
 FLAGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
 FAST = ("-std=c99", "-O3")
+NAME = "lyapnet"  # what names begin with, unless told otherwise
 
 
-def sources(controller: Controller, law: Law, about: Mapping[str, str]) -> dict[str, str]:
+def sources(controller: Controller, law: Law, about: Mapping[str, str], name: str = NAME) -> dict[str, str]:
     """File name ↦ text.
 
     Args:
         about: what is exported, for the comment at the top.
+        name: what the names of its functions and macros begin with: an identifier of C.
 
     Raises:
         ExportError: an operation has no rule in C; or the law is too large for a stack.
     """
-    tables, arrays = Tables(), "".join(f"const double *{name}, " for name in law.arguments)
+    tables, arrays = Tables(), "".join(f"const double *{argument}, " for argument in law.arguments)
     functions, stack = zip(
         *(
-            c_function(f"static void {name}_of({arrays}double *y)", graph, law.arguments, ["y"], tables)
-            for name, graph in (("control", law.control), ("value", law.value))
+            c_function(f"static void {result}_of({arrays}double *y)", graph, law.arguments, ["y"], tables)
+            for result, graph in (("control", law.control), ("value", law.value))
         ),
         strict=True,
     )
     lines = "\n   ".join(f"{key}: {value}" for key, value in {**about, "stack": f"{max(stack)} bytes"}.items())
     comment = "/* " + lines.replace("*/", "* /").replace("/*", "/ *") + " */\n"
-    parameter = ", const double p[LYAPNET_PARAMETERS]" if "p" in law.arguments else ""
-    control = f"void lyapnet_control(double t, const double x[LYAPNET_STATES]{parameter}, double u[LYAPNET_CONTROLS])"
-    value = f"double lyapnet_value(double t, const double x[LYAPNET_STATES]{parameter})"
-    given = ", ".join("&t" if name == "t" else name for name in law.arguments)
+    macro = name.upper()
+    parameter = f", const double p[{macro}_PARAMETERS]" if "p" in law.arguments else ""
+    control = f"void {name}_control(double t, const double x[{macro}_STATES]{parameter}, double u[{macro}_CONTROLS])"
+    value = f"double {name}_value(double t, const double x[{macro}_STATES]{parameter})"
+    given = ", ".join("&t" if argument == "t" else argument for argument in law.arguments)
     entries = (
         f"{control}\n{{\n    control_of({given}, u);\n}}\n\n"
         f"{value}\n{{\n    double V[1];\n    value_of({given}, V);\n    return V[0];\n}}\n"
     )
     code, includes = "\n".join(functions), '#include "policy.h"\n\n#include <math.h>\n'
     return {
-        "policy.h": comment + _header(controller, law, control, value),
+        "policy.h": comment + _header(controller, law, macro, control, value),
         "policy.c": "\n".join([comment + includes, *helpers(code), *tables.text, code, entries]),
-        "main.c": _example(law),
-        "CMakeLists.txt": CMAKE,
+        "main.c": _example(law, name),
+        "CMakeLists.txt": CMAKE.replace("@", "policy" if name == NAME else f"{name}_policy"),
     }
 
 
-def _header(controller: Controller, law: Law, control: str, value: str) -> str:
+def _header(controller: Controller, law: Law, macro: str, control: str, value: str) -> str:
     sizes = {"STATES": len(law.arguments["x"]), "CONTROLS": controller.system.m}
     if "p" in law.arguments:
         sizes["PARAMETERS"] = len(law.arguments["p"])
-    defines = "".join(f"#define LYAPNET_{name} {size}\n" for name, size in sizes.items())
+    defines = "".join(f"#define {macro}_{name} {size}\n" for name, size in sizes.items())
     return (
-        f"#ifndef LYAPNET_POLICY_H\n#define LYAPNET_POLICY_H\n\n{defines}\n"
+        f"#ifndef {macro}_POLICY_H\n#define {macro}_POLICY_H\n\n{defines}\n"
         f'#ifdef __cplusplus\nextern "C" {{\n#endif\n\n/* u(t, x) */\n{control};\n\n/* V(t, x) */\n{value};\n\n'
         "#ifdef __cplusplus\n}\n#endif\n\n#endif\n"
     )
@@ -70,29 +73,31 @@ def _header(controller: Controller, law: Law, control: str, value: str) -> str:
 
 YOURS = ("main.c", "CMakeLists.txt")  # which are left as they are where they exist
 CMAKE = """cmake_minimum_required(VERSION 3.10)
-project(policy C)
+project(@ C)
 set(CMAKE_C_STANDARD 99)
 if(NOT CMAKE_BUILD_TYPE)
   set(CMAKE_BUILD_TYPE Release)
 endif()
-add_library(policy policy.c)
-target_include_directories(policy PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
-target_link_libraries(policy PUBLIC m)
-add_executable(main main.c)
-target_link_libraries(main policy)
-"""
+add_library(@ policy.c)
+target_include_directories(@ PUBLIC ${CMAKE_CURRENT_SOURCE_DIR})
+target_link_libraries(@ PUBLIC m)
+if(CMAKE_SOURCE_DIR STREQUAL CMAKE_CURRENT_SOURCE_DIR)
+  add_executable(main main.c)
+  target_link_libraries(main @)
+endif()
+"""  # @: the library; as a part of another project it is that alone
 
 
-def _example(law: Law) -> str:
+def _example(law: Law, name: str) -> str:
     """A program that asks for u and V at a state of X₀."""
-    lists = {name: ", ".join(map(literal, law.arguments[name].tolist())) for name in law.arguments if name != "t"}
-    arrays = "".join(f"    const double {name}[] = {{{numbers}}};\n" for name, numbers in lists.items())
-    given = ", ".join(lists)
+    lists = {one: ", ".join(map(literal, law.arguments[one].tolist())) for one in law.arguments if one != "t"}
+    arrays = "".join(f"    const double {one}[] = {{{numbers}}};\n" for one, numbers in lists.items())
+    given, controls = ", ".join(lists), f"{name.upper()}_CONTROLS"
     return (
         '#include <stdio.h>\n#include "policy.h"\n\nint main(void)\n{\n'
-        f"{arrays}    double u[LYAPNET_CONTROLS];\n    lyapnet_control(0.0, {given}, u);\n"
-        f'    for (int i = 0; i < LYAPNET_CONTROLS; i++) printf("u[%d] = %g\\n", i, u[i]);\n'
-        f'    printf("V = %g\\n", lyapnet_value(0.0, {given}));\n    return 0;\n}}\n'
+        f"{arrays}    double u[{controls}];\n    {name}_control(0.0, {given}, u);\n"
+        f'    for (int i = 0; i < {controls}; i++) printf("u[%d] = %g\\n", i, u[i]);\n'
+        f'    printf("V = %g\\n", {name}_value(0.0, {given}));\n    return 0;\n}}\n'
     )
 
 
@@ -119,12 +124,13 @@ class CompiledLaw:
         law: of which it is.
         controls: m.
         options: for the compiler.
+        name: as in `sources`.
 
     Raises:
         ExportError: as compile_c.
     """
 
-    def __init__(self, folder: Path, law: Law, controls: int, options: Sequence[str]):
+    def __init__(self, folder: Path, law: Law, controls: int, options: Sequence[str], name: str = NAME):
         with tempfile.TemporaryDirectory() as place:
             library = Path(place) / "policy.so"
             compile_c([folder / "policy.c"], library, [*options, "-shared", "-fPIC"])
@@ -132,7 +138,7 @@ class CompiledLaw:
         self.parameters = len(law.arguments.get("p", ()))
         self.states, self.controls = len(law.arguments["x"]), controls
         arrays = [ctypes.c_void_p] * (len(law.arguments) - 1)
-        self._control, self._value = functions.lyapnet_control, functions.lyapnet_value
+        self._control, self._value = functions[f"{name}_control"], functions[f"{name}_value"]
         self._control.argtypes, self._control.restype = [ctypes.c_double, *arrays, ctypes.c_void_p], None
         self._value.argtypes, self._value.restype = [ctypes.c_double, *arrays], ctypes.c_double
 

@@ -1,5 +1,6 @@
 """Writing a controller's law: traced, written, held against the controller, and only then kept."""
 
+import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +29,9 @@ class Exported(NamedTuple):
     agreement: Agreement
 
 
-def export(controller: Controller, path: str | Path, to: str, checkpoint: Path | None = None) -> Exported:
+def export(
+    controller: Controller, path: str | Path, to: str, checkpoint: Path | None = None, name: str = c.NAME
+) -> Exported:
     """Write u(t, x) and V(t, x) of a controller for use without lyapnet.
 
     Limits, target, parameters of a family and what follows T are inside; t below 0 counts as 0. What is written is run
@@ -39,22 +42,24 @@ def export(controller: Controller, path: str | Path, to: str, checkpoint: Path |
         to: a key of FORMATS: c, C99 without a library; onnx, a model (t, x[, p]) ↦ (u, V) of one state; torch, the
             same for torch.export.load.
         checkpoint: that the controller was loaded from, whose digest is then noted.
+        name: what the names in C begin with: several laws in one program need several.
 
     Raises:
-        UsageError: another format, or a place that cannot be written to.
+        UsageError: another format, a place that cannot be written to, or a name that is none in C.
         ExportError: the law cannot be written in it, or what was written is not that law.
     """
     path = Path(path)
     _require_place(path, to)
+    _require_name(name, to)
     about, law = _about(controller, checkpoint), Law(controller)
     try:
         place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
     except OSError as error:
         raise UsageError(f"Expected a place that can be written to, got {str(path)!r} ({error.strerror}).") from error
-    with place as name:
-        draft = Path(name)
+    with place as folder:
+        draft = Path(folder)
         if to == "c":
-            return _write_c(controller, law, about, draft, path)
+            return _write_c(controller, law, about, draft, path, name)
         make, write, run = PROGRAMS[to]
         made, file = make(law), draft / path.name
         write(made, file, about)
@@ -77,13 +82,21 @@ def compiled(controller: Controller) -> c.CompiledLaw:
 
 
 def _verified(
-    controller: Controller, law: Law, about: dict[str, str], folder: Path, options: Sequence[str]
+    controller: Controller, law: Law, about: dict[str, str], folder: Path, options: Sequence[str], name: str = c.NAME
 ) -> tuple[c.CompiledLaw, Agreement]:
     """The C of a law written into a folder, compiled, and held against the controller."""
-    for name, text in c.sources(controller, law, about).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    compiled_law = c.CompiledLaw(folder, law, controller.system.m, options)
+    for file, text in c.sources(controller, law, about, name).items():
+        (folder / file).write_text(text, encoding="utf-8")
+    compiled_law = c.CompiledLaw(folder, law, controller.system.m, options, name)
     return compiled_law, verify(controller, compiled_law.of_many)
+
+
+def _require_name(name: str, to: str) -> None:
+    """Refuse what cannot begin a name in C, and a name where there are none."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
+    if to != "c" and name != c.NAME:
+        raise UsageError(f"Expected no name for {to}, got {name!r}; the names in C alone have one.")
 
 
 def _require_place(path: Path, to: str) -> None:
@@ -107,14 +120,14 @@ def _require_place(path: Path, to: str) -> None:
         raise UsageError(f"Expected a new folder, or that of an earlier export, got {str(path)!r}; choose another.")
 
 
-def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Path, folder: Path) -> Exported:
+def _write_c(controller: Controller, law: Law, about: dict[str, str], draft: Path, folder: Path, name: str) -> Exported:
     """The files of a C library; in a folder that has them, those of the law alone."""
-    _, agreement = _verified(controller, law, about, draft, c.FLAGS)
+    _, agreement = _verified(controller, law, about, draft, c.FLAGS, name)
     folder.mkdir(exist_ok=True)
     paths = []
-    for name, text in c.sources(controller, law, {**about, "verified": str(agreement)}).items():
-        if name not in c.YOURS or not (folder / name).exists():
-            paths.append(folder / name)
+    for file, text in c.sources(controller, law, {**about, "verified": str(agreement)}, name).items():
+        if file not in c.YOURS or not (folder / file).exists():
+            paths.append(folder / file)
             write_atomically(paths[-1], text.encode())
     return Exported(paths, agreement)
 

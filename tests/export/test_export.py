@@ -220,6 +220,51 @@ def test_files_of_the_users_own_are_kept(tmp_path):
     assert (folder / "policy.h").read_text() == "mine"
 
 
+BOTH = """#include <stdio.h>
+#include "{0}/policy.h"
+#include "{1}/policy.h"
+int main(void)
+{{
+    const double x[{2}_STATES] = {{0.3, -0.2}};
+    printf("%.17g %.17g\\n", {3}_value(0.0, x), {4}_value(0.0, x));
+    return 0;
+}}
+"""
+
+
+@needs_compiler
+def test_one_program_has_several_laws_by_name(tmp_path):
+    controllers = {name: untrained("double_integrator", *SHORT, f"seed={k}") for k, name in enumerate(("arm", "leg"))}
+    for name, controller in controllers.items():
+        export(controller, tmp_path / name, "c", name=name)
+    assert "add_library(arm_policy policy.c)" in (tmp_path / "arm" / "CMakeLists.txt").read_text()
+    done = built_together(tmp_path, "arm", "leg", "ARM", "arm", "leg")
+    assert not done.returncode, done.stderr
+    printed = subprocess.run([str(tmp_path / "both")], capture_output=True, text=True, check=True).stdout.split()
+    values = [float(controller.value(0.0, [0.3, -0.2])) for controller in controllers.values()]
+    assert [float(V) for V in printed] == pytest.approx(values, rel=1e-9)
+    for name, controller in controllers.items():
+        export(controller, tmp_path / f"{name}_too", "c")
+    again = built_together(tmp_path, "arm_too", "leg_too", "LYAPNET", "lyapnet", "lyapnet")
+    assert "lyapnet_control" in again.stderr, "by one name they are defined twice"
+
+
+def built_together(folder, *names):
+    """What the compiler says to a program that asks two laws."""
+    (folder / "both.c").write_text(BOTH.format(*names))
+    sources = [str(folder / "both.c"), *(str(folder / name / "policy.c") for name in names[:2])]
+    command = ["cc", "-std=c99", f"-I{folder}", "-o", str(folder / "both"), *sources, "-lm"]
+    return subprocess.run(command, check=False, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(("name", "to"), [("Arm", "c"), ("4bar", "c"), ("a-b", "c"), ("", "c"), ("arm", "torch")])
+def test_a_name_that_is_none_is_refused(name, to, tmp_path):
+    place = tmp_path / ("law" if to == "c" else "law.pt2")
+    with pytest.raises(UsageError, match=r"Expected (a|no) name"):
+        export(own_controller(reads=False), place, to, name=name)
+    assert not place.exists()
+
+
 @needs_compiler
 def test_names_do_not_get_out_of_their_comment(tmp_path):
     export(own_controller(reads=False), tmp_path / "law", "c")

@@ -23,10 +23,10 @@ class ValueProgram(Program):
     closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly.
 
     With `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is
-    then right in relation to what it costs from where that is little, too. And D then leaves out trajectories that cost
-    far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀): what a law that is lost pays is no better
-    guess of the optimum than V. Taken for the truth it would raise V where the way to the goal begins, and lead the
-    laws of the states around away from it, until all of them are lost.
+    then right in relation to what it costs from where that is little, too. And D then has no gradient of trajectories
+    that cost far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀): what a law that is lost pays is
+    no better guess of the optimum than V. Taken for the truth it would raise V where the way to the goal begins, and
+    lead the laws of the states around away from it, until all of them are lost.
     """
 
     degree = 2
@@ -39,7 +39,7 @@ class ValueProgram(Program):
     def per_state(self, values: ValuePath, trajectory: Trajectory) -> dict[str, PerState]:
         error = cost_to_go_error(values, trajectory.step_cost, trajectory.terminal_cost)
         if self.relative:
-            error = error.where(~lost(values, trajectory), 0)
+            error = error.where(~lost(values, trajectory), error.detach())
         return {**super().per_state(values, trajectory), "cost_to_go": error}
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:

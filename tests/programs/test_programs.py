@@ -138,6 +138,8 @@ def test_a_lost_trajectory_does_not_teach_V_what_it_costs():
     trajectory, program = trajectory_of(value, step_cost, terminal_cost), ValueProgram(0, cost_to_go=1, relative=True)
     (slope,) = torch.autograd.grad(program(trajectory).loss, value)
     assert not slope[:, 4].any()
+    error, cost = cost_to_go_error(value, step_cost, terminal_cost), trajectory.cost
+    assert_close(program(trajectory).loss, (error / cost**2).mean(), msg="it counts all the same")
     (pulled,) = torch.autograd.grad(ValueProgram(0, cost_to_go=1)(trajectory).loss, value)
     assert (pulled[:, 4] < 0).all(), "without `relative` it is"
     low = (0.1 * value.detach()).requires_grad_()

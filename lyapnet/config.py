@@ -175,7 +175,7 @@ class RolloutConfig:
         "auto", "Run gradient discrete as machine code; auto where that earns its compilation.", choices=SWITCH
     )
     costate_limit: float | None = option(
-        None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", above=0
+        None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", at_least=1
     )
     rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
     atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
@@ -295,12 +295,20 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     recipe = dict(STANDARD)
     if _names_constraints(content.get("constraints") or {}, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
+    if _gradient(sections.get("rollout", {}), overrides) != STANDARD["rollout"]["gradient"]:
+        recipe["rollout"] = {key: value for key, value in recipe["rollout"].items() if key != "costate_limit"}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     program = standard["program"]
     named = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))]
     known = PROGRAMS.get(str(named[-1]))
     weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **program}}
+
+
+def _gradient(rollout: Mapping[str, Any], overrides: Sequence[str]) -> str:
+    """The route that a file or the command line asks for, the recipe's if none."""
+    given = [each.partition("=")[2] for each in overrides if each.startswith("rollout.gradient=")]
+    return str([rollout.get("gradient", STANDARD["rollout"]["gradient"]), *given][-1])
 
 
 def _names_constraints(section: Mapping[str, Any], overrides: Sequence[str]) -> bool:

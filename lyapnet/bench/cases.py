@@ -31,8 +31,8 @@ class Case(NamedTuple):
     program: Program
 
     def rollout(self, gradient: str, V: ValueFunction | None = None, **options: Any) -> Rollout:
-        """The closed loop with that rollout.gradient, and further options of the config's section."""
-        section = replace(self.config.rollout, gradient=gradient, **options)
+        """The closed loop with that rollout.gradient, costates of any length, and further options of its section."""
+        section = replace(self.config.rollout, gradient=gradient, costate_limit=None, **options)
         return build_rollout(replace(self.config, rollout=section), self.problem, self.V if V is None else V)
 
     def gradient(self, rollout: Rollout, x0: State) -> Sequence[Tensor]:

@@ -74,10 +74,11 @@ def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout
             f"Expected rollout.gradient=discrete for rollout.compile=on, got {options.gradient}; only that route "
             "compiles: take it, or leave compile at auto."
         )
-    limit = options.costate_limit if options.gradient == "discrete" else None
     with section("rollout"):
-        policy = POLICIES[options.policy](problem, V)
-        return Rollout(problem, policy, options.method, options.gradient, options.rtol, options.atol, limit)
+        return Rollout(
+            problem, POLICIES[options.policy](problem, V), options.method, options.gradient, options.rtol, options.atol,
+            options.costate_limit,
+        )  # fmt: skip
 
 
 def build_program(config: Config) -> Program:

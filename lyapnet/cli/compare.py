@@ -108,7 +108,7 @@ def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console:
     from lyapnet.comparison.statistics import compared
     from lyapnet.tables import terminal
 
-    jobs = list({job.name: job for job in (*jobs_of(config), *chosen, *begun_jobs(config))}.values())
+    jobs = list({job.name: job for job in (*jobs_of(config, check=False), *chosen, *begun_jobs(config))}.values())
     finished = [result for job in jobs if (result := job.result) is not None]
     results = with_cold_compilation(with_common_optima(finished))
     if not results:

@@ -15,7 +15,7 @@ from lyapnet.build import parts_of
 from lyapnet.comparison.baselines.training import BaselineTraining, best_policy
 from lyapnet.comparison.controller_policy import ControllerPolicy
 from lyapnet.comparison.plan import RESULT, Job
-from lyapnet.comparison.planners import PlannerPolicy
+from lyapnet.comparison.planners import PlannerPolicy, planner_of
 from lyapnet.comparison.results import OURS, PLANNED, ControlTimes, Measurement, Result
 from lyapnet.comparison.scoring import Costs, costs_of, optima_of
 from lyapnet.comparison.sweep.points import Point
@@ -175,10 +175,11 @@ def _baseline(job: Job, console: Console) -> Result:
 
 
 def _planner(job: Job, console: Console) -> Result:
+    bounded, states = job.bounded, _states(job)
     began = time.process_time()
-    policy, states = PlannerPolicy(job.planner, job.bounded), _states(job)
+    policy = PlannerPolicy(planner_of(job.method, bounded.problem), bounded)
     prepared = time.process_time() - began
-    costs = costs_of(policy, job.bounded, True, states)
+    costs = costs_of(policy, bounded, True, states)
     console.print(f"{job.name}: mean cost {float(costs.cost.mean()):.4g}", soft_wrap=True)
     return _result(
         job, states, costs, "", [], seconds=prepared, times=policy.times, unsolved_fraction=policy.unsolved_fraction

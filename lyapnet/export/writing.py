@@ -50,7 +50,7 @@ def export(
     """
     path = Path(path)
     _require_place(path, to)
-    _require_name(name, to)
+    _require_name(name, to, path)
     about, law = _about(controller, checkpoint), Law(controller)
     try:
         place = tempfile.TemporaryDirectory(dir=path.parent, prefix=".export_")
@@ -91,12 +91,18 @@ def _verified(
     return compiled_law, verify(controller, compiled_law.of_many)
 
 
-def _require_name(name: str, to: str) -> None:
-    """Refuse what cannot begin a name in C, and a name where there are none."""
+def _require_name(name: str, to: str, path: Path) -> None:
+    """Refuse what cannot begin a name in C, a name where there are none, and another one than an earlier export's."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise UsageError(f"Expected a name of small letters, digits and _, a letter first, got {name!r}.")
     if to != "c" and name != c.NAME:
         raise UsageError(f"Expected no name for {to}, got {name!r}; the names in C alone have one.")
+    header = path / "policy.h"
+    if to == "c" and header.is_file() and f" {name}_control(" not in header.read_text(encoding="utf-8"):
+        raise UsageError(
+            f"Expected a name as in {str(header)!r}, whose main.c and CMakeLists.txt stay, got {name!r}; "
+            "give the same, or another folder."
+        )
 
 
 def _require_place(path: Path, to: str) -> None:

@@ -24,9 +24,9 @@ class ValueProgram(Program):
 
     With `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is
     then right in relation to what it costs from where that is little, too. And D then has no gradient of trajectories
-    that cost far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀): what a law that is lost pays is
-    no better guess of the optimum than V. Taken for the truth it would raise V where the way to the goal begins, and
-    lead the laws of the states around away from it, until all of them are lost.
+    that cost far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀), 1 at the least: what a law that
+    is lost pays is no better guess of the optimum than V. Taken for the truth it would raise V where the way to the
+    goal begins, and lead the laws of the states around away from it, until all of them are lost.
     """
 
     degree = 2

@@ -79,7 +79,7 @@ class Rollout(nn.Module):
     Raises:
         ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
             an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler; or a
-            limit of the costates that is not positive, or of another gradient.
+            limit of the costates below 1, or of another gradient.
     """
 
     def __init__(
@@ -103,9 +103,9 @@ class Rollout(nn.Module):
                 f"Expected method as one of {', '.join(FIXED_STEP_METHODS)} for gradient discrete, got {method!r}; "
                 "choose one of them, or gradient adjoint."
             )
-        if costate_limit is not None and not (gradient == "discrete" and costate_limit > 0):
+        if costate_limit is not None and not (gradient == "discrete" and costate_limit >= 1):
             raise ValueError(
-                f"Expected a costate_limit > 0 of gradient discrete, got {costate_limit} of {gradient}; leave it out."
+                f"Expected a costate_limit ≥ 1 of gradient discrete, got {costate_limit} of {gradient}; leave it out."
             )
         wanted = getattr(policy, "held", False) if held is None else held
         held = bool(wanted) and method in FIXED_STEP_METHODS[1:]  # with Euler steps every law is held

@@ -80,6 +80,25 @@ def test_the_whole_comparison(tmp_path):
     require_complete(tmp_path, compared(tmp_path, "--workers", "2"), tasks, LEARNED, unclipped=3)
 
 
+def test_planners_stand_beside_what_learns(smoke):
+    said = compared(smoke[0], "--tasks", "double_integrator", "--methods", "lqr,mpc_100", "--workers", "2")
+    assert said.returncode == 0, said.stderr
+    for name in ("LQR", "MPC (100 % of T)", "lyapnet", "PPO (tuned)"):
+        assert name in said.stdout
+    by_method = {result.method: result for result in results_of(smoke[0])}
+    for method in ("lqr", "mpc_100"):
+        result = by_method[method]
+        assert result.costs == pytest.approx(result.optima, rel=1e-6), "a linear task within its box"
+        assert result.times
+        assert 0 < result.times.median <= result.times.most
+        assert not result.curve
+    assert by_method["lyapnet"].times
+    report = smoke[0] / "logs" / "compare_smoke" / "report"
+    rows = (report / "alternatives.csv").read_text().splitlines()
+    assert len(rows) == 1 + len(by_method)
+    assert "## Costs" in (report / "report.md").read_text(encoding="utf-8")
+
+
 @pytest.fixture
 def compare(smoke, monkeypatch, capsys):
     """Arguments of the same comparison, in this process ↦ (status, output, errors)."""

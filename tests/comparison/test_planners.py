@@ -74,19 +74,32 @@ def test_an_optimal_trajectory_from_where_it_starts():
     policy, ratio = scored("ilqr", task("reacher", "horizon.steps=20", "horizon.dt=0.05"), states=2)
     torch.testing.assert_close(ratio, torch.ones_like(ratio), rtol=1e-3, atol=0)
     assert policy.times.first > 20 * policy.times.median, "it plans once"
-    assert policy.unsolved_fraction == 0
 
 
-def test_limits_are_kept_to_the_last_bit(monkeypatch):
+def test_mpc_knows_the_limits_and_lqr_does_not():
     bounded = task("pendulum_limited", "horizon.steps=30", "horizon.dt=0.1", scale=20.0)
-    given, step = [], bounded.problem.step
-    monkeypatch.setattr(bounded.problem, "step", lambda x, u: (given.append(u), step(x, u))[1])
+    asked = {}
     for method in ("lqr", "mpc_25"):
-        policy = PlannerPolicy(planner_of(method, bounded.problem), bounded)
-        given.clear()
-        costs_of(policy, bounded, True, bounded.problem.initial_states.sample(2).double())
-        assert len(given) == 30
-        assert 7.9 < max(float(u.abs().max()) for u in given) <= 8.0
+        law = planner_of(method, bounded.problem).law()
+        asked[method] = max(abs(float(law(n, np.array([2.9, 0.1]))[0])) for n in range(30))
+    assert 7.9 < asked["mpc_25"] < 8.0001
+    assert asked["lqr"] > 8.0
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("cartpole_swingup", ["controls={lower: -12, upper: 12}"]),  # hundreds of iterations at the first step
+        ("planar_quadrotor", ["horizon.steps=20"]),  # two steps would be a tenth of the horizon
+    ],
+)
+def test_what_takes_long_or_is_short_converges(name, overrides):
+    bounded = task(name, *overrides)
+    planner = planner_of("mpc_100" if "swingup" in name else "mpc_10", bounded.problem)
+    law, x0 = planner.law(), bounded.problem.initial_states.sample(1, torch.Generator().manual_seed(3))[0].double()
+    for n in range(3):
+        law(n, x0.numpy())
+    assert (planner.solved, planner.unsolved) == (3, 0)
 
 
 def test_what_does_not_converge_is_counted_and_goes_on(monkeypatch):

@@ -245,6 +245,8 @@ def test_one_program_has_several_laws_by_name(tmp_path):
     assert [float(V) for V in printed] == pytest.approx(values, rel=1e-9)
     for name, controller in controllers.items():
         export(controller, tmp_path / f"{name}_too", "c")
+    with pytest.raises(UsageError, match="a name as in"):
+        export(controllers["leg"], tmp_path / "arm", "c", name="leg")
     again = built_together(tmp_path, "arm_too", "leg_too", "LYAPNET", "lyapnet", "lyapnet")
     assert "lyapnet_control" in again.stderr, "by one name they are defined twice"
 

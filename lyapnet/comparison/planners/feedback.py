@@ -5,12 +5,12 @@ import torch
 from numpy.typing import NDArray
 
 from lyapnet.comparison.planners.planner import LoopLaw, Planner
-from lyapnet.expansions import at_rest, in_float64, optimal_trajectories, path_under, regulator
+from lyapnet.expansions import at_rest, greedy_law, in_float64, optimal_trajectories, path_under, regulator, riccati
 from lyapnet.problem import Problem
 
 
 class Regulator(Planner):
-    """LQR: u_n = ū_n + K_n(x − x*) of the task linearised at its goal, for its own horizon; cut to U by the plant."""
+    """LQR: u_n = ū_n + K_n(x − x*) of the task linearised at its goal, for its own horizon; U is not known to it."""
 
     def __init__(self, problem: Problem):
         self.goal = problem.goal.double().cpu().numpy()
@@ -23,12 +23,11 @@ class Regulator(Planner):
 class IterativeRegulator(Planner):
     """iLQR, with second derivatives at the end, from x₀ at t = 0; its plan is then followed, the plant being the model.
 
-    It begins with the control that costs nothing, as a user does who knows no better. Its optimisation has converged
-    where the plan is finite.
+    It is begun twice, with the control that costs nothing and with LQR's, and the cheaper of the two plans is taken.
     """
 
     def __init__(self, problem: Problem):
-        self.problem = in_float64(problem)
+        self.problem, self.linear = in_float64(problem), riccati(problem)
 
     def law(self) -> LoopLaw:
         plan: list[NDArray] = []
@@ -42,7 +41,7 @@ class IterativeRegulator(Planner):
 
     def _plan(self, x: NDArray) -> NDArray:
         x0 = torch.from_numpy(x)[None]
-        idle = path_under(self.problem, at_rest(self.problem), x0)
-        path = optimal_trajectories(self.problem, x0, idle.u).path
-        self.count(bool(path.cost.isfinite()))
-        return np.ascontiguousarray(path.u[:, 0].numpy())
+        laws = at_rest(self.problem), greedy_law(self.problem, self.linear)
+        u = torch.cat([path_under(self.problem, law, x0).u for law in laws], 1)
+        path = optimal_trajectories(self.problem, x0.expand(u.shape[1], -1), u).path
+        return np.ascontiguousarray(path.u[:, int(path.cost.argmin())].numpy())

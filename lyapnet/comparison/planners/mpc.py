@@ -11,7 +11,8 @@ from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.expansions import riccati
 from lyapnet.problem import Problem
 
-SOLVER, ITERATIONS, TOLERANCE = "fatrop", 100, 1e-6
+SOLVER, ITERATIONS, TOLERANCE = "fatrop", 1000, 1e-6
+LEAST = 5  # steps of a horizon: fatrop does not converge on shorter ones of tasks with many states
 QUIET = {"print_time": False, "show_eval_warnings": False, "fatrop.print_level": 0}
 
 
@@ -22,11 +23,11 @@ class PredictiveControl(Planner):
     are left: those beyond T leave x where it is and cost what u is off its rest, so that one solver serves all steps
     and T is where it is. With H = N it is the optimal law, but for local minima. A
     plan is warm-started with the last one, a step later; the first begins with the straight line to the goal and the
-    control that costs nothing. Where a solve does not converge, the last plan is followed for another step.
+    control that costs nothing. Of a solve that does not converge, the last iterate is the plan.
 
     Args:
         problem: the task; its constraints are not known here.
-        steps: H.
+        steps: H; LEAST at the least.
 
     Raises:
         UsageError: the task has operations that CasADi lacks, or controls without limits that it could be told.
@@ -37,6 +38,7 @@ class PredictiveControl(Planner):
 
     def __init__(self, problem: Problem, steps: int):
         self.problem = copied(problem)
+        steps = max(steps, LEAST)
         self.steps, self.horizon = steps, problem.horizon.steps
         if self.problem.controls.limits is None:
             name = type(self.problem.controls).__name__
@@ -79,9 +81,9 @@ class PredictiveControl(Planner):
         x[0] = x0
         found = self._solver(x0=_stacked(x, u), p=given, lbx=lower, ubx=upper, lbg=0, ubg=0)
         plan = np.asarray(found["x"]).ravel()
-        converged = self._solver.stats()["success"] and bool(np.isfinite(plan).all())
-        self.count(converged)
-        if not converged:
+        finite = bool(np.isfinite(plan).all())
+        self.count(finite and self._solver.stats()["success"])
+        if not finite:
             return x, u
         width = x.shape[1] + u.shape[1]
         rows = plan[: self.steps * width].reshape(self.steps, width)

@@ -16,7 +16,7 @@ def alternatives(comparison: Comparison) -> Table:
     """A row for each method on each task."""
     rows = [_row(group) for task in comparison.tasks for group in comparison.of_task(task)]
     columns = [
-        Column("task", ("task",), name_of), Column("method", ("method",), method_name),
+        Column("task", ("task",), name_of), Column("method", ("method",), method_name), Column("seeds", ("seeds",)),
         Column("cost / J*", ("cost_ratio",), _ratio), Column("worst state", ("worst",), _ratio),
         Column("fail", ("failed",), share), Column("before use (s)", ("seconds",), number),
         Column("first control (ms)", ("first",), number), Column("a control (ms): median", ("median",), number),

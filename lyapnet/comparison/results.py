@@ -88,10 +88,18 @@ def _later(result: Result, compilation: float) -> Result:
 
 
 def with_common_optima(results: Sequence[Result]) -> list[Result]:
-    """The results with the least optimum of each state that any job knew: the oracle keeps the best that it has met."""
+    """The results with the least optimum of each state that any job knew, or its method reached.
+
+    The oracle keeps the best local minimum that it has met; a method that costs less has found a better one. Where none
+    was found, none is known, whatever methods reach.
+    """
     known: dict[str, torch.Tensor] = {}
     for result in results:
         if result.optima is not None:
             optima = torch.tensor(result.optima, dtype=torch.float64)
             known[result.task] = torch.fmin(known.get(result.task, optima), optima)
+    for result in results:
+        if (optima := known.get(result.task)) is not None and len(optima) == len(result.costs):
+            reached = torch.fmin(optima, torch.tensor(result.costs, dtype=torch.float64))
+            known[result.task] = reached.where(optima.isfinite(), optima)
     return [replace(r, optima=known[r.task].tolist()) if r.task in known else r for r in results]

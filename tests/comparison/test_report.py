@@ -20,7 +20,13 @@ from lyapnet.comparison.report import details as detailed
 from lyapnet.comparison.report import figures, summary, write_report
 from lyapnet.comparison.report.rows import missing
 from lyapnet.comparison.report.table1 import table1
-from lyapnet.comparison.results import Measurement, Result, with_cold_compilation
+from lyapnet.comparison.results import (
+    ControlTimes,
+    Measurement,
+    Result,
+    with_cold_compilation,
+    with_common_optima,
+)
 from lyapnet.comparison.statistics import compared, interquartile_mean, spread
 from lyapnet.drawing import GREY
 from lyapnet.errors import UsageError
@@ -548,6 +554,30 @@ def test_whatever_there_is_is_reported(chosen, tmp_path):
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     assert "nan" not in text
     assert f"{len(chosen)} results" in text
+
+
+def test_what_else_one_could_take(tmp_path):
+    """A state that a planner reaches at less than its optimum had a worse local minimum; what diverges has failed."""
+    lqr = replace(
+        result("lqr", curve=((0, 1.0),)), curve=[], costs=[1.5, 2.5, 3.0, INF], times=ControlTimes(0.25, 3.0, 1.0)
+    )
+    ours = result(ratio=1.01)
+    mpc = replace(result("mpc_25", curve=((0, 1.0),)), curve=[], costs=[0.5, 2.0, 3.0, 4.0], unsolved_fraction=0.125)
+    unknown = [replace(one, optima=[*one.optima[:1], math.nan, *one.optima[2:]]) for one in (lqr, ours, mpc)]
+    found = with_common_optima(unknown)
+    assert found[0].optima == pytest.approx([0.5, math.nan, 3.0, 4.0], nan_ok=True)
+    write_report(found, tmp_path)
+    rows = {row["method"]: row for row in rows_of(tmp_path / "alternatives.csv")}
+    assert float(rows["lqr"]["failed"]) == pytest.approx(2 / 3), "3 times the optimum, and diverged"
+    assert float(rows["lqr"]["worst"]) == INF
+    assert float(rows["mpc_25"]["cost_ratio"]) == pytest.approx(1.0)
+    assert (rows["lqr"]["median"], rows["lqr"]["first"], rows["lyapnet"]["median"]) == ("0.25", "1.0", "")
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert "MPC (25 % of T)" in text
+    assert "| 12.5% |" in text
+    alone = tmp_path / "alone"
+    assert all(path.is_file() for path in write_report([found[0], found[2]], alone)), "without any learner"
+    assert "## Costs" not in (alone / "report.md").read_text(encoding="utf-8")
 
 
 def test_nothing_is_refused(tmp_path):

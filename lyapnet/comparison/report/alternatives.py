@@ -29,7 +29,7 @@ def brief(comparison: Comparison) -> Table:
     """What of it fits into a terminal."""
     full = alternatives(comparison)
     columns = [
-        Column("task", ("task",), name_of), Column("method", ("method",), method_name),
+        Column("task", ("task",), name_of), Column("method", ("method",), _short_name),
         Column("cost/J*", ("cost_ratio",), _ratio), Column("worst", ("worst",), _ratio),
         Column("fail", ("failed",), share), Column("s", ("seconds",), _short), Column("ms", ("median",), _short),
         Column("99.9 %", ("most",), _short),
@@ -63,7 +63,13 @@ def _mean(values: list[float]) -> float | None:
     return fmean(values) if values else None
 
 
+def _short_name(method: str) -> str:
+    return method_name(method).replace(" of T", "")
+
+
 def _short(value: float) -> str:
+    if value < 1e-3:
+        return "<0.001"
     return f"{value:.2g}" if value < 10 else f"{value:,.0f}"
 
 

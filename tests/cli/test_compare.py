@@ -83,7 +83,7 @@ def test_the_whole_comparison(tmp_path):
 def test_planners_stand_beside_what_learns(smoke):
     said = compared(smoke[0], "--tasks", "double_integrator", "--methods", "lqr,mpc_100", "--workers", "2")
     assert said.returncode == 0, said.stderr
-    for name in ("LQR", "MPC (100 % of T)", "lyapnet", "PPO (tuned)"):
+    for name in ("LQR", "MPC (100 %)", "lyapnet", "PPO (tuned)"):
         assert name in said.stdout
     by_method = {result.method: result for result in results_of(smoke[0])}
     for method in ("lqr", "mpc_100"):

@@ -20,6 +20,7 @@ from lyapnet.comparison.baselines.checkpoints import best_checkpoint, checkpoint
 from lyapnet.comparison.baselines.settings import SETTINGS
 from lyapnet.comparison.baselines.training import BaselineTraining, best_policy
 from lyapnet.comparison.reference_problems import bounded_problem
+from lyapnet.comparison.scoring import costs_of
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.horizon import Horizon
 

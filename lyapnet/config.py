@@ -295,20 +295,19 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     recipe = dict(STANDARD)
     if _names_constraints(content.get("constraints") or {}, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
-    if _gradient(sections.get("rollout", {}), overrides) != STANDARD["rollout"]["gradient"]:
+    route = STANDARD["rollout"]["gradient"]
+    if _asked("rollout.gradient", sections.get("rollout", {}).get("gradient", route), overrides) != route:
         recipe["rollout"] = {key: value for key, value in recipe["rollout"].items() if key != "costate_limit"}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     program = standard["program"]
-    named = [program["name"], *(each.partition("=")[2] for each in overrides if each.startswith("program.name="))]
-    known = PROGRAMS.get(str(named[-1]))
+    known = PROGRAMS.get(_asked("program.name", program["name"], overrides))
     weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **program}}
 
 
-def _gradient(rollout: Mapping[str, Any], overrides: Sequence[str]) -> str:
-    """The route that a file or the command line asks for, the recipe's if none."""
-    given = [each.partition("=")[2] for each in overrides if each.startswith("rollout.gradient=")]
-    return str([rollout.get("gradient", STANDARD["rollout"]["gradient"]), *given][-1])
+def _asked(key: str, given: Any, overrides: Sequence[str]) -> str:
+    """What the command line says last of a key, and else what is given."""
+    return str([given, *(each.partition("=")[2] for each in overrides if each.startswith(f"{key}="))][-1])
 
 
 def _names_constraints(section: Mapping[str, Any], overrides: Sequence[str]) -> bool:

@@ -129,6 +129,11 @@ def cost(value: float) -> str:
     return DIVERGED if math.isinf(value) else number(value)
 
 
+def ratio(value: float) -> str:
+    """A cost in units of another: four decimals where it is near."""
+    return f"{value:.4f}" if value < 10 else cost(value)
+
+
 def mean_and_std(mean: float, std: float | None, diverged: int = 0, seeds: int = 0) -> str:
     """mean ± std: std to two digits, mean to the same decimals, five digits at most; or how many seeds diverged."""
     if math.isinf(mean):

@@ -103,7 +103,7 @@ def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console:
     """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
     from lyapnet.comparison.execution import controllers_of
     from lyapnet.comparison.plan import begun_jobs, jobs_of
-    from lyapnet.comparison.report import brief, summary, write_report
+    from lyapnet.comparison.report import brief_alternatives, summary, write_report
     from lyapnet.comparison.results import PLANNED, with_cold_compilation, with_common_optima
     from lyapnet.comparison.statistics import compared
     from lyapnet.tables import terminal
@@ -123,7 +123,7 @@ def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console:
     if (learned := comparison.without(PLANNED)).groups:
         console.print(terminal(summary(learned)))
     if set(PLANNED).intersection(comparison.methods):
-        console.print(terminal(brief(comparison)))
+        console.print(terminal(brief_alternatives(comparison)))
     if lacking := len(planned) - len(results):
         console.print(f"{lacking} of {len(planned)} jobs are missing; the same command goes on", soft_wrap=True)
     console.print(f"wrote {wrote[0]} and {len(wrote) - 1} files beside it", soft_wrap=True)

@@ -11,7 +11,7 @@ from omegaconf import MISSING
 from lyapnet.build import build_problem
 from lyapnet.comparison.baselines.baseline import VALIDATIONS, Baseline
 from lyapnet.comparison.baselines.settings import SETTINGS
-from lyapnet.comparison.planners import Planner, planner_of
+from lyapnet.comparison.planners import planner_of
 from lyapnet.comparison.reference_problems import CONTROL_SCALES, BoundedProblem, bounded_problem
 from lyapnet.comparison.results import LEARNED, METHODS, OURS, PLANNED, Result
 from lyapnet.comparison.workers import Runnable
@@ -161,25 +161,16 @@ class Job(Runnable):
             self.bounded, method, self.seed, compared.steps[method], compared.hidden, options, validations
         )  # fmt: skip
 
-    @property
-    def planner(self) -> Planner:
-        """What plans.
-
-        Raises:
-            UsageError: see planner_of.
-        """
-        return planner_of(self.method, self.bounded.problem)
-
     def check(self) -> None:
         """Refuse what cannot be trained or planned, before anything is.
 
         Raises:
-            UsageError: see `config`, `baseline` and `planner`.
+            UsageError: see `config`, `baseline` and planner_of.
         """
         if self.method == OURS:
             _ = self.bounded
         elif self.method in PLANNED:
-            _ = self.planner
+            planner_of(self.method, self.bounded.problem)
         else:
             self.baseline.check()
 
@@ -200,7 +191,7 @@ def jobs_of(
         _require_among(task, config.tasks, "--tasks")
     for method in methods or ():
         _require_among(method, METHODS, "--methods")
-        if _needs_steps(method) and not any(method in config.tasks[task].steps for task in tasks or config.tasks):
+        if method in SETTINGS and not any(method in config.tasks[task].steps for task in tasks or config.tasks):
             raise UsageError(f"Expected {method} under steps of a task, got none; give its environment steps.")
     tasks, methods = list(dict.fromkeys(tasks or config.tasks)), list(dict.fromkeys(methods or config.methods))
     count = {m: seeds or (config.seeds if m == OURS else config.baseline_seeds) for m in methods}
@@ -223,11 +214,7 @@ def jobs_of(
 
 
 def _is_compared(config: ComparisonConfig, task: str, method: str) -> bool:
-    return not _needs_steps(method) or method in config.tasks[task].steps
-
-
-def _needs_steps(method: str) -> bool:
-    return method in SETTINGS
+    return method not in SETTINGS or method in config.tasks[task].steps
 
 
 def begun_jobs(config: ComparisonConfig) -> list[Job]:

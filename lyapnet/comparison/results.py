@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from lyapnet.files import write_json
@@ -34,6 +35,12 @@ class ControlTimes:
     median: float
     most: float  # the 99.9th percentile
     first: float | None = None  # at t = 0, median over the states, where that is when a plan is made
+
+    @staticmethod
+    def of(seconds: Sequence[float], first: Sequence[float] = ()) -> "ControlTimes":
+        """Those of some controls, and of the first ones of several closed loops."""
+        median, most = np.quantile(seconds, (0.5, 0.999)).tolist()
+        return ControlTimes(1e3 * median, 1e3 * most, 1e3 * float(np.median(first)) if len(first) else None)
 
 
 @dataclass(frozen=True)

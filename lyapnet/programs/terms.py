@@ -9,6 +9,8 @@ from torch import Tensor
 
 from lyapnet.types import PerState, StepPath, ValuePath
 
+LEAST = 0.05  # of a typical cost, against which an error counts where the cost itself is less
+
 
 def residual(values: ValuePath, step_cost: StepPath) -> PerState:
     """Σ_n (V_{n+1} − V_n + Δt ℓ_n)²: zero where V is the cost-to-go of the closed loop. Source: P_V of the paper."""
@@ -46,6 +48,11 @@ def terminal_residual(values: ValuePath, terminal_cost: PerState) -> PerState:
 def terminal_hinge(values: ValuePath, terminal_cost: PerState) -> PerState:
     """max(φ(x_N) − V(T, x_N), 0): V ends no lower than the terminal cost, so that V(0, x₀) bounds the whole cost."""
     return torch.relu(terminal_cost - values[-1])
+
+
+def promised(value: PerState, cost: PerState) -> PerState:
+    """V(0, x₀), LEAST of the median cost at the least: what the cost of a closed loop is held against."""
+    return value.maximum(LEAST * cost.median())
 
 
 def satisfied(summed_hinge: PerState, value: PerState, tolerance: float) -> Bool[Tensor, "*batch"]:

@@ -7,11 +7,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from lyapnet.programs.base import Program
-from lyapnet.programs.terms import cost_to_go_error, residual, terminal_residual
+from lyapnet.programs.terms import LEAST, cost_to_go_error, promised, residual, terminal_residual
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
 
-LEAST = 0.05  # of the mean cost, against which an error of V counts where the cost itself is less
 LOST = 1.5  # times as much as V(0, x₀) promises, the batch's median of which being one: the law is lost there, not V
 
 
@@ -60,5 +59,5 @@ class ValueProgram(Program):
 def lost(values: ValuePath, trajectory: Trajectory) -> Bool[Tensor, "*batch"]:
     """Whether a trajectory costs LOST times as much as V(0, x₀) says, in units of the batch's median of that ratio."""
     J = trajectory.cost.detach()
-    ratio = J / values[0].detach().maximum(LEAST * J.median())
+    ratio = J / promised(values[0].detach(), J)
     return ratio > LOST * ratio.median().clamp_min(1)

@@ -6,6 +6,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.errors import DivergenceError
+from lyapnet.programs.terms import promised
 from lyapnet.rollout import Trajectory
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
@@ -13,7 +14,6 @@ from lyapnet.types import PerState
 
 SOUGHT, KEPT = 512, 256  # states of X₀ that are tried at each validation; lost ones, those found last
 EXCESS = 0.05  # of V(0, x₀), by which a closed loop that is lost costs more
-LEAST = 0.05  # of the median cost: what an excess is measured against where V(0, x₀) is less
 
 
 class LostStates(Callback):
@@ -45,7 +45,7 @@ class LostStates(Callback):
 
 def excess(cost: PerState, value: PerState) -> PerState:
     """(J_N − V(0, x₀)) / V(0, x₀): above zero where V promises what its law does not keep."""
-    return (cost - value) / value.clamp_min(LEAST * float(cost.median()))
+    return (cost - value) / promised(value, cost)
 
 
 def _excess_of(_: Learner, trajectory: Trajectory) -> PerState:

@@ -21,9 +21,9 @@ class PredictiveControl(Planner):
 
     What follows the H steps costs V, the value of LQR there, as is usual; at T it is φ. Near the end fewer than H steps
     are left: those beyond T leave x where it is and cost what u is off its rest, so that one solver serves all steps
-    and T is where it is. With H = N it is the optimal law, but for local minima. A
-    plan is warm-started with the last one, a step later; the first begins with the straight line to the goal and the
-    control that costs nothing. Of a solve that does not converge, the last iterate is the plan.
+    and T is where it is. With H = N it is the optimal law, but for local minima. A plan is warm-started with the last
+    one, a step later; the first begins with the straight line to the goal and the control that costs nothing. Of a
+    solve that does not converge, the last iterate is the plan.
 
     Args:
         problem: the task; its constraints are not known here.
@@ -73,7 +73,7 @@ class PredictiveControl(Planner):
         return control
 
     def _solve(self, step: int, x0: NDArray, x: NDArray, u: NDArray) -> tuple[NDArray, NDArray]:
-        """The plan from x₀ at a step, or the start where there is none."""
+        """The plan from x₀ at a step, from a start; the start itself where the solver left the finite numbers."""
         inside, end = (np.arange(self.steps) < self.horizon - step).astype(float), step + self.steps
         tail = self._tail.hessian[min(end, self.horizon)], self._tail.gradient[min(end, self.horizon)]
         given = np.concatenate([x0, inside, [float(end >= self.horizon)], *(part.numpy().ravel() for part in tail)])

@@ -1,9 +1,9 @@
-"""Planners by name, and one of them in the place of a policy of Stable-Baselines3."""
+"""What a planner is, and one in the place of a policy of Stable-Baselines3."""
 
-import importlib.util
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from lyapnet.comparison.reference_problems import BoundedProblem
 from lyapnet.comparison.results import ControlTimes
-from lyapnet.errors import UsageError
-from lyapnet.problem import Problem
 
 LoopLaw = Callable[[int, NDArray], NDArray]  # (n, x_n) ↦ u_n of one closed loop, whose plan it may remember
 
@@ -33,24 +31,6 @@ class Planner(ABC):
     def count(self, converged: bool) -> None:
         """Take note of an optimisation."""
         self.solved, self.unsolved = self.solved + converged, self.unsolved + (not converged)
-
-
-def planner_of(method: str, problem: Problem) -> Planner:
-    """The planner of a name in PLANNED: lqr, ilqr, or mpc_P whose horizon is P % of the task's.
-
-    Raises:
-        UsageError: MPC without CasADi, or of a task that CasADi has no operations for.
-    """
-    from lyapnet.comparison.planners.feedback import IterativeRegulator, Regulator
-
-    if method in ("lqr", "ilqr"):
-        return Regulator(problem) if method == "lqr" else IterativeRegulator(problem)
-    if importlib.util.find_spec("casadi") is None:
-        raise UsageError(f"Expected CasADi for {method}, got none; pip install 'lyapnet[oracle]'.")
-    from lyapnet.comparison.planners.mpc import PredictiveControl
-
-    percent = int(method.removeprefix("mpc_"))
-    return PredictiveControl(problem, max(1, round(problem.horizon.steps * percent / 100)))
 
 
 class PlannerPolicy:
@@ -84,8 +64,7 @@ class PlannerPolicy:
     def times(self) -> ControlTimes:
         """What its calls took so far."""
         first, *later = self.seconds
-        median, most = np.quantile(1e3 * np.concatenate(later or [first]), (0.5, 0.999)).tolist()
-        return ControlTimes(median, most, 1e3 * float(np.median(first)))
+        return ControlTimes.of(list(chain(*(later or [first]))), first)
 
     @property
     def unsolved_fraction(self) -> float | None:

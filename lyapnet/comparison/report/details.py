@@ -7,7 +7,7 @@ from typing import Any
 from lyapnet.comparison.report.names import method_name, name_of
 from lyapnet.comparison.results import OURS
 from lyapnet.comparison.statistics import CONVERGED, NEAR, AtStep, Comparison, Group, Reach, Spread
-from lyapnet.tables import Column, Table, cost, factor, number, share, steps, with_interval
+from lyapnet.tables import Column, Table, cost, factor, number, ratio, share, steps, with_interval
 
 OVERVIEW = (
     "task", "method", "seeds", "cost / J*", "at our convergence: cost / J*", "there / ours", "steps to 2 %",
@@ -53,9 +53,9 @@ def details(comparison: Comparison) -> Table:
         Column("× our steps to 2 %", ("budget_of_convergence",), factor),
         Column("× our seconds", ("budget_of_seconds",), factor),
         Column("IQM of J_N [95 %]", ("iqm", "iqm_low", "iqm_high"), with_interval), Column("J*", ("optimum",), number),
-        Column("cost / J*", ("cost_ratio",), _ratio),
+        Column("cost / J*", ("cost_ratio",), ratio),
         Column("validations", ("validations",)), Column("best validation at", ("best_steps",), steps),
-        Column("last validation: cost / J*", ("last_cost",), _ratio),
+        Column("last validation: cost / J*", ("last_cost",), ratio),
         Column("IQM of J/J* [95 %]", ("relative_iqm", "relative_iqm_low", "relative_iqm_high"), with_interval),
         Column("at our convergence: cost / J*", ("at_cost", "at_ended", "at_steps"), _at_step),
         Column("there / ours", ("at_factor",), factor),
@@ -157,7 +157,7 @@ def _budget_fields(comparison: Comparison, group: Group) -> dict[str, Any]:
 
 def _at_step(value: float, ended: bool, at: float) -> str:
     """A relative cost, and where its training ended if that was too soon."""
-    return _ratio(value) + (f" (ended at {steps(at)})" if ended else "")
+    return ratio(value) + (f" (ended at {steps(at)})" if ended else "")
 
 
 def _reached_steps(reached: int, seeds: int, value: float | None) -> str:
@@ -169,13 +169,9 @@ def _reached_seconds(reached: int, value: float | None) -> str:
     return "not reached" if value is None else number(value)
 
 
-def _ratio(value: float) -> str:
-    return f"{value:.4f}" if value < 10 else cost(value)
-
-
-def _ratio_or_cost(mean: float, ratio: float | None) -> str:
+def _ratio_or_cost(mean: float, relative: float | None) -> str:
     """A cost where its optimum is not known."""
-    return f"J_N {cost(mean)}" if ratio is None else _ratio(ratio)
+    return f"J_N {cost(mean)}" if relative is None else ratio(relative)
 
 
 def _range(low: float, high: float) -> str:

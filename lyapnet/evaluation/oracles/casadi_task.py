@@ -1,6 +1,6 @@
 """A task as CasADi functions, for solvers that plan: its step, its end and its constraints."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import casadi
 import torch
@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.graphs.tracing import Tensors
 from lyapnet.problem import Problem
 from lyapnet.types import Control, PerState, State
 
@@ -47,7 +48,7 @@ class CasadiTask:
         assert self.problem.constraints is not None
         return (self.problem.constraints(x),)
 
-    def _translated(self, function, arguments: Sequence[Tensor]) -> casadi.Function:
+    def _translated(self, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> casadi.Function:
         self.graphs.append(traced(function, arguments))
         translated = symbolic(self.graphs[-1], arguments)
         require_equal(translated, function, arguments)

@@ -218,6 +218,7 @@ class EvaluationConfig:
     test_states: int = option(256, "Initial states of the evaluation at the end of training.", at_least=1)
     optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
     figures_every: int = option(5, "Validations between figures; the last one always draws.", at_least=1)
+    animate: bool = option(True, "Show closed loops in motion in TensorBoard, after the last step.")
     certify_every: int = option(0, "Validations between statistical bounds; 0 for none.", at_least=0)
     certified_states: int = option(1000, "Fresh states for each such bound.", at_least=1)
     confidence: float = option(1 - 1e-6, "Confidence of each such bound by itself.", above=0, below=1)

@@ -8,6 +8,7 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -15,6 +16,7 @@ from torch import Tensor
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError, one_line
+from lyapnet.shapes import Shape
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State, Time
 
@@ -88,6 +90,11 @@ class FamilySystem(ControlAffineSystem):
         x, p = self.split(x)
         member: Any = self.member(p)
         return member.inverse_mass(x)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+        n = self.system.n
+        values = {name: float(x[n + i]) for name, i in self.parameters_in_f.items()}
+        return with_attributes(self.system, values).draw(x[:n], u)
 
 
 class FamilyCost(Cost):

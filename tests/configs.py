@@ -16,7 +16,7 @@ initial_states: {lower: [-1, -1], upper: [1, 1]}
 horizon: {steps: 4, dt: 0.1}
 network: {name: anchored, hidden: [4]}
 training: {iterations: 1, batch_size: 2}
-evaluation: {validation_states: 2, test_states: 2}
+evaluation: {validation_states: 2, test_states: 2, animate: false}
 """
 
 HANGAR = """

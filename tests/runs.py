@@ -32,7 +32,7 @@ SMALL = {
     "horizon": {"steps": 15, "dt": 0.1},
     "network": {"name": "anchored", "hidden": [8, 8]},
     "training": {"iterations": 17, "batch_size": 6, "learning_rate": 0.05, "validate_every": 5},
-    "evaluation": {"validation_states": 6, "test_states": 6, "figures_every": 2},
+    "evaluation": {"validation_states": 6, "test_states": 6, "figures_every": 2, "animate": False},
     "trainer": {"gradient_clip_val": 3},
 }
 TINY = ["training.iterations=2", "horizon.steps=8", "evaluation.validation_states=4", "evaluation.test_states=4",

@@ -10,7 +10,17 @@ from tests.layout import files, functions, imports, levels, room, rooms, sources
 
 # Each line imports only lines above it.
 LEVELS = (
-    {"drawing", "errors", "interpolation", "linear_algebra", "provenance", "random_streams", "tables", "types"},
+    {
+        "drawing",
+        "errors",
+        "interpolation",
+        "linear_algebra",
+        "provenance",
+        "random_streams",
+        "shapes",
+        "tables",
+        "types",
+    },
     {"constraints", "contracts", "cost", "files", "horizon", "schema", "sets", "sizes", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
@@ -30,7 +40,7 @@ LEVELS = (
 MATHEMATICS = {
     "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family", "files", "graphs",
     "horizon", "interpolation", "linear_algebra", "networks", "policy", "problem", "programs", "random_streams",
-    "rollout", "sets", "systems", "types",
+    "rollout", "sets", "shapes", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

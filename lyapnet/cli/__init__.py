@@ -1,4 +1,4 @@
-"""The command line: lyapnet check | train | evaluate | export | sweep | certify | compare | bench | systems.
+"""The command line: lyapnet check | train | evaluate | animate | export | sweep | certify | compare | bench | systems.
 
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from lyapnet.cli import bench, certify
+from lyapnet.cli.animate import animate
 from lyapnet.cli.check import check
 from lyapnet.cli.compare import compare
 from lyapnet.cli.evaluate import evaluate
@@ -35,7 +36,7 @@ def lyapnet(
         print(__version__)
 
 
-for command in (check, train, evaluate, export, sweep, compare, systems):
+for command in (check, train, evaluate, animate, export, sweep, compare, systems):
     app.command()(command)
 for group in (certify, bench):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

@@ -56,6 +56,7 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         ("run", plan.run.folder),
         ("watch", shlex.join(["tensorboard", "--logdir", str(plan.config.logs)])),
         ("measure", f"lyapnet evaluate {quoted}{options}"),
+        ("animate", f"lyapnet animate {quoted}{options} --out closed_loops.gif"),
         ("certify", f"lyapnet certify {quoted}{options}"),
         ("fine-tune", f"{command} --finetune {quoted}"),
         ("use", f"lyapnet.load({json.dumps(str(best), ensure_ascii=False)}{arguments})"),

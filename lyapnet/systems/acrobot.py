@@ -1,7 +1,9 @@
 """The acrobot."""
 
+import numpy as np
 import torch
 
+from lyapnet.shapes import Disk, Line, Shape, chain
 from lyapnet.systems.base import MechanicalSystem, require_positive
 from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
@@ -32,7 +34,7 @@ class Acrobot(MechanicalSystem):
         require_positive(mass=mass, length=length, gravity=gravity)
         super().__init__(actuation=[[0.0], [1.0]], damping=[damping, damping])
         self.inertia, self.coupling = mass * length**2 / 3, mass * length**2 / 2
-        self.weight = mass * gravity * length / 2
+        self.length, self.weight = length, mass * gravity * length / 2
 
     def mass_matrix(self, q: Coordinates) -> MassMatrix:
         swing = self.coupling * torch.cos(q[..., 1])
@@ -52,3 +54,7 @@ class Acrobot(MechanicalSystem):
         q, qdot = self._split(x)
         height = 3 * torch.cos(q[..., 0]) + torch.cos(q[..., 0] + q[..., 1])
         return self.kinetic_energy(q, qdot) + self.weight * height
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        rods = chain([self.length] * 2, np.pi / 2 - np.cumsum(x[:2]))
+        return [Line(rods), *(Disk(joint, 0.05 * self.length) for joint in rods)]

@@ -4,12 +4,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from lyapnet.errors import UsageError
 from lyapnet.linear_algebra import apply, multiply, solve
+from lyapnet.shapes import Shape
 from lyapnet.types import Control, ControlMatrix, Coordinates, InputMatrix, MassMatrix, PerState, State
 
 
@@ -45,6 +47,13 @@ class ControlAffineSystem(nn.Module, ABC):
         f, g = self.f(x), self.g(x)
         u = -apply(torch.linalg.pinv(g), f)
         return u, f + apply(g, u)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+        """What it looks like in a state (n,) under a control (m,): shapes in a plane, in metres; here none.
+
+        `lyapnet animate` moves them; of a system without shapes it shows the plane of two states.
+        """
+        return ()
 
     @property
     def title(self) -> str:

@@ -1,7 +1,9 @@
 """The cartpole."""
 
+import numpy as np
 import torch
 
+from lyapnet.shapes import Arrow, Disk, Line, Shape, chain, rectangle
 from lyapnet.systems.base import MechanicalSystem, require_positive
 from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
@@ -55,3 +57,12 @@ class Cartpole(MechanicalSystem):
     def energy(self, x: State) -> PerState:
         q, qdot = self._split(x)
         return self.kinetic_energy(q, qdot) + self.pole_mass * self.gravity * self.length * torch.cos(q[..., 1])
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        """The force is drawn as long as the pole where it equals the weight of both."""
+        length, cart = self.length, np.array([x[0], 0.0])
+        pole = cart + chain([length], [np.pi / 2 - x[1]])
+        push = (x[0] + length * u[0] / (self.gravity * (self.cart_mass + self.pole_mass)), 0.0)
+        rail = Line([(min(x[0], 0.0) - length, 0), (max(x[0], 0.0) + length, 0)], width=1, faint=True)
+        body = rectangle(cart, 0.4 * length, 0.2 * length)
+        return [rail, body, Line(pole), Disk(pole[-1], 0.07 * length), Arrow(cart, push)]

@@ -1,7 +1,9 @@
 """The pendulum."""
 
+import numpy as np
 import torch
 
+from lyapnet.shapes import Disk, Line, Shape, chain
 from lyapnet.systems.base import MechanicalSystem, require_positive
 from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
@@ -37,3 +39,7 @@ class Pendulum(MechanicalSystem):
     def energy(self, x: State) -> PerState:
         q, qdot = self._split(x)
         return self.kinetic_energy(q, qdot) + self.mass * self.gravity * self.length * torch.cos(q[..., 0])
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        rod = chain([self.length], [np.pi / 2 - x[0]])
+        return [Line(rod), Disk(rod[-1], 0.08 * self.length)]

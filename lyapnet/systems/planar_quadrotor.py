@@ -1,7 +1,9 @@
 """The planar quadrotor."""
 
+import numpy as np
 import torch
 
+from lyapnet.shapes import Arrow, Line, Shape
 from lyapnet.systems.base import ControlAffineSystem, require_positive
 from lyapnet.types import ControlMatrix, InputMatrix, State
 
@@ -48,3 +50,11 @@ class PlanarQuadrotor(ControlAffineSystem):
         zero = torch.zeros_like(x[..., 0])
         push, turn = 1 / self.mass + zero, self.arm**2 / self.inertia + zero
         return torch.stack([push + turn, push - turn, push - turn, push + turn], -1).unflatten(-1, (2, 2))
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        """A thrust that carries the weight alone is drawn twice as long as an arm."""
+        along, up = np.array([np.cos(x[2]), np.sin(x[2])]), np.array([-np.sin(x[2]), np.cos(x[2])])
+        rotors = x[:2] + self.arm * np.stack([along, -along])
+        shares = (u / (self.mass * self.gravity) + 0.5)[:, None] * up
+        thrusts = [Arrow(*ends) for ends in zip(rotors, rotors + 2 * self.arm * shares, strict=True)]
+        return [Line(rotors, width=4), *thrusts]

@@ -1,9 +1,13 @@
 """The planar two-link arm."""
 
+import numpy as np
 import torch
 
+from lyapnet.shapes import Disk, Line, Shape, chain
 from lyapnet.systems.base import MechanicalSystem, require_positive
 from lyapnet.types import Coordinates, MassMatrix, PerState, State
+
+DRAWN = (0.3, 0.33)  # m: the links of Li and Todorov, which a₁, a₂ and a₃ leave open
 
 
 class Reacher(MechanicalSystem):
@@ -53,3 +57,7 @@ class Reacher(MechanicalSystem):
 
     def energy(self, x: State) -> PerState:
         return self.kinetic_energy(*self._split(x))
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        arm = chain(DRAWN, np.cumsum(x[:2]))
+        return [Line(arm), *(Disk(joint, 0.02) for joint in arm)]

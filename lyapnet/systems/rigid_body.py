@@ -11,9 +11,11 @@ which is singular at θ = ±π/2.
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from lyapnet.shapes import Arrow, Line, Polygon, Shape, oblique
 from lyapnet.systems.base import ControlAffineSystem, require_positive
 from lyapnet.types import InputMatrix, State
 
@@ -39,6 +41,20 @@ def attitude_rates(attitude: Tensor, w: Tensor) -> Tensor:
     along = torch.sin(roll) * w[..., 1] + torch.cos(roll) * w[..., 2]
     across = torch.cos(roll) * w[..., 1] - torch.sin(roll) * w[..., 2]
     return torch.stack([w[..., 0] + torch.tan(pitch) * along, across, along / torch.cos(pitch)], -1)
+
+
+def seen(points: Sequence[Sequence[float]], attitude: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Points (k, 3) in a body's frame as they look on paper, (k, 2)."""
+    R = to_body_frame(torch.as_tensor(attitude)).numpy()
+    return oblique(np.asarray(points) @ R + position)
+
+
+def rotorcraft(attitude: np.ndarray, position: np.ndarray, lift: float) -> list[Shape]:
+    """Four arms of 0.3 m, a thrust upwards as long as an arm where lift is 1, and a line to the level z = 0."""
+    arms = seen([(0.3, 0, 0), (-0.3, 0, 0), (0, 0.3, 0), (0, -0.3, 0)], attitude, position)
+    center, thrust = seen([(0, 0, 0), (0, 0, 0.3 * lift)], attitude, position)
+    below = oblique(np.stack([position, position * (1, 1, 0)]))
+    return [Line(below, width=0.8, faint=True), Line(arms[:2]), Line(arms[2:]), Arrow(center, thrust)]
 
 
 def three(name: str, values: Sequence[float]) -> Tensor:
@@ -95,6 +111,20 @@ class Satellite(ControlAffineSystem):
         turning = self.torques / self.inertia[:, None]
         return torch.cat([torch.zeros_like(turning), turning]).expand(*x.shape[:-1], 6, 3)
 
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        """A cube of 1 m with two panels, and its own axes 1, 2 and 3."""
+        face = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5)]
+        here = np.zeros(3)
+        edges = [seen([(side, *corner) for corner in face], x[:3], here) for side in (-0.5, 0.5)]
+        across = [np.stack(pair) for pair in zip(*edges, strict=True)][:4]
+        panels = [[(-0.3, s, 0), (0.3, s, 0), (0.3, 3 * s, 0), (-0.3, 3 * s, 0)] for s in (-0.6, 0.6)]
+        center, *axes = seen([(0, 0, 0), (1.2, 0, 0), (0, 1.2, 0), (0, 0, 1.2)], x[:3], here)
+        return [
+            *(Polygon(seen(panel, x[:3], here)) for panel in panels),
+            *(Line(edge, width=1.5) for edge in (*edges, *across)),
+            *(Arrow(center, axis) for axis in axes),
+        ]
+
 
 class BodyFrameQuadrotor(ControlAffineSystem):
     """A quadrotor with its velocity v and rates w in its own frame; thrust beyond that of hovering, and torques:
@@ -138,6 +168,10 @@ class BodyFrameQuadrotor(ControlAffineSystem):
         turning = torch.cat([torch.zeros_like(turning)] * 3 + [turning])
         return torch.cat([pushing, turning], 1).expand(*x.shape[:-1], 12, 4)
 
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        """A thrust that carries the weight is drawn as long as an arm."""
+        return rotorcraft(x[6:9], x[:3], 1 + u[0] / (self.mass * self.gravity))
+
 
 class Quadrotor(ControlAffineSystem):
     """A quadrotor that is a point for its thrust, and three double integrators for its attitude:
@@ -178,6 +212,10 @@ class Quadrotor(ControlAffineSystem):
         turning = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 3, 3)
         pushing = torch.cat([zeros, zeros, direction, zeros], -2)
         return torch.cat([pushing, torch.cat([torch.zeros_like(turning)] * 3 + [turning], -2)], -1)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        """A thrust that carries the weight is drawn as long as an arm."""
+        return rotorcraft(x[3:6], x[:3], self.carried + u[0] / (self.mass * self.gravity))
 
     def _direction(self, x: State) -> Tensor:
         return to_body_frame(x[..., 3:6])[..., 2, :]

@@ -1,9 +1,11 @@
 """The planar arm of three links."""
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.shapes import Disk, Line, Shape, chain
 from lyapnet.systems.base import MechanicalSystem, require_positive
 from lyapnet.types import Coordinates, MassMatrix, PerState, State
 
@@ -30,6 +32,7 @@ class ThreeLinkArm(MechanicalSystem):
     def __init__(self, mass: float = 1.0, length: float = 0.5, damping: float = 0.25):
         require_positive(mass=mass, length=length)
         super().__init__([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0], [0.0, 0.0, 1.0]], [damping] * 3)
+        self.length = length
         c = torch.tensor([[7 / 3, 3 / 2, 1 / 2], [3 / 2, 4 / 3, 1 / 2], [1 / 2, 1 / 2, 1 / 3]])
         self.register_buffer("c", mass * length**2 * c.to(self.B), persistent=False)
 
@@ -41,3 +44,7 @@ class ThreeLinkArm(MechanicalSystem):
 
     def energy(self, x: State) -> PerState:
         return self.kinetic_energy(*self._split(x))
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
+        arm = chain([self.length] * 3, x[:3])
+        return [Line(arm), *(Disk(joint, 0.05 * self.length) for joint in arm)]

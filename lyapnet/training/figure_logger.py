@@ -7,10 +7,12 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from matplotlib.figure import Figure
+from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
 from lyapnet.drawing import pixels
 from lyapnet.errors import DivergenceError
 from lyapnet.evaluation import figures
+from lyapnet.evaluation.animation import Film
 from lyapnet.evaluation.path_figure import has_plane, paths
 from lyapnet.random_streams import FIGURES, stream
 from lyapnet.training.curves import with_loggers
@@ -23,19 +25,31 @@ class FigureLogger(Recurring):
 
     Args:
         every: steps between drawings; the last validation always draws.
+        animate: whether that one shows closed loops in motion too.
     """
+
+    def __init__(self, every: int, animate: bool = True):
+        super().__init__(every)
+        self.animate = animate
 
     def act(self, trainer: Trainer, pl_module: LightningModule) -> None:
         member, loggers = next(with_loggers(trainer, pl_module))
         if not trainer.is_global_zero or not any(map(_shows_figures, loggers)):
             return
+        last = self.animate and trainer.global_step == trainer.max_epochs
+        in_motion = [logger for logger in loggers if last and isinstance(logger, TensorBoardLogger)]
         try:
             drawn = figures_of(member)
+            film = film_of(member).gif() if in_motion else b""
         except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
             warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
             return
         for name, figure in drawn.items():
             log_figure(loggers, name, figure, trainer.global_step)
+        for logger in in_motion:
+            image = Summary.Image(encoded_image_string=film)
+            summary = Summary(value=[Summary.Value(tag="closed_loop", image=image)])
+            logger.experiment.file_writer.add_summary(summary, trainer.global_step)
 
 
 def figures_of(learner: Learner) -> dict[str, Figure]:
@@ -50,6 +64,13 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
         "value_slices": figures.value_slices(learner.V, problem),
     }
     return {**drawn, "paths": paths(sample, problem)} if has_plane(problem) else drawn
+
+
+def film_of(learner: Learner) -> Film:
+    """Closed loops from five states of X₀."""
+    x0 = learner.problem.initial_states.sample(5, stream(learner.seed, FIGURES))
+    with torch.no_grad():
+        return Film(learner.rollout(x0), learner.problem, learner.V, rate=15)
 
 
 def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:

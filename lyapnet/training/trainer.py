@@ -54,7 +54,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         Dashboard(configs_of_seeds(config)),
         stopwatch,
         ScalarLogger(stopwatch),
-        FigureLogger(every * options.figures_every),
+        FigureLogger(every * options.figures_every, options.animate),
         *([certified] if options.certify_every else []),
         TrainingProgress(console),
         RisingCost(),

@@ -175,3 +175,13 @@ def test_other_threads_are_heard():
     finally:
         threading.excepthook = before
     assert len(raised) == 1
+
+
+def test_the_last_step_shows_closed_loops_in_motion(tmp_path):
+    config = {**CONFIG, "evaluation": {**CONFIG["evaluation"], "animate": True}}
+    run = lyapnet.train(config, [f"logs={tmp_path}"])
+    accumulator = EventAccumulator(str(run.folder), size_guidance={"images": 0}).Reload()
+    (shown,) = accumulator.Images("closed_loop")
+    assert shown.step == 4
+    assert shown.encoded_image_string.startswith(b"GIF89a")
+    assert "closed_loop" not in logged(lyapnet.train(CONFIG, [f"logs={tmp_path}"]).folder)

@@ -1,0 +1,74 @@
+"""lyapnet animate."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from lyapnet.cli.options import (
+    At,
+    Checkpoint,
+    Constraints,
+    Controls,
+    Cost,
+    Debug,
+    Network,
+    Program,
+    System,
+    load_controller,
+)
+from lyapnet.errors import UsageError
+
+
+def animate(
+    checkpoint: Checkpoint,
+    out: Annotated[Path, typer.Option(help="The file: a .gif, or an .mp4 where ffmpeg is installed.")],
+    start: Annotated[
+        str | None, typer.Option("--from", help="The initial state, as x_1,x_2,…", metavar="STATE")
+    ] = None,
+    samples: Annotated[int, typer.Option(min=1, max=16, help="Closed loops from X₀, without --from.")] = 5,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
+    rate: Annotated[float, typer.Option("--frames-per-second", help="Of the animation.")] = 20.0,
+    speed: Annotated[
+        float | None, typer.Option(help="1 is real time; without it, that or what makes 3 to 10 s.")
+    ] = None,
+    system: System = None,
+    network: Network = None,
+    cost: Cost = None,
+    controls: Controls = None,
+    constraints: Constraints = None,
+    program: Program = None,
+    at: At = None,
+    debug: Debug = False,
+) -> None:
+    """Show closed loops in motion, beside their controls, cost and V.
+
+    The shapes are those of the system's `draw`; of a system without any, it is the plane of two states with level sets
+    of V(t, ·).
+    """
+    from lyapnet.evaluation.animation import Film
+    from lyapnet.random_streams import FIGURES, stream
+
+    controller = load_controller(
+        checkpoint,
+        at,
+        system=system,
+        network=network,
+        cost=cost,
+        controls=controls,
+        constraints=constraints,
+        program=program,
+    )
+    if start is None:
+        x0 = controller.initial_states.sample(samples, stream(seed, FIGURES))
+    else:
+        try:
+            x0 = controller.initial_states.lower.new_tensor([[float(entry) for entry in start.split(",")]])
+        except ValueError as error:
+            raise UsageError(f"Expected --from as numbers, got {start!r}; as in --from 0.5,-0.2.") from error
+    notes = Console(highlight=False, markup=False)
+    with notes.status("animating …"):
+        film = Film(controller.rollout(x0), controller.problem, controller.value, rate, speed)
+        film.write(out)
+    notes.print(f"wrote {out}", soft_wrap=True)

@@ -1,0 +1,300 @@
+"""Closed loops in motion: the system's own shapes, or the plane of two states, beside controls and cost."""
+
+import io
+import math
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, FancyArrowPatch
+from matplotlib.patches import Polygon as Patch
+from PIL import Image
+
+from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
+from lyapnet.errors import UsageError, one_line
+from lyapnet.evaluation.figures import Slice, widest_axes
+from lyapnet.files import write_atomically
+from lyapnet.problem import Problem
+from lyapnet.rollout import Trajectory
+from lyapnet.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
+from lyapnet.types import Value
+
+SHORTEST, LONGEST = 3.0, 10.0  # seconds of an animation whose speed nobody gave
+BEHIND = 0.18  # opacity of all closed loops but the first, where their shapes overlap
+
+
+class Film:
+    """Closed loops in motion, frame by frame.
+
+    The left panel has the shapes that the system draws: the first closed loop's, in the background those of the others,
+    and in red the goal's. Of a system without shapes it has the plane of X₀'s two widest states, with level sets of
+    V(t, ·) through the centre of X₀ in the others. On the right are the controls with their limits, and the cost to
+    go with V, of the first closed loop in full colour.
+
+    Args:
+        trajectory: a batch (b,) of closed loops of a V.
+        problem: theirs.
+        V: of the level sets.
+        rate: frames per second.
+        speed: of the animation's time against the system's; None: 1, or what makes it 3 to 10 s long.
+
+    Raises:
+        UsageError: a rate or a speed that is no positive number; or a `draw` that fails.
+    """
+
+    def __init__(
+        self, trajectory: Trajectory, problem: Problem, V: Value, rate: float = 20.0, speed: float | None = None
+    ):
+        duration = float(trajectory.t[-1])
+        if speed is None:
+            speed = duration / min(max(duration, SHORTEST), LONGEST)
+        for name, value in (("frames per second", rate), ("speed", speed)):
+            if not 0 < value < math.inf:
+                raise UsageError(f"Expected {name} > 0, got {value}; as in 20 frames per second at speed 1.")
+        self.problem, self.V, self.rate, self.speed = problem, V, rate, speed
+        self.t, self.x, self.u = (numpy_of(part) for part in (trajectory.t, trajectory.x, trajectory.u))
+        self.to_go = numpy_of(trajectory.cost - trajectory.running_cost)
+        self.value = numpy_of(trajectory.require_value())
+        count = max(2, round(duration / speed * rate) + 1)
+        self.nodes: list[int] = np.linspace(0, len(self.t) - 1, count).round().astype(int).tolist()
+        self.figure = Figure(figsize=(8.6, 4.3), layout="constrained")
+        drawn = [self._shapes(node, 0) for node in (0, len(self.u))]
+        self._scene = self._stage() if any(drawn) else self._plane()
+        self._curves = self._panels()
+        self._canvas = FigureCanvasAgg(self.figure)
+        self.figure.set_dpi(110)
+
+    def frames(self) -> Iterator[np.ndarray]:
+        """Each frame as (height, width, 3) bytes; the sides are even, as video formats want them."""
+        canvas = self._canvas
+        canvas.draw()  # what does not move, once for all frames
+        still = canvas.copy_from_bbox(self.figure.bbox)
+        for node in self.nodes:
+            canvas.restore_region(still)
+            for line, times, values in self._curves:
+                line.set_data(times[: node + 1], values[: node + 1])
+                line.axes.draw_artist(line)
+            self._clock.set_text(f"t = {self.t[node]:.2f} s")
+            self._panel.draw_artist(self._clock)
+            for artist in self._scene(node):
+                self._panel.draw_artist(artist)
+                artist.remove()
+            frame = np.array(canvas.buffer_rgba())[..., :3]
+            yield frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
+
+    def gif(self) -> bytes:
+        """The animation as a GIF that repeats."""
+        palette = _palette()
+        images = (Image.fromarray(frame) for frame in self.frames())
+        first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+        buffer, pause = io.BytesIO(), 1000 / self.rate
+        pauses = [round(pause)] * len(others) + [1000]  # the end stays for a second
+        first.save(buffer, "GIF", save_all=True, append_images=others, duration=pauses, loop=0, optimize=False)
+        return buffer.getvalue()
+
+    def mp4(self) -> bytes:
+        """The animation as an MP4 video, made by ffmpeg.
+
+        Raises:
+            UsageError: there is no ffmpeg, or it fails.
+        """
+        program = shutil.which("ffmpeg")
+        if program is None:
+            raise UsageError("Expected ffmpeg for an MP4, got none in PATH; install it, or write a .gif.")
+        frames = self.frames()
+        first = next(frames)
+        size = f"{first.shape[1]}x{first.shape[0]}"
+        raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(self.rate), "-i", "-"]
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder, "film.mp4")
+            command = [program, "-loglevel", "error", *raw, "-pix_fmt", "yuv420p", str(target)]
+            content = b"".join(frame.tobytes() for frame in (first, *frames))
+            made = subprocess.run(command, input=content, capture_output=True)
+            if made.returncode:
+                raise UsageError(f"Expected ffmpeg to make an MP4, got: {one_line(made.stderr.decode())[:200]}.")
+            return target.read_bytes()
+
+    def write(self, path: Path) -> None:
+        """Write the animation, all or nothing: a .gif, or an .mp4.
+
+        Raises:
+            UsageError: another ending; or no ffmpeg for an MP4.
+            OSError: the file cannot be written.
+        """
+        makers = {".gif": self.gif, ".mp4": self.mp4}
+        if path.suffix not in makers:
+            raise UsageError(f"Expected a file that ends in .gif or .mp4, got {str(path)!r}; name it so.")
+        write_atomically(path, makers[path.suffix]())
+
+    def _shapes(self, node: int, loop: int) -> Sequence[Shape]:
+        return shapes_of(self.problem, self.x[node, loop], self.u[min(node, len(self.u) - 1), loop])
+
+    def _left(self) -> Axes:
+        self._grid = self.figure.add_gridspec(1, 2, width_ratios=(1, 1))
+        panel = self.figure.add_subplot(self._grid[0])
+        self._panel, self._clock = panel, panel.set_title("t = 0.00 s", loc="left", fontsize=9, animated=True)
+        note = "" if math.isclose(self.speed, 1) else f"{self.speed:.2g} × real time"
+        panel.set_title(note, loc="right", fontsize=8, color=GREY)
+        return panel
+
+    def _stage(self) -> Any:
+        """The panel of the system's shapes; what puts those of a node into it."""
+        panel, problem = self._left(), self.problem
+        shown = [self._shapes(node, loop) for node in self.nodes for loop in range(self.x.shape[1])]
+        goal = shapes_of(problem, numpy_of(problem.goal), numpy_of(problem.rest))
+        corners = np.concatenate([corners_of(shape) for shapes in (*shown, goal) for shape in shapes])
+        low, high = corners.min(0), corners.max(0)
+        side = 1.1 * max(float((high - low).max()), 1e-9) / 2
+        panel.set(xlim=(low + high)[0] / 2 + [-side, side], ylim=(low + high)[1] / 2 + [-side, side])
+        panel.set_aspect("equal")
+        panel.set_xlabel("(m)", fontsize=8)
+        panel.tick_params(labelsize=7)
+        panel.grid(color="#EEEEEE", linewidth=0.6)
+        panel.set_axisbelow(True)
+        for shape in goal:
+            panel.add_artist(_artist(shape, VERMILION, 0.35))
+
+        def put(node: int) -> Iterator[Artist]:
+            for loop in reversed(range(self.x.shape[1])):
+                for shape in self._shapes(node, loop):
+                    yield panel.add_artist(_artist(shape, BLUE, BEHIND if loop else 1.0))
+
+        return put
+
+    def _plane(self) -> Any:
+        """The panel of two states with level sets of V; what puts those of a node into it."""
+        panel, problem = self._left(), self.problem
+        if problem.system.n < 2:
+            raise UsageError(f"Expected {problem.system.title}.draw, got none, and one state has no plane; write it.")
+        i, j = (*widest_axes(problem.initial_states), 1, 0)[:2]
+        for axis, index in (("x", i), ("y", j)):
+            getattr(panel, f"set_{axis}label")(problem.system.state_labels[index], fontsize=8)
+        low, high = self.x.min((0, 1))[[i, j]], self.x.max((0, 1))[[i, j]]
+        margin = 0.06 * np.maximum(high - low, 1e-9)
+        panel.set_xlim(low[0] - margin[0], high[0] + margin[0])
+        panel.set_ylim(low[1] - margin[1], high[1] + margin[1])
+        panel.tick_params(labelsize=7)
+        panel.plot(*numpy_of(problem.goal)[[i, j]], "*", color=VERMILION, markersize=10)
+        region = _grid(problem, (i, j), low - margin, high + margin)
+        first = self._values(0, region)
+        levels = np.quantile(first, np.linspace(0.03, 0.97, 9))
+        levels = levels[np.append(True, np.diff(levels) > 0)]
+
+        def put(node: int) -> Iterator[Artist]:
+            coordinates = [numpy_of(line) for line in region.grid]
+            yield panel.contour(*coordinates, self._values(node, region), levels=levels, colors=GREY, linewidths=0.7)
+            for loop in range(self.x.shape[1]):
+                path = self.x[: node + 1, loop][:, [i, j]]
+                yield from panel.plot(*path.T, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
+                yield from panel.plot(*path[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
+
+        return put
+
+    def _values(self, node: int, region: Slice) -> np.ndarray:
+        with torch.no_grad():
+            values = self.V(torch.as_tensor(self.t[node]).to(region.states), region.states)
+        return numpy_of(values).reshape([len(line) for line in region.grid]).T
+
+    def _panels(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
+        """The panels of the controls and of the cost; their lines that grow, with times and values."""
+        system, limits = self.problem.system, self.problem.controls.limits
+        rows = min(system.m, 4)
+        grid = self._grid[1].subgridspec(rows + 1, 1)
+        panels: list[Axes] = [*grid.subplots(sharex=True, squeeze=False)[:, 0]]
+        growing = []
+        for k, panel in enumerate(panels[:-1]):
+            panel.set_ylabel(system.control_labels[k].replace(" (", "\n("), fontsize=8)
+            for limit in limits or ():
+                if math.isfinite(height := float(limit.expand(system.m)[k])):
+                    panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
+            growing += self._lines(panel, self.u[..., k], GREEN)
+        last = panels[-1]
+        growing += self._lines(last, self.to_go, ORANGE, "cost to go")
+        growing += self._lines(last, self.value, BLUE, "V(t, x)", "--", others=False)
+        last.set_ylabel("cost", fontsize=8)
+        last.set_xlabel("time (s)", fontsize=8)
+        last.set_xlim(0, self.t[-1])
+        last.legend(fontsize=7, frameon=False, loc="upper right")
+        for panel in panels:
+            panel.tick_params(labelsize=7)
+        return growing
+
+    def _lines(
+        self, panel: Axes, values: np.ndarray, color: str, label: str = "", style: str = "-", others: bool = True
+    ) -> list[tuple[Any, np.ndarray, np.ndarray]]:
+        """The curves (N or N + 1, b) of all closed loops, faint, and the line of the first, which grows."""
+        times = self.t[: len(values)]
+        shown = values if others else values[:, :1]
+        panel.plot(times, shown, color=color, linewidth=0.7, alpha=0.25, linestyle=style)
+        lines = panel.plot([], [], color=color, linewidth=1.3, linestyle=style, label=label or None, animated=True)
+        return [(lines[0], times, values[:, 0])]
+
+
+def shapes_of(problem: Problem, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+    """What the system draws in a state (n,) under a control (m,).
+
+    Raises:
+        UsageError: its `draw` fails, or returns something else.
+    """
+    system = problem.system
+    try:
+        shapes = list(system.draw(np.asarray(x, dtype=float), np.asarray(u, dtype=float)))
+        finite = all(isinstance(s, Shape) and np.isfinite(corners_of(s)).all() and corners_of(s).size for s in shapes)
+    except Exception as error:  # of any kind: the system may be the user's
+        raise UsageError(
+            f"Expected {system.title}.draw(x, u) of arrays ({system.n},) and ({system.m},), got {one_line(error)}; "
+            "return Line, Disk, Polygon and Arrow of lyapnet.shapes."
+        ) from error
+    if not finite:
+        raise UsageError(
+            f"Expected {system.title}.draw to return Line, Disk, Polygon and Arrow of lyapnet.shapes at finite points "
+            f"(x, y), got {shapes}; correct it."
+        )
+    return shapes
+
+
+def _artist(shape: Shape, color: str, alpha: float) -> Artist:
+    match shape:
+        case Line(points, width, faint):
+            tint = GREY if faint else color
+            return Line2D(*np.asarray(points).T, color=tint, linewidth=width, alpha=alpha, solid_capstyle="round")
+        case Disk(center, radius):
+            return Circle(tuple(np.asarray(center)), radius, color=color, alpha=alpha, linewidth=0)
+        case Polygon(points):
+            return Patch(np.asarray(points), closed=True, color=color, alpha=alpha, linewidth=0)
+        case Arrow(tail, head):
+            tint = ORANGE if color == BLUE else color
+            return FancyArrowPatch(
+                tuple(np.asarray(tail)), tuple(np.asarray(head)), arrowstyle="-|>", mutation_scale=9, color=tint,
+                alpha=alpha, shrinkA=0, shrinkB=0, linewidth=1.5,
+            )  # fmt: skip
+
+
+def _palette() -> Image.Image:
+    """The colours of all figures, each in steps to white, and greys: at most 256."""
+    named = [to_rgb(color) for color in (BLUE, GREEN, ORANGE, VERMILION, GREY, "black")]
+    shades = [1 - (1 - np.array(color)) * share for color in named for share in np.linspace(1, 0, 42)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette((np.array(shades) * 255).round().astype(int).flatten().tolist())
+    return palette
+
+
+def _grid(problem: Problem, axes: tuple[int, int], low: np.ndarray, high: np.ndarray, points: int = 41) -> Slice:
+    """A grid of two states, the others at the centre of X₀."""
+    like = problem.initial_states.center
+    grid = [torch.linspace(float(a), float(b), points).to(like) for a, b in zip(low, high, strict=True)]
+    mesh = torch.meshgrid(*grid, indexing="ij")
+    states = like.repeat(points**2, 1)
+    states[:, list(axes)] = torch.stack([component.flatten() for component in mesh], -1)
+    return Slice(axes, grid, states)

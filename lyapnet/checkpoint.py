@@ -26,7 +26,27 @@ UNREADABLE = (
     pickle.UnpicklingError, zipfile.BadZipFile,
 )  # fmt: skip
 KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
+ZOO = Path(__file__).parent / "zoo"  # the controllers that come with lyapnet, NAME.ckpt with NAME.json
 DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.2
+
+
+def located(path: str | Path) -> Path:
+    """Where a checkpoint lies: the path itself, or that of zoo:NAME among the controllers that come with lyapnet.
+
+    Raises:
+        UsageError: no such controller; names those that there are.
+    """
+    scheme, separator, name = str(path).partition(":")
+    if scheme != "zoo" or not separator or Path(path).exists():
+        return Path(path)
+    if name not in (known := zoo_names()):
+        raise UsageError(f"Expected zoo:NAME with one of {', '.join(known)}, got {str(path)!r}; see lyapnet zoo.")
+    return ZOO / f"{name}.ckpt"
+
+
+def zoo_names() -> list[str]:
+    """The controllers that come with lyapnet."""
+    return sorted(path.stem for path in ZOO.glob("*.ckpt"))
 
 
 def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dict[str, Any]:
@@ -39,6 +59,7 @@ def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dic
         CheckpointError: truncated, changed since it was written, not a checkpoint of lyapnet's, or holding anything but
             plain data.
     """
+    path = located(path)
     content = read_plain_data(path, device)
     if not isinstance(content, dict) or not all(isinstance(content.get(k), dict) for k in (KEY, "state_dict")):
         raise CheckpointError(

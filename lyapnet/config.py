@@ -31,7 +31,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
-    "rollout": {"policy": "sampled", "gradient": "discrete", "costate_limit": 5},
+    "rollout": {"policy": "sampled", "gradient": "discrete"},
     "training": {
         "iterations": 400,
         "batch_size": 32,
@@ -43,6 +43,7 @@ STANDARD: dict[str, Any] = {
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},
 }
+COSTATE_LIMIT = 5  # that of the recipe, for the value program between limits of the controls
 
 
 @dataclass
@@ -294,16 +295,19 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
     recipe = dict(STANDARD)
-    if _names_constraints(content.get("constraints") or {}, overrides):
+    if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
-    route = STANDARD["rollout"]["gradient"]
-    if _asked("rollout.gradient", sections.get("rollout", {}).get("gradient", route), overrides) != route:
-        recipe["rollout"] = {key: value for key, value in recipe["rollout"].items() if key != "costate_limit"}
+    wanted = {
+        f"{part}.{key}": _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
+        for part, key in (("program", "name"), ("rollout", "gradient"))
+    }
+    exact = wanted != {"program.name": "value", "rollout.gradient": "discrete"}
+    if not exact and _names(("lower", "upper"), "controls", content, overrides):
+        recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
-    program = standard["program"]
-    known = PROGRAMS.get(_asked("program.name", program["name"], overrides))
+    known = PROGRAMS.get(wanted["program.name"])
     weights = {} if known is None else known.recommended
-    return {**content, **standard, "program": {**weights, **program}}
+    return {**content, **standard, "program": {**weights, **standard["program"]}}
 
 
 def _asked(key: str, given: Any, overrides: Sequence[str]) -> str:
@@ -311,13 +315,14 @@ def _asked(key: str, given: Any, overrides: Sequence[str]) -> str:
     return str([given, *(each.partition("=")[2] for each in overrides if each.startswith(f"{key}="))][-1])
 
 
-def _names_constraints(section: Mapping[str, Any], overrides: Sequence[str]) -> bool:
-    """Whether a file or the command line asks for a constraint, and not for its margin alone."""
-    named = ("lower", "upper", "outside", "inside", "name")
-    if any(section.get(key) and section[key] != ConstraintsConfig.name for key in named):
+def _names(keys: Sequence[str], section: str, content: Mapping[str, Any], overrides: Sequence[str]) -> bool:
+    """Whether a file or the command line gives a section one of some keys."""
+    written = content.get(section) or {}
+    if any(written.get(key) not in (None, {}, [], ConstraintsConfig.name) for key in keys):
         return True
-    given = (each.partition("=") for each in overrides if each.startswith("constraints"))
-    return any(key != "constraints.margin" and value not in ("", "{}", "null") for key, _, value in given)
+    given = (each.partition("=") for each in overrides)
+    named = tuple(f"{section}.{key}" for key in keys)
+    return any((key == section or key.startswith(named)) and value not in ("", "{}", "null") for key, _, value in given)
 
 
 def to_plain(config: Config) -> dict[str, Any]:

@@ -32,7 +32,7 @@ LEVELS = (
     {"controller"},
     {"evaluation", "export", "loading"},
     {"certification"},
-    {"bench", "training"},
+    {"bench", "training", "zoo"},
     {"comparison"},
     {"cli"},
     {"__main__"},

@@ -105,7 +105,7 @@ class SoundClaim:
         if self.counterexample is not None:
             return "the condition fails close to what X₀ needs"
         if self.crossing <= self.wanted:
-            return "closed loops of the funnel that X₀ needs may cross a constraint, or begin beyond it"
+            return "closed loops of the funnel that X₀ needs may cross a constraint or begin beyond it, as time allowed"
         return "the funnel meets the boundary of D: choose a larger set"
 
     def guaranteed_cost(self, value: PerState) -> PerState:

@@ -6,7 +6,17 @@ from typing import Annotated, Any
 import typer
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
-Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run.", metavar="CKPT")]
+
+
+def _located(path: Path) -> Path:
+    from lyapnet.checkpoint import located  # torch takes seconds: only where a checkpoint is named
+
+    return located(path)
+
+
+Checkpoint = Annotated[
+    Path, typer.Argument(help="A checkpoint of a run, or zoo:NAME.", metavar="CKPT", callback=_located)
+]
 System = Annotated[str | None, typer.Option(help="module:Class of a system of your own.")]
 Network = Annotated[str | None, typer.Option(help="module:Class of a network of your own.")]
 Cost = Annotated[str | None, typer.Option(help="module:Class of a cost of your own.")]

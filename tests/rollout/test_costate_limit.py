@@ -4,8 +4,6 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.build import build_rollout, build_value_function
-from lyapnet.build.problem import build_problem
 from lyapnet.config import load_config
 from lyapnet.policy import HJBPolicy
 from lyapnet.rollout import Rollout
@@ -85,9 +83,20 @@ def test_a_limit_without_meaning_is_refused(gradient, limit, pendulum):
         Rollout(rollout.problem, rollout.closed_loop.policy, "euler", gradient, costate_limit=limit)
 
 
-@pytest.mark.parametrize(("gradient", "expected"), [("discrete", 5.0), ("adjoint", None)])
-def test_the_recipe_has_one_where_there_is_a_discrete_costate(gradient, expected):
-    config = load_config(CONF / "pendulum_swingup.yaml", [f"rollout.gradient={gradient}", "horizon.steps=5"])
-    problem = build_problem(config)
-    rollout = build_rollout(config, problem, build_value_function(config, problem))
-    assert (rollout.discrete and rollout.discrete.costate_limit) == expected
+@pytest.mark.parametrize(
+    ("name", "overrides", "expected"),
+    [
+        ("pendulum_limited", [], 5.0),
+        ("pendulum_limited", ["rollout.gradient=adjoint"], None),
+        ("pendulum_limited", ["program.name=lyapunov"], None),
+        ("pendulum_limited", ["rollout.costate_limit=7"], 7.0),
+        ("pendulum_limited", ["rollout.costate_limit=null"], None),
+        ("pendulum_swingup", [], None),
+        ("pendulum_swingup", ["controls.lower=0"], 5.0),
+        ("pendulum_swingup", ["controls={lower: -8, upper: 8}"], 5.0),
+        ("pendulum_swingup", ["constraints.upper.velocity=9"], None),
+    ],
+)
+def test_the_recipe_has_one_for_the_value_program_between_limits(name, overrides, expected):
+    config = load_config(CONF / f"{name}.yaml", overrides)
+    assert config.rollout.costate_limit == expected

@@ -1,0 +1,83 @@
+"""lyapnet zoo and lyapnet demo: the controllers that come with lyapnet."""
+
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from lyapnet.cli.options import Debug
+
+STATES = 1000  # that a demonstration draws for its certificate
+
+
+def zoo(debug: Debug = False) -> None:
+    """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
+    from lyapnet.certification.tables import floored
+    from lyapnet.zoo import entries
+
+    table = Table(Column("zoo:", no_wrap=True), "cost / optimum", "worst state", "error of V", "certified share of X₀")
+    table.title = "Controllers that come with lyapnet"
+    for one in entries():
+        found, certificate = one.record["evaluation"], one.record["certificate"]
+        table.add_row(
+            one.name,
+            f"{found['cost_ratio']:.4f}",
+            f"{one.record['worst_ratio']:.4f}",
+            f"{found['value_error']:.2%}",
+            f"≥ {floored(certificate['probability_lower_bound'])}",
+        )
+    console = Console(highlight=False, markup=False)
+    console.print(table)
+    console.print("lyapnet demo NAME shows one; zoo:NAME stands for its checkpoint in any command.")
+
+
+def demo(
+    name: Annotated[str, typer.Argument(help="Of lyapnet zoo.", metavar="NAME")] = "cartpole_limited",
+    out: Annotated[Path | None, typer.Option(help="The folder; else lyapnet_demo/NAME.", metavar="FOLDER")] = None,
+    debug: Debug = False,
+) -> None:
+    """Show a controller that comes with lyapnet: against the optimum, certified, drawn and in motion; no training."""
+    began = time.monotonic()
+    from lyapnet.certification.sampling_certificates import statistical_certificate
+    from lyapnet.evaluation.animation import Film
+    from lyapnet.evaluation.figures import trajectories
+    from lyapnet.zoo import entry
+
+    one, folder = entry(name), out or Path("lyapnet_demo", name)
+    console = Console(highlight=False, markup=False)
+    with console.status("rolling out …"):
+        trajectory, ratio, error = one.measured()
+        controller = one.load()
+        certificate = statistical_certificate(controller, STATES, 1 - 1e-3, 0.95)
+        shown = controller.rollout(trajectory.x[0, :5])
+        folder.mkdir(parents=True, exist_ok=True)
+        trajectories(shown, controller.problem).savefig(folder / "trajectories.png", dpi=150)
+        Film(shown, controller.problem, controller.value).write(folder / "closed_loops.gif")
+    console.print(_table(one.name, trajectory, ratio, error, certificate))
+    console.print(f"{'made by':<10}{one.record['command']}", soft_wrap=True)
+    console.print(f"{'wrote':<10}{folder / 'trajectories.png'}, {folder / 'closed_loops.gif'}", soft_wrap=True)
+    for what, command in (
+        ("measure", f"lyapnet evaluate zoo:{name}"),
+        ("certify", f"lyapnet certify statistical zoo:{name}"),
+        ("export", f"lyapnet export zoo:{name} --to c --out law"),
+        ("use", f'lyapnet.load("zoo:{name}")'),
+    ):
+        console.print(f"{what:<10}{command}", soft_wrap=True)
+    console.print(f"{time.monotonic() - began:.1f} s")
+
+
+def _table(name: str, trajectory: Any, ratio: float, error: float, certificate: Any) -> Table:
+    from lyapnet.certification.tables import floored
+
+    states = trajectory.x.shape[1]
+    table = Table("measure", "value", title=f"zoo:{name}, {states} states of X₀ that no training saw")
+    table.add_row("cost / optimum, ratio of the means", f"{ratio:.4f}")
+    table.add_row("value error, mean |V(0, x₀) − J*| / mean J*", f"{error:.2%}")
+    *conditions, _ = certificate.in_formulas()
+    share = f"share of X₀ with {', '.join(conditions)}, from {STATES} further states, confidence 0.999"
+    table.add_row(share, f"≥ {floored(certificate.claim.probability_lower_bound)}")
+    table.caption = "Optima from the record, computed beforehand; all else just now."
+    return table

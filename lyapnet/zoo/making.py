@@ -1,0 +1,109 @@
+"""Makes controllers of the zoo: python -m lyapnet.zoo.making [NAME …], in the folder that holds conf/.
+
+Each is one training with seed 0, then measured, certified and exported. `--from CKPT` takes a checkpoint that is
+trained already, of the same command.
+"""
+
+import argparse
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyapnet.certification.sampling_certificates import statistical_certificate
+from lyapnet.checkpoint import KEY, ZOO, read_checkpoint, write_checkpoint
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from lyapnet.evaluation.measurement import evaluation
+from lyapnet.export import export
+from lyapnet.files import write_json
+from lyapnet.loading import load
+from lyapnet.provenance import commit, versions
+
+ALONE = (
+    "acrobot", "bryson_denham", "cartpole_balancing", "cartpole_family", "cartpole_swingup", "double_integrator",
+    "landing", "pendulum_limited", "pendulum_periodic", "pendulum_swingup", "planar_quadrotor", "quadrotor", "reacher",
+    "reacher_family", "satellite", "three_link_arm",
+)  # fmt: skip
+TASKS: dict[str, list[str]] = {  # name ↦ arguments of lyapnet train --config
+    **{name: [f"conf/{name}.yaml"] for name in ALONE},
+    "cartpole_limited": ["conf/cartpole_swingup.yaml", "controls={lower: -20, upper: 20}"],
+    "reacher_limited": ["conf/reacher.yaml", "controls={lower: [-1.03, -0.37], upper: [1.03, 0.37]}"],
+}
+SAMPLES, KEPT = 256, 32  # states of the evaluation, and those whose optima the record keeps
+EVALUATED = ("cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "samples", "violated_fraction")
+
+
+def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
+    """Put a trained checkpoint into the zoo: its weights and config as NAME.ckpt, what it reaches as NAME.json.
+
+    Raises:
+        UsageError: there are no optima to compare with.
+    """
+    began, content = time.monotonic(), read_checkpoint(trained)
+    config = {**content[KEY]["config"], "experiment": name, "logs": "logs"}
+    kept = {"config": config, "problem": content[KEY]["problem"], "version": content[KEY]["version"]}
+    kept |= {key: content[KEY][key] for key in ("penalty",) if key in content[KEY]}
+    slim = {"state_dict": content["state_dict"], "global_step": content["global_step"], KEY: kept}
+    write_checkpoint(slim, folder / f"{name}.ckpt")
+    record = {
+        "command": shlex.join(["lyapnet", "train", "--config", *TASKS[name]]),
+        "seed": config["seed"],
+        "versions": {package: number for package, number in versions("torch").items() if package != "platform"},
+        "commit": commit(),
+        **_measurements(load(folder / f"{name}.ckpt"), folder / f"{name}.ckpt"),
+        "seconds": round(time.monotonic() - began),
+    }
+    write_json(folder / f"{name}.json", record)
+    return record
+
+
+def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
+    measured = evaluation(controller, SAMPLES)
+    optima = measured.table.optimal_cost
+    if optima is None or not (known := optima.isfinite()).any():
+        raise UsageError(f"Expected optima to compare with, got none ({measured.notes[0]}); install lyapnet[oracle].")
+    result = measured.result()
+    certificate = statistical_certificate(controller).result
+    with tempfile.TemporaryDirectory() as folder:
+        _, agreement = export(controller, Path(folder, "law"), "c", checkpoint, "policy")
+    return {
+        "evaluation": {key: result[key] for key in EVALUATED if key in result},
+        "worst_ratio": float((measured.table.cost / optima)[known].max()),
+        "certificate": certificate,
+        "export": {"states": agreement.states, "control": agreement.control, "value": agreement.value},
+        "states": measured.table.x0[known][:KEPT].tolist(),
+        "optima": optima[known][:KEPT].tolist(),
+    }
+
+
+def train(name: str, logs: Path) -> Path:
+    """The best checkpoint of a new training."""
+    command = [sys.executable, "-m", "lyapnet", "train", "--config", *TASKS[name]]
+    subprocess.run([*command, f"experiment={name}", f"logs={logs}"], check=True)
+    return logs / name / "version_0" / "checkpoints" / "best.ckpt"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make the controllers that are named, or all."""
+    parser = argparse.ArgumentParser(prog="python -m lyapnet.zoo.making", description=__doc__)
+    parser.add_argument("names", nargs="*", choices=[*TASKS, []], metavar="NAME", help=", ".join(TASKS))
+    parser.add_argument("--from", dest="trained", type=Path, metavar="CKPT", help="a checkpoint; of one NAME")
+    parser.add_argument("--out", type=Path, default=ZOO, help="the folder")
+    given = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    for name in given.names or TASKS:
+        with tempfile.TemporaryDirectory() as logs:
+            record = make(name, given.trained or train(name, Path(logs)), given.out)
+        found = record["evaluation"]
+        print(f"{name}: cost / optimum {found['cost_ratio']:.4f}, value error {found['value_error']:.4f}")
+
+
+if __name__ == "__main__":
+    main()

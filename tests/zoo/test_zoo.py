@@ -1,0 +1,114 @@
+"""The controllers that come with lyapnet: each as good as its record says, named everywhere as zoo:NAME."""
+
+import json
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import lyapnet
+from lyapnet.checkpoint import KEY, ZOO, located, read_checkpoint, write_checkpoint, zoo_names
+from lyapnet.cli import main
+from lyapnet.config import load_config
+from lyapnet.errors import UsageError
+from lyapnet.zoo import entry, making
+
+ROOT = Path(__file__).parents[2]
+NAMES = zoo_names()
+ONE = "cartpole_balancing"
+
+
+def test_every_checkpoint_has_its_record_and_its_command():
+    assert len(NAMES) >= 3
+    assert {path.stem for path in ZOO.glob("*.json")} == set(NAMES)
+    assert set(NAMES) <= making.TASKS.keys()
+    assert all((ROOT / arguments[0]).is_file() for arguments in making.TASKS.values())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_controller_is_as_good_as_its_record_says(name):
+    one = entry(name)
+    trajectory, ratio, error = one.measured()
+    found = one.record["evaluation"]
+    # the recorded states are the first of those that were evaluated
+    assert ratio == pytest.approx(found["cost_ratio"], abs=0.02)
+    assert ratio > 1 - 1e-6
+    assert error < 3 * found["value_error"] + 1e-3
+    assert float((trajectory.cost / torch.tensor(one.record["optima"])).max()) <= one.record["worst_ratio"] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_controller_is_of_its_command_and_names_no_folder(name):
+    content = read_checkpoint(f"zoo:{name}")
+    path, *overrides = making.TASKS[name]
+    config, own = load_config(ROOT / path, overrides), content[KEY]["config"]
+    assert own["experiment"] == name
+    assert own["logs"] == "logs"
+    for part in ("system", "cost", "controls", "initial_states", "horizon", "program"):
+        assert vars(lyapnet.load(f"zoo:{name}").config)[part] == getattr(config, part)
+    assert set(content) == {"state_dict", "global_step", KEY}
+    assert located(f"zoo:{name}").stat().st_size < 300_000
+
+
+def test_a_worse_controller_is_told_from_its_record(tmp_path):
+    # the twin of the test above: weights that are a little off
+    content = read_checkpoint(f"zoo:{ONE}")
+    weights = {key: w + 0.1 * torch.ones_like(w) * w.abs().mean() for key, w in content["state_dict"].items()}
+    write_checkpoint({**content, "state_dict": weights}, tmp_path / "worse.ckpt")
+    _, ratio, error = entry(ONE)._replace(checkpoint=tmp_path / "worse.ckpt").measured()
+    found = entry(ONE).record["evaluation"]
+    assert ratio > found["cost_ratio"] + 0.02 or error > 3 * found["value_error"] + 1e-3
+
+
+def test_names():
+    assert located(f"zoo:{ONE}") == ZOO / f"{ONE}.ckpt"
+    assert located("logs/best.ckpt") == Path("logs/best.ckpt")
+    with pytest.raises(UsageError, match=f"one of .*{ONE}"):
+        located("zoo:nothing")
+    with pytest.raises(UsageError, match="zoo:NAME"):
+        located("zoo:../zoo/" + ONE)
+
+
+def test_a_file_of_that_name_comes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path(f"zoo:{ONE}").touch()
+    assert located(f"zoo:{ONE}") == Path(f"zoo:{ONE}")
+
+
+def test_the_wheel_holds_them():
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["lyapnet"]
+    assert {"zoo/*.ckpt", "zoo/*.json"} <= set(data)
+
+
+def test_demo_and_zoo(tmp_path, capsys):
+    assert main(["demo", ONE, "--out", str(tmp_path / "shown")]) == 0
+    printed = capsys.readouterr().out
+    assert "cost / optimum" in printed
+    assert {path.name for path in (tmp_path / "shown").iterdir()} == {"trajectories.png", "closed_loops.gif"}
+
+
+def test_the_zoo_is_listed(capsys):
+    assert main(["zoo"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in NAMES)
+
+
+def test_a_command_takes_one(capsys):
+    assert main(["evaluate", f"zoo:{ONE}", "--samples", "2", "--no-optimum", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["samples"] == 2
+    assert main(["evaluate", "zoo:nothing"]) == 2
+    assert "zoo:NAME" in capsys.readouterr().err
+
+
+def test_making_strips_and_measures(tmp_path, monkeypatch):
+    pytest.importorskip("casadi")
+    monkeypatch.setattr(making, "SAMPLES", 2)
+    certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
+    monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
+    record = making.make(ONE, located(f"zoo:{ONE}"), tmp_path)
+    assert record["evaluation"]["samples"] == 2
+    assert record["command"] == "lyapnet train --config conf/cartpole_balancing.yaml"
+    assert record["export"]["control"] < 1e-9
+    assert {path.name for path in tmp_path.iterdir()} == {f"{ONE}.ckpt", f"{ONE}.json"}

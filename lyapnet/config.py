@@ -297,15 +297,14 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     recipe = dict(STANDARD)
     if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
-    wanted = {
-        f"{part}.{key}": _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
+    program, gradient = (
+        _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
-    }
-    exact = wanted != {"program.name": "value", "rollout.gradient": "discrete"}
-    if not exact and _names(("lower", "upper"), "controls", content, overrides):
+    )
+    if (program, gradient) == ("value", "discrete") and _names(("lower", "upper"), "controls", content, overrides):
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
-    known = PROGRAMS.get(wanted["program.name"])
+    known = PROGRAMS.get(program)
     weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **standard["program"]}}
 

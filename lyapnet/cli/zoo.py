@@ -49,8 +49,8 @@ def demo(
     one, folder = entry(name), out or Path("lyapnet_demo", name)
     console = Console(highlight=False, markup=False)
     with console.status("rolling out …"):
-        trajectory, ratio, error = one.measured()
         controller = one.load()
+        trajectory, ratio, error = one.measured(controller)
         certificate = statistical_certificate(controller, STATES, 1 - 1e-3, 0.95)
         shown = controller.rollout(trajectory.x[0, :5])
         folder.mkdir(parents=True, exist_ok=True)

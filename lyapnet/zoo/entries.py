@@ -23,12 +23,11 @@ class Entry(NamedTuple):
         """The controller, as lyapnet.load("zoo:NAME")."""
         return load(self.checkpoint)
 
-    def measured(self) -> tuple[Trajectory, float, float]:
-        """(closed loops from the recorded states, cost / optimum, mean |V(0, x₀) − J*| / mean J*), computed now.
+    def measured(self, controller: Controller) -> tuple[Trajectory, float, float]:
+        """(closed loops from the recorded states, cost / optimum, mean |V(0, x₀) − J*| / mean J*) of a controller.
 
         The optima J* are those of the record, so that no oracle is needed.
         """
-        controller = self.load()
         states = controller.initial_states.lower.new_tensor(self.record["states"])
         optima = states.new_tensor(self.record["optima"])
         trajectory = controller.rollout(states)

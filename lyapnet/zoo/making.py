@@ -48,16 +48,16 @@ def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
     """
     began, content = time.monotonic(), read_checkpoint(trained)
     config = {**content[KEY]["config"], "experiment": name, "logs": "logs"}
-    kept = {"config": config, "problem": content[KEY]["problem"], "version": content[KEY]["version"]}
-    kept |= {key: content[KEY][key] for key in ("penalty",) if key in content[KEY]}
+    known = {key: content[KEY][key] for key in ("problem", "version", "penalty") if key in content[KEY]}
+    kept, checkpoint = {**known, "config": config}, folder / f"{name}.ckpt"
     slim = {"state_dict": content["state_dict"], "global_step": content["global_step"], KEY: kept}
-    write_checkpoint(slim, folder / f"{name}.ckpt")
+    write_checkpoint(slim, checkpoint)
     record = {
         "command": shlex.join(["lyapnet", "train", "--config", *TASKS[name]]),
         "seed": config["seed"],
         "versions": {package: number for package, number in versions("torch").items() if package != "platform"},
         "commit": commit(),
-        **_measurements(load(folder / f"{name}.ckpt"), folder / f"{name}.ckpt"),
+        **_measurements(load(checkpoint), checkpoint),
         "seconds": round(time.monotonic() - began),
     }
     write_json(folder / f"{name}.json", record)

@@ -30,7 +30,7 @@ def test_every_checkpoint_has_its_record_and_its_command():
 @pytest.mark.parametrize("name", NAMES)
 def test_a_controller_is_as_good_as_its_record_says(name):
     one = entry(name)
-    trajectory, ratio, error = one.measured()
+    trajectory, ratio, error = one.measured(one.load())
     found = one.record["evaluation"]
     # the recorded states are the first of those that were evaluated
     assert ratio == pytest.approx(found["cost_ratio"], abs=0.02)
@@ -57,7 +57,7 @@ def test_a_worse_controller_is_told_from_its_record(tmp_path):
     content = read_checkpoint(f"zoo:{ONE}")
     weights = {key: w + 0.1 * torch.ones_like(w) * w.abs().mean() for key, w in content["state_dict"].items()}
     write_checkpoint({**content, "state_dict": weights}, tmp_path / "worse.ckpt")
-    _, ratio, error = entry(ONE)._replace(checkpoint=tmp_path / "worse.ckpt").measured()
+    _, ratio, error = entry(ONE).measured(lyapnet.load(tmp_path / "worse.ckpt"))
     found = entry(ONE).record["evaluation"]
     assert ratio > found["cost_ratio"] + 0.02 or error > 3 * found["value_error"] + 1e-3
 

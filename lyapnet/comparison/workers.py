@@ -9,7 +9,7 @@ import subprocess
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 from lyapnet.errors import UsageError, one_line
 
 LOG = "job.log"
+ASKED_EVERY = 1.0  # seconds, whether a job that runs is still wanted
 
 
 class Runnable(ABC):
@@ -43,6 +44,11 @@ class Runnable(ABC):
     @abstractmethod
     def finished(self) -> bool:
         """Whether the work is done; the command's exit status alone does not say so."""
+
+    @property
+    def given_up(self) -> bool:
+        """Whether it is to leave before its end; asked while it runs."""
+        return False
 
 
 J = TypeVar("J", bound=Runnable)
@@ -71,8 +77,8 @@ def run_jobs(
     return run_locally(jobs, workers, begun) if ray is None else run_on_ray(jobs, ray, begun)
 
 
-def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> Iterator[Outcome[J]]:
-    """The outcomes as they come, of `workers` processes at a time.
+def run_locally(jobs: Sequence[J], workers: int, begun: Callable[[J], Any]) -> Generator[Outcome[J], None, None]:
+    """The outcomes as they come, of `workers` processes at a time; closing the generator stops them.
 
     Args:
         begun: called with each job that starts.
@@ -168,7 +174,7 @@ def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lamb
         earlier = output.tell()
         process = subprocess.Popen(job.command, stdout=output, stderr=output, env={**os.environ, **threads})
         started(process)
-        status = process.wait()
+        status = _status(process, job)
     seconds = time.perf_counter() - begun
     if job.finished:
         return seconds, ""
@@ -176,3 +182,14 @@ def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lamb
     if status < 0:
         return seconds, f"stopped by {signal.Signals(-status).name}"
     return seconds, words[-1] if words else f"stopped with status {status}"
+
+
+def _status(process: subprocess.Popen, job: Runnable) -> int:
+    """With which status the process of a job ends, which is told to leave once the job is given up."""
+    while True:
+        try:
+            return process.wait(ASKED_EVERY)
+        except subprocess.TimeoutExpired:
+            if job.given_up:
+                process.terminate()
+                return process.wait()

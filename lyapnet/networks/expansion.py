@@ -20,6 +20,11 @@ ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
 NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
 
 
+def standard_widths(n: int) -> list[int]:
+    """The widths of the hidden layers for n states."""
+    return [64 if n <= FEW else 128] * 2
+
+
 class ExpansionNetwork(ValueFunction):
     """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s ρ(ξ) N(t, ξ), ξ = Cᵀδ, δ = x − x̄(t); N is zero until it is trained.
 
@@ -54,7 +59,7 @@ class ExpansionNetwork(ValueFunction):
         super().__init__()
         self.constants = list(constants)
         n = self.n = len(scaling.state)
-        hidden = [64 if n <= FEW else 128] * 2 if hidden is None else hidden
+        hidden = standard_widths(n) if hidden is None else hidden
         self.network = FCN(Scaling([1.0] * n, scaling.duration, 1.0), hidden, activation)
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)

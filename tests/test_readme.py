@@ -55,6 +55,8 @@ def brief(arguments: list[str]) -> list[str]:
         key, _, values = arguments[arguments.index("--vary") + 1].partition("=")
         value = "8" if key == "horizon.steps" else values.split(",")[0]
         return [*arguments[:3], "--vary", f"{key}={value}", "--out", "sweep", *SHORT]
+    if arguments[0] == "tune":
+        return [*with_option(arguments[:2], "--trials", "1"), "--no-final", *SHORT]
     if arguments[:2] == ["bench", "certify"]:
         return [*arguments, "--dimensions", "1", "--boxes", "2", "--repeats", "1", "--seconds", "1"]
     if arguments[0] == "compare":

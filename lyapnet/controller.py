@@ -17,11 +17,12 @@ from lyapnet.config import Config, SystemConfig
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.family import AtParameters, FamilySystem
-from lyapnet.horizon import Horizon
+from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.policy import HJBPolicy, ValuePolicy
 from lyapnet.problem import Problem
 from lyapnet.programs import Program, ValueProgram
 from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
+from lyapnet.rollout.runge_kutta import Step
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 
@@ -124,6 +125,11 @@ class Controller:
     def closed_loop(self) -> ClosedLoop:
         """(t, (x, ∫ℓ)) ↦ its derivative under u(t, x), as a module."""
         return self._rollout.closed_loop
+
+    @property
+    def step(self) -> Step:
+        """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V), one step of its rollouts; where they choose their own, one of rk4."""
+        return Step(self._rollout.stepped, TABLEAUX.get(self._rollout.solver_arguments["method"], TABLEAUX["rk4"]))
 
     @property
     def law(self) -> ContinuedPolicy:

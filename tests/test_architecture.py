@@ -32,7 +32,7 @@ LEVELS = (
     {"controller"},
     {"evaluation", "export", "loading"},
     {"certification"},
-    {"bench", "training", "zoo"},
+    {"bench", "training", "view", "zoo"},
     {"comparison"},
     {"cli"},
     {"__main__"},

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -40,36 +40,49 @@ def check(
     started, share = time.monotonic(), None
     numbers: dict[str, Any] = {}
     try:
-        content = read_content(path)
-        with refusing(path):
-            of = content["of"][0]
-            lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
-            alpha, delta, states = float(of["alpha"]), float(of["delta"]), Box(lower, upper)
-        _require_claim(controller, path, alpha, delta, states)
+        kept = kept_funnel(controller, path)
         claim = sound_claim(
-            controller.closed_loop, controller.problem, alpha, delta, states, Budget(UNLIMITED, workers=workers),
-            torch.Generator().manual_seed(0), report, path, True,
+            controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states,
+            Budget(UNLIMITED, workers=workers), torch.Generator().manual_seed(0), report, path, True,
         )  # fmt: skip
         numbers = SoundCertificate(controller, claim, {}).proved()
         verdict = "certified" if claim.verdict == "certified" else "refused"
         numbers["reason"] = None if verdict == "certified" else "a leaf is not proved, or the funnel misses some of X₀"
-        share = claim.proof_seconds / content["seconds"]
+        share = claim.proof_seconds / kept.seconds
     except UsageError as error:
         verdict, numbers["reason"] = "refused", str(error)
     seconds = time.monotonic() - started
     return plain({"kind": "check", "verdict": verdict, **numbers, "seconds": seconds, "share_of_search": share})
 
 
-def _require_claim(controller: Controller, path: Path, alpha: float, delta: float, states: Box) -> None:
-    """Refuse an unfinished proof, or that of another controller, before anything is computed.
+class KeptFunnel(NamedTuple):
+    """The funnel {V(t, x) ≤ ρ + δt} within D that a file records as proved."""
+
+    alpha: float
+    delta: float  # in cost per second
+    states: Box  # D; without width along states that nothing depends on
+    rho: float
+    seconds: float  # of the search
+
+
+def kept_funnel(controller: Controller, path: Path) -> KeptFunnel:
+    """What the file of a finished proof says of a controller; no leaf is bounded anew.
 
     Raises:
-        UsageError: it is one; or as bounded_condition.
+        UsageError: it is another file, an unfinished proof, or that of another controller; or as bounded_condition.
     """
+    content = read_content(path)
+    with refusing(path):
+        of = content["of"][0]
+        lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
+        kept = KeptFunnel(
+            float(of["alpha"]), float(of["delta"]), Box(lower, upper), float(content["proved"]), content["seconds"]
+        )
     loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
-    condition = DecreaseCondition(loop, alpha, delta, problem.constraints)
+    condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints)
     times = torch.tensor([[0.0], [controller.horizon.duration]], dtype=torch.float64)
-    lower, upper = torch.cat([times[0], states.lower]), torch.cat([times[1], states.upper])
-    if states.dimension == controller.system.n:  # sound_claim says so else
+    lower, upper = torch.cat([times[0], lower]), torch.cat([times[1], upper])
+    if kept.states.dimension == controller.system.n:  # sound_claim says so else
         of = about(bounded_condition(condition, (lower, upper)), condition, lower, upper)
         KeptProof(path, of, math.inf).claim((lower, upper))
+    return kept

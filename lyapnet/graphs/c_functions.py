@@ -37,16 +37,26 @@ def c_function(
         ExportError: an operator has no rule; names it. Or its arrays take more than STACK bytes.
     """
     text = Text(tables)
-    text.lines += [f"(void){name};" for name in arguments]  # not all functions need all of them
-    inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
-    outputs = _Reader(graph, text).run(*inputs)
-    for name, output in zip(results, outputs, strict=True):
-        text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
+    for name in arguments:  # not all functions need all of them
+        text.unused(name)
+    write_body(text, graph, arguments, results)
     if text.bytes > STACK:
         raise ExportError(
             f"Expected a law whose arrays fit on a stack, got {text.bytes / 1e6:.3g} MB; take --to torch or onnx."
         )
     return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n", text.bytes
+
+
+def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str]) -> None:
+    """Write what a trace does: from the arrays of its arguments to those of its results.
+
+    Raises:
+        ExportError: an operator has no rule; names it.
+    """
+    inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
+    outputs = _Reader(graph, text).run(*inputs)
+    for name, output in zip(results, outputs, strict=True):
+        text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
 
 
 def helpers(code: str) -> list[str]:
@@ -137,13 +147,13 @@ class _Reader(Interpreter):
             return RULES[name](self.text, *args, **kwargs)
         except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise ExportError(
-                f"Expected operations that can be written in C, got {target}; write f, g, the cost or V in others, add "
-                "a rule to lyapnet.graphs.c_rules.RULES, or take --to torch."
+                f"Expected operations that can be written in {self.text.language}, got {target}; write f, g, the cost "
+                f"or V in others, add a rule to lyapnet.graphs.c_rules.RULES, or {self.text.otherwise}."
             ) from error
         except Exception as error:  # of any kind: shapes that no rule expected
             raise ExportError(
-                f"Expected operations that can be written in C, got {target}, and {type(error).__name__}: "
-                f"{one_line(error)[:200]}; take --to torch."
+                f"Expected operations that can be written in {self.text.language}, got {target}, and "
+                f"{type(error).__name__}: {one_line(error)[:200]}; {self.text.otherwise}."
             ) from error
 
 

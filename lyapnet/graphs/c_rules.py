@@ -166,7 +166,7 @@ def _extreme(relation: str) -> Callable[..., Any]:
         line = f"if ({further}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
         for k in range(1, x.shape[dim]):
             text.each(value.shape, [Array(x.name, x.layout.select(dim, k)), value, float(k)], line, index)
-        text.lines.append(f"(void){index.name};")
+        text.unused(index.name)
         found = value, index
         return [Array(y.name, y.layout.unsqueeze(dim)) if keepdim else y for y in found]
 
@@ -190,7 +190,7 @@ def _gather(text: Text, x: Any, dim: int, index: Any, *, sparse_grad: bool = Fal
     first = x.layout.narrow(dim, 0, 1).as_strided(index.shape, [
         0 if axis == dim % len(x.shape) else stride for axis, stride in enumerate(x.layout.stride())
     ])  # fmt: skip
-    line = f"{{into}} = (&{{0}})[{x.layout.stride(dim)} * (int){{1}}];"
+    line = f"{{into}} = {{0.name}}[{{0.index}} + {x.layout.stride(dim)} * {text.whole}{{1}}];"
     return text.each(index.shape, [Array(x.name, first), index], line, text.new(index.shape))
 
 
@@ -201,7 +201,8 @@ def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
         raise NotImplementedError
     steps = [0 if axis == dim % len(whole.shape) else step for axis, step in enumerate(whole.layout.stride())]
     first = Array(whole.name, whole.layout.as_strided(index.shape, steps))
-    text.each(index.shape, [index, source], f"(&{{into}})[{whole.layout.stride(dim)} * (int){{0}}] = {{1}};", first)
+    place = f"{{into.name}}[{{into.index}} + {whole.layout.stride(dim)} * {text.whole}{{0}}]"
+    text.each(index.shape, [index, source], f"{place} = {{1}};", first)
     return whole
 
 

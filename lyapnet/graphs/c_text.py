@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,8 +24,18 @@ class Array:
         return self.layout.shape
 
 
+class Place(NamedTuple):
+    """An entry of an array, as it is written."""
+
+    name: str
+    index: str
+
+    def __str__(self) -> str:
+        return f"{self.name}[{self.index}]"
+
+
 class Tables:
-    """The constants of C functions: each written once."""
+    """The constants of functions: each written once."""
 
     def __init__(self) -> None:
         self.text: list[str] = []
@@ -37,21 +47,27 @@ class Tables:
         key = tuple(numbers.shape), numbers.numpy().tobytes()
         if key not in self._known:
             name = f"w{len(self._known)}"
-            entries = [literal(number) for number in numbers.flatten().tolist()] or ["0.0"]
-            rows = [", ".join(entries[i : i + PER_LINE]) for i in range(0, len(entries), PER_LINE)]
-            self.text.append(
-                f"static const double {name}[{len(entries)}] = {{\n    {f',{chr(10)}    '.join(rows)}}};\n"
-            )
+            self.text.append(self.written(name, numbers))
             self._known[key] = Array(name, torch.empty(numbers.shape, device="meta"))
         return self._known[key]
 
+    def written(self, name: str, numbers: Tensor) -> str:
+        """A table in float64, as text."""
+        entries = [literal(number) for number in numbers.flatten().tolist()] or ["0.0"]
+        rows = [", ".join(entries[i : i + PER_LINE]) for i in range(0, len(entries), PER_LINE)]
+        return f"static const double {name}[{len(entries)}] = {{\n    {f',{chr(10)}    '.join(rows)}}};\n"
+
 
 class Text:
-    """The body of a C function, line by line.
+    """The body of a C function, line by line; that of a similar language where a class derived from it says how.
 
     Args:
         tables: takes its constants.
     """
+
+    language, otherwise = "C", "take --to torch"  # for messages
+    counter = "int"  # how one is declared
+    whole = "(int)"  # makes an index of a number
 
     def __init__(self, tables: Tables):
         self.tables, self.lines, self.bytes, self._count = tables, list[str](), 0, 0
@@ -61,11 +77,21 @@ class Text:
         name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
         size = max(1, layout.numel())
         self._count, self.bytes = self._count + 1, self.bytes + 8 * size
-        self.lines.append(f"double {name}[{size}];")
+        self.declare(name, size)
         return Array(name, layout)
+
+    def declare(self, name: str, size: int) -> None:
+        """Write a new array."""
+        self.lines.append(f"double {name}[{size}];")
+
+    def unused(self, name: str) -> None:
+        """Write that an array may serve nobody, which a compiler would point out else."""
+        self.lines.append(f"(void){name};")
 
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
         """Write a line at every index of a shape: {0}, {1}, … are the values there, and {into} is where it goes.
+
+        An array's value is a Place.
 
         Args:
             values: Arrays, tensors or numbers, each broadcast.
@@ -74,16 +100,16 @@ class Text:
         arrays = [value if isinstance(value, Array) else self._constant(value) for value in (*values, into)]
         layouts = [array.layout.expand(tuple(shape)) if isinstance(array, Array) else None for array in arrays]
         axes = _axes(shape, [layout for layout in layouts if layout is not None])
-        places, column = list[str](), 0
+        places, column = list[Any](), 0
         for array, layout in zip(arrays, layouts, strict=True):
             if isinstance(array, str) or layout is None:
-                places.append(str(array))
+                places.append(array)
                 continue
             steps = [(f"i{k}", strides[column]) for k, (_, strides) in enumerate(axes)]
-            places.append(f"{array.name}[{_index(int(layout.storage_offset()), steps)}]")
+            places.append(Place(array.name, _index(int(layout.storage_offset()), steps)))
             column += 1
         for k, (size, _) in enumerate(axes):
-            self.lines.append(f"{'    ' * k}for (int i{k} = 0; i{k} < {size}; i{k}++)")
+            self.lines.append(f"{'    ' * k}for ({self.counter} i{k} = 0; i{k} < {size}; i{k}++)")
         self.lines.append("    " * len(axes) + line.format(*places[:-1], into=places[-1]))
         return into
 

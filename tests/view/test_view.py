@@ -1,0 +1,77 @@
+"""The page of a controller: it says what the controller says, answers a slider and clicks, and refuses clearly."""
+
+import re
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from lyapnet.cli import main
+from lyapnet.errors import UsageError
+from lyapnet.view import page_of
+from tests.problems import untrained
+
+pytest.importorskip("plotly")
+BROWSER = shutil.which("chromium-headless-shell") or shutil.which("chromium")
+FIXTURE = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"
+ACT = """<script>window.addEventListener("load", async () => {
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms)), told = [];
+  const tell = () => told.push([chosen.t, chosen.loops.length, element("plane").data[0].z[0][0]].join());
+  const slide = async () => {
+    element("t").value = 3;
+    element("t").dispatchEvent(new Event("input"));
+    await pause(300);
+  };
+  const click = async () => {
+    const drag = document.querySelector("#plane .nsewdrag"), box = drag.getBoundingClientRect();
+    const place = { clientX: box.left + 0.3 * box.width, clientY: box.top + 0.4 * box.height };
+    const send = (to, kind) => to.dispatchEvent(new MouseEvent(kind, { ...place, bubbles: true, view: window }));
+    send(drag, "mousemove"); await pause(300);
+    send(drag, "mousedown"); await pause(20);
+    send(document.querySelector(".dragcover") || drag, "mouseup"); await pause(500);
+  };
+  tell(); await slide(); tell(); await click(); tell();
+  document.title = told.join(" ");
+});</script></body>"""
+
+
+def shown(page, folder):
+    """What a browser makes of a page: the title that ACT leaves, and the line of the check."""
+    if BROWSER is None:
+        pytest.skip("no chromium-headless-shell or chromium")
+    path = folder / "page.html"
+    path.write_text(ACT.join(page.rsplit("</body>", 1)), encoding="utf-8")
+    options = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--virtual-time-budget=10000", "--dump-dom"]
+    done = subprocess.run([BROWSER, *options, f"file://{path}"], capture_output=True, text=True, timeout=60, check=True)
+    return re.findall(r"<title>(.*?)</title>", done.stdout)[0], re.findall(r'id="check"[^>]*>(.*?)</p>', done.stdout)[0]
+
+
+def test_a_slider_and_a_click_change_what_is_drawn(tmp_path):
+    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    assert len(page) < 8e6
+    title, check = shown(page, tmp_path)
+    before, later, clicked = (state.split(",") for state in title.split())
+    assert before[0] == "0"
+    assert float(later[0]) > 0
+    assert before[2] != later[2]
+    assert [before[1], later[1], clicked[1]] == ["0", "0", "1"]
+    assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9
+
+
+def test_a_page_that_differs_from_the_controller_says_so(tmp_path):
+    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    wrong = page.replace('"V": [', '"V": [9e9, ')
+    assert "do not use it" in shown(wrong, tmp_path)[1]
+
+
+def test_a_missing_plotly_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    with pytest.raises(UsageError, match=r'pip install "lyapnet\[view\]"'):
+        page_of(untrained("pendulum_limited", "horizon.steps=6"), "pendulum")
+
+
+def test_the_command_refuses_another_ending(tmp_path, capsys, caplog):
+    assert main(["view", FIXTURE, "--out", str(tmp_path / "page.png")]) != 0
+    assert ".html" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -63,14 +63,15 @@ class Rollout(nn.Module):
             nodes. A law that is made to be held is held over each step of a fixed-step method, else it is u(t, x) at
             every stage.
         gradient: a member of GRADIENTS.
-            adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
-                to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
-                adjoint). Memory does not grow with the graph of a step; the gradient is that of the continuous
-                problem, so on a fixed grid it differs from the discrete one by O(Δt).
-            backprop: automatic differentiation through the steps; the exact gradient of the discretisation.
-            discrete: the same gradient, exact, by the discrete costate equation (see DiscreteAdjoint); several
-                times faster than either, in memory that grows with neither the network nor the graph of the steps.
-                For fixed-step methods.
+
+            * adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
+              to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
+              adjoint). Memory does not grow with the graph of a step; the gradient is that of the continuous problem,
+              so on a fixed grid it differs from the discrete one by O(Δt).
+            * backprop: automatic differentiation through the steps; the exact gradient of the discretisation.
+            * discrete: the same gradient, exact, by the discrete costate equation (see DiscreteAdjoint); several times
+              faster than either, in memory that grows with neither the network nor the graph of the steps. For
+              fixed-step methods.
         rtol, atol: tolerances of adaptive methods.
         costate_limit: with gradient discrete, times the median of its batch that a costate may be long; None: any, the
             exact gradient (see DiscreteAdjoint).

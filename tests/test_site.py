@@ -1,0 +1,75 @@
+"""The documentation site: what it needs from elsewhere, that its figures are on record, and that its tutorials run."""
+
+import csv
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.pages import ROOT
+
+DOCS = ROOT / "docs"
+LEADERBOARD = DOCS / "leaderboard.md"
+FIGURE = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.])")
+
+
+def rows(page: str) -> list[tuple[str, str]]:
+    """Figures of a row of the leaderboard, as text, and the file that it names as their source."""
+    found = []
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split(" |")]
+        if line.startswith("| ") and len(cells) >= 7 and (link := re.search(r"\]\(([^)#]+)", cells[5])):
+            found.append((" ".join(cells[1:5]), link[1]))
+    return found
+
+
+def on_record(source: Path) -> set[str]:
+    """The figures of a page, or those of a comparison's table as the leaderboard rounds them."""
+    text = source.read_text(encoding="utf-8")
+    if source.suffix != ".csv":
+        return {*FIGURE.findall(text.replace("two to four minutes", "2 to 4 min"))}
+    lines = list(csv.DictReader(text.splitlines()))
+    costs = {f"{float(line['cost_ratio']):.{digits}f}" for line in lines for digits in (2, 4)}
+    return costs | {f"{float(line['seconds_mean']):.0f}" for line in lines}
+
+
+def missing(page: str) -> list[str]:
+    return [figure for cells, source in rows(page) for figure in set(FIGURE.findall(cells)) - on_record(DOCS / source)]
+
+
+def test_every_figure_of_the_leaderboard_is_in_the_file_that_its_row_names():
+    page = LEADERBOARD.read_text(encoding="utf-8")
+    assert len(rows(page)) >= 40
+    assert missing(page) == []
+    assert missing(page.replace("| 1.0654 |", "| 1.0653 |")) == ["1.0653"]
+
+
+def on_the_sidebar() -> set[str]:
+    trees = re.findall(r"```\{toctree\}\n(.*?)```", (DOCS / "index.md").read_text(encoding="utf-8"), re.DOTALL)
+    return {line for tree in trees for line in tree.splitlines() if line and not line.startswith((":", "Start "))}
+
+
+def test_every_page_is_on_the_sidebar():
+    tables = {"compare/table1", "compare/details"}  # of the report, to download
+    pages = {path.relative_to(DOCS).with_suffix("").as_posix() for path in DOCS.glob("**/*.md")}
+    assert on_the_sidebar() == pages - {"index"} - tables
+
+
+def test_the_reference_has_the_public_interface():
+    import lyapnet
+
+    shown = re.findall(r"^\.\. auto\w+:: (\w+)$", (DOCS / "reference.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(shown) == sorted({*lyapnet.__all__} - {"SYSTEMS", "__version__"})
+
+
+@pytest.mark.slow
+def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_path):
+    pytest.importorskip("myst_nb")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-D", "nb_execution_mode=force", str(DOCS), str(tmp_path)]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    loaded = r"<(?:script|img|iframe)[^>]* src=\"(?:https?:)?//|<link[^>]*stylesheet[^>]*href=\"(?:https?:)?//"
+    assert re.search(loaded, '<script async src="https://cdn.example.org/mathjax.js">')
+    assert not [page for page in tmp_path.rglob("*.html") if re.search(loaded, page.read_text(encoding="utf-8"))]

@@ -132,11 +132,11 @@ def _extent(controller: Controller, funnel: KeptFunnel | None) -> Box:
 
 def _checks(controller: Controller) -> dict[str, Any]:
     """u, V and where a step leads at some times and states of X₀, as the controller has them."""
-    generator, horizon = stream(0, FIGURES), controller.horizon
+    generator, horizon, step = stream(0, FIGURES), controller.horizon, controller.step
     x = controller.initial_states.sample(CHECKED, generator)
     nodes = torch.randint(horizon.steps, (CHECKED,), generator=generator)
     t = nodes.to(x) * horizon.dt
     with torch.no_grad():
-        after = [controller.step(*each)[0] for each in zip(t, x.new_full((CHECKED,), horizon.dt), x, strict=True)]
+        after = [step(*each)[0] for each in zip(t, x.new_full((CHECKED,), horizon.dt), x, strict=True)]
         u, V = controller.policy(t, x), controller.value(t, x)
     return {"t": t.tolist(), "x": x.tolist(), "u": u.tolist(), "V": V.tolist(), "after": torch.stack(after).tolist()}

@@ -134,7 +134,7 @@ def shared_starts(task: Task, workers: int, say: Say) -> dict[tuple[str, ...], P
 def verdict(trial: FrozenTrial, task: Task) -> str:
     """How a trial ended, for readers."""
     if trial.state == TrialState.COMPLETE:
-        return f"{'gap' if task.compared else 'cost'} {trial.value:.4g}"
+        return f"{task.measure} {trial.value:.4g}"
     if trial.state == TrialState.PRUNED:
         return f"pruned after step {max(trial.intermediate_values)}"
     return f"failed: {trial.user_attrs.get('failure', '')}" if trial.state == TrialState.FAIL else "not finished"

@@ -3,7 +3,7 @@
 from typing import Any
 
 import optuna
-from optuna.trial import FrozenTrial, TrialState
+from optuna.trial import TrialState
 from rich.box import SIMPLE
 from rich.table import Column, Table
 
@@ -21,13 +21,12 @@ def search_rows(task: Task, study: optuna.Study) -> list[dict[str, Any]]:
     """A row for each trial: its settings, its measure at each validation and at its best checkpoint, how it ended."""
     trials = study.get_trials(deepcopy=False)
     steps = sorted({step for trial in trials for step in trial.intermediate_values})
-    measure = _measure(task)
     return [
         {
             "trial": trial.number,
-            **dict(setting.split("=", 1) for setting in _settings(task, trial)),
-            measure: trial.value if trial.state == TrialState.COMPLETE else None,
-            **{f"{measure}_at_{step}": trial.intermediate_values.get(step) for step in steps},
+            **dict(setting.split("=", 1) for setting in task.settings(trial.params)),
+            task.measure: trial.value if trial.state == TrialState.COMPLETE else None,
+            **{f"{task.measure}_at_{step}": trial.intermediate_values.get(step) for step in steps},
             "seconds": trial.user_attrs.get("seconds"),
             "state": STATES.get(trial.state, UNFINISHED),
             "failure": trial.user_attrs.get("failure", ""),
@@ -44,7 +43,7 @@ def search_csv(task: Task, study: optuna.Study) -> str:
 
 def search_table(task: Task, study: optuna.Study) -> Table:
     """A line for each trial, with its measure half-way, at the end of the training and at its best checkpoint."""
-    rows, best, measure = search_rows(task, study), best_of(study), _measure(task)
+    rows, best, measure = search_rows(task, study), best_of(study), task.measure
     steps = [int(key.rpartition("_")[2]) for key in rows[0] if key.startswith(f"{measure}_at_")] if rows else []
     stages = sorted({steps[(len(steps) - 1) // 2], steps[-1]}) if steps else []
     keys = [one.key for one in task.space]
@@ -70,7 +69,7 @@ def summary(task: Task, study: optuna.Study) -> list[str]:
     given = next((trial for trial in trials if trial.user_attrs.get("given")), None)
     against = "" if given is None else f"; the given config: {verdict(given, task)}"
     return [
-        f"best: trial_{best.number}, {' '.join(_settings(task, best))}: {verdict(best, task)}{against}",
+        f"best: trial_{best.number}, {' '.join(task.settings(best.params))}: {verdict(best, task)}{against}",
         "The settings were chosen on the validation states, so the number is too good; other states and another seed "
         "tell what they are worth.",
     ]
@@ -83,11 +82,3 @@ def final_line(task: Task, training: Training) -> str:
     measures, samples = found.get("mean", found), found.get("seeds", [found])[0]["samples"]
     known = [f"{name.replace('_', ' ')} {measured_or_not(name, measures[name])}" for name in SHOWN if name in measures]
     return f"seed {training.config.seed}, {samples} unseen states: {', '.join(known)}; {training.run.best}"
-
-
-def _measure(task: Task) -> str:
-    return "gap" if task.compared else "cost"
-
-
-def _settings(task: Task, trial: FrozenTrial) -> list[str]:
-    return task.settings(trial.params)

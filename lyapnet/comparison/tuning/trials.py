@@ -38,6 +38,11 @@ class Task:
     seed: int
     compared: bool  # with the optimum
 
+    @property
+    def measure(self) -> str:
+        """What is minimised, for readers."""
+        return "gap" if self.compared else "cost"
+
     def config(self, settings: Sequence[str] = ()) -> Config:
         """The resolved config with some settings."""
         return load_config(self.path, [*self.overrides, *settings])

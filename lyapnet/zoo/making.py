@@ -37,6 +37,8 @@ TASKS: dict[str, list[str]] = {  # name ↦ arguments of lyapnet train --config
     "reacher_limited": ["conf/reacher.yaml", "controls={lower: [-1.03, -0.37], upper: [1.03, 0.37]}"],
 }
 SAMPLES, KEPT = 256, 32  # states of the evaluation, and those whose optima the record keeps
+PRECISIONS = ("float64", "float32")
+EXPORTS = {"c": "law", "torch": "law.pt2", "onnx": "law.onnx"}
 EVALUATED = ("cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "samples", "violated_fraction")
 
 
@@ -71,16 +73,31 @@ def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
         raise UsageError(f"Expected optima to compare with, got none ({measured.notes[0]}); install lyapnet[oracle].")
     result = measured.result()
     certificate = statistical_certificate(controller).result
-    with tempfile.TemporaryDirectory() as folder:
-        _, agreement = export(controller, Path(folder, "law"), "c", checkpoint, "policy")
     return {
         "evaluation": {key: result[key] for key in EVALUATED if key in result},
         "worst_ratio": float((measured.table.cost / optima)[known].max()),
         "certificate": certificate,
-        "export": {"states": agreement.states, "control": agreement.control, "value": agreement.value},
+        "export": {precision: _agreements(checkpoint, precision) for precision in PRECISIONS},
         "states": measured.table.x0[known][:KEPT].tolist(),
         "optima": optima[known][:KEPT].tolist(),
     }
+
+
+def _agreements(checkpoint: Path, precision: str) -> dict[str, dict[str, float]]:
+    """How far each export is from the controller whose weights are rounded to that precision."""
+    content, kind = read_checkpoint(checkpoint), getattr(torch, precision)
+    content[KEY]["config"]["training"]["precision"] = precision
+    weights = content["state_dict"].items()
+    content["state_dict"] = {key: w.to(kind) if w.is_floating_point() else w for key, w in weights}
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        rounded = Path(folder, "rounded.ckpt")
+        write_checkpoint(content, rounded)
+        controller = load(rounded)
+        for to, file in EXPORTS.items():
+            _, agreement = export(controller, Path(folder, file), to, rounded)
+            found[to] = agreement._asdict()
+    return found
 
 
 def train(name: str, logs: Path) -> Path:

@@ -104,11 +104,15 @@ def test_a_command_takes_one(capsys):
 
 def test_making_strips_and_measures(tmp_path, monkeypatch):
     pytest.importorskip("casadi")
+    pytest.importorskip("onnxscript")
     monkeypatch.setattr(making, "SAMPLES", 2)
     certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
     monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
     record = making.make(ONE, located(f"zoo:{ONE}"), tmp_path)
     assert record["evaluation"]["samples"] == 2
     assert record["command"] == "lyapnet train --config conf/cartpole_balancing.yaml"
-    assert record["export"]["control"] < 1e-9
+    for precision, bound in (("float64", 1e-10), ("float32", 1e-4)):
+        agreements = record["export"][precision]
+        assert set(agreements) == {"c", "torch", "onnx"}
+        assert all(max(one["control"], one["value"]) < bound for one in agreements.values())
     assert {path.name for path in tmp_path.iterdir()} == {f"{ONE}.ckpt", f"{ONE}.json"}

@@ -3,7 +3,7 @@
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +16,13 @@ from lyapnet.export.c import FAST, CompiledLaw, compile_c
 from lyapnet.export.law import Law
 from lyapnet.export.verification import points
 from lyapnet.graphs.c_text import literal
+from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Trajectory
 
 RATE = 1000  # controls per second
 STATES = 1000  # that are asked for in turn
-OPTIMISED = ("-O2", "-O3")
+LOOPS = 64  # closed loops along which others are asked
+OPTIMISED = ("-O2", "-O3", "-O3 -march=native")
 LOOP = """#define _POSIX_C_SOURCE 200112L
 #include <stdio.h>
 #include <time.h>
@@ -47,6 +50,8 @@ int main(void)
 }}
 """
 
+Policy = Callable[[float, NDArray], NDArray]  # t, x (n,) ↦ u (m,)
+
 
 @dataclass(frozen=True)
 class Latency:
@@ -59,8 +64,11 @@ class Latency:
     worst: float
 
 
-def latencies(controller: Controller, seconds: float) -> list[Latency]:
+def latencies(controller: Controller, seconds: float, others: Mapping[str, Policy] | None = None) -> list[Latency]:
     """How long u takes, each way for so many seconds: in C, compiled in Python, and `Controller.policy`.
+
+    Args:
+        others: further ways, which are asked along closed loops of the controller, one after another.
 
     Raises:
         ExportError: the law cannot be written in C; or there is no compiler.
@@ -78,7 +86,17 @@ def latencies(controller: Controller, seconds: float) -> list[Latency]:
         fast = CompiledLaw(folder / "law", Law(controller), controller.system.m, FAST)
     for way, policy in (("Python, compiled", fast.policy), ("Python", controller.policy)):
         found.append(_summary(way, _in_python(policy, t, x, count)))
+    x0 = controller.initial_states.sample(LOOPS, stream(0, TEST, 2)).to(controller.initial_states.lower)
+    loops = controller.rollout(x0)
+    for way, policy in (others or {}).items():
+        found.append(_summary(way, _in_python(policy, *_in_turn(loops), count)))
     return found
+
+
+def _in_turn(loops: Trajectory) -> tuple[NDArray, NDArray]:
+    """(t, x) of closed loops at their steps, one loop after another."""
+    t, x = loops.t[:-1].double().cpu().numpy(), loops.x[:-1].double().cpu().numpy()
+    return np.tile(t, x.shape[1]), x.transpose(1, 0, 2).reshape(-1, x.shape[2])
 
 
 def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
@@ -94,12 +112,12 @@ def _loop(controller: Controller, t: NDArray, x: NDArray, count: int) -> str:
 
 def _in_c(folder: Path, option: str) -> NDArray:
     program = folder / "loop"
-    compile_c([folder / "loop.c", folder / "policy.c"], program, ["-std=c99", option])
+    compile_c([folder / "loop.c", folder / "policy.c"], program, ["-std=c99", *option.split()])
     printed = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
     return np.array(printed.split(), dtype=np.float64)
 
 
-def _in_python(policy: Callable[..., NDArray], t: NDArray, x: NDArray, count: int) -> NDArray:
+def _in_python(policy: Policy, t: NDArray, x: NDArray, count: int) -> NDArray:
     """As many calls as fit into the time, at most that number."""
     taken, following = list[float](), time.perf_counter()
     end = following + count / RATE

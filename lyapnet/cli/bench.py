@@ -175,10 +175,14 @@ def certify(
 def law(
     checkpoint: Annotated[Path, typer.Argument(help="Whose control law is timed.", metavar="CKPT")],
     seconds: Annotated[float, typer.Option(min=0.01, help="For each way.")] = 10.0,
+    beside: Annotated[bool, typer.Option("--beside", help="Time MPC and a policy of SB3 too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
     debug: Debug = False,
 ) -> None:
     """Time one control in a loop of 1 kHz: in C as `lyapnet export` writes it, and in Python.
+
+    --beside needs the extras oracle and baselines: MPC over all of T, warm-started by its last plan, and PPO's policy,
+    both along closed loops.
 
     lyapnet bench law logs/double_integrator/version_0/checkpoints/best.ckpt --seconds 60
     """
@@ -186,9 +190,13 @@ def law(
     from lyapnet.bench.tables import latency_table
     from lyapnet.cli.options import load_controller
 
-    controller = load_controller(checkpoint)
+    controller, others = load_controller(checkpoint), None
+    if beside:
+        from lyapnet.comparison.timing import alternatives
+
+        others = alternatives(controller)
     with Console(stderr=True).status("writing, compiling, timing …"):
-        rows = latencies(controller, seconds)
+        rows = latencies(controller, seconds, others)
     if as_json:
         print(json.dumps([asdict(row) for row in rows]))
     else:

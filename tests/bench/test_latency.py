@@ -16,7 +16,7 @@ def test_each_way_is_timed(tmp_path, capsys):
     capsys.readouterr()
     assert main(["bench", "law", str(checkpoint), "--seconds", "0.2", "--json"]) == 0
     rows = {row["way"]: row for row in json.loads(capsys.readouterr().out)}
-    assert [*rows] == ["C, -O2", "C, -O3", "Python, compiled", "Python"]
+    assert [*rows] == ["C, -O2", "C, -O3", "C, -O3 -march=native", "Python, compiled", "Python"]
     for row in rows.values():
         assert 0 < row["median"] <= row["most"] <= row["worst"]
         assert 0 < row["calls"] <= 200
@@ -24,3 +24,14 @@ def test_each_way_is_timed(tmp_path, capsys):
     assert rows["C, -O3"]["median"] < rows["Python, compiled"]["median"] < rows["Python"]["median"]
     assert main(["bench", "law", str(checkpoint), "--seconds", "0.05"]) == 0
     assert "microseconds of u(t, x), 1 kHz" in capsys.readouterr().out
+
+
+def test_mpc_and_a_learners_policy_beside(tmp_path, capsys):
+    pytest.importorskip("casadi")
+    pytest.importorskip("stable_baselines3")
+    checkpoint = tiny_checkpoint(tmp_path)
+    capsys.readouterr()
+    assert main(["bench", "law", str(checkpoint), "--seconds", "0.1", "--beside", "--json"]) == 0
+    rows = {row["way"]: row for row in json.loads(capsys.readouterr().out)}
+    assert [*rows][-2:] == ["MPC over T (fatrop)", "SB3's predict"]
+    assert rows["C, -O3"]["median"] < min(rows[way]["median"] for way in [*rows][-2:])

@@ -27,6 +27,11 @@ STILL = 1e-9  # by which a mode has to decay in each step
 class ContinuedValue(ValueFunction):
     """V(t, x) up to T, and after it what goes with the law."""
 
+    V: ValueFunction
+    duration: float
+    beyond: str | None
+    regulator: "Regulator | None"
+
     def __init__(self, V: ValueFunction, duration: float, beyond: str | None, regulator: "Regulator | None"):
         super().__init__()
         self.V, self.duration, self.beyond, self.regulator = V, duration, beyond, regulator
@@ -54,6 +59,10 @@ class ContinuedPolicy(ValuePolicy):
     """
 
     V: ContinuedValue
+    policy: ValuePolicy
+    beyond: str | None
+    regulator: "Regulator | None"
+    duration: float
 
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None = None):
         if beyond not in (None, *BEYOND):
@@ -61,7 +70,7 @@ class ContinuedPolicy(ValuePolicy):
         regulator = Regulator(problem) if beyond == "riccati" else None
         super().__init__(problem, ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
-        self.held = policy.held
+        self.held: bool = policy.held
 
     def forward(self, t: Time, x: State) -> Control:
         late = t >= self.duration - slack(t, self.duration)
@@ -137,6 +146,10 @@ class Regulator(nn.Module):
 
 class LaterPolicy(ValuePolicy):
     """A law, and its V, on a clock that starts late: policy(t + start, x)."""
+
+    policy: ValuePolicy
+    start: float
+    held: bool
 
     def __init__(self, problem: Problem, policy: ValuePolicy, start: float):
         super().__init__(problem, _LaterValue(policy.V, start))

@@ -67,7 +67,7 @@ class StateLimits(Constraints):
         super().__init__()
         if not all(scale > 0 for scale in scales):
             raise ValueError(f"Expected scales > 0, got {list(scales)}; give the size of what counts as 1.")
-        self.names = tuple(names) or tuple(f"limit {j + 1}" for j in range(len(states)))
+        self.names: Sequence[str] = tuple(names) or tuple(f"limit {j + 1}" for j in range(len(states)))
         self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)
         for name, numbers in (("limits", limits), ("sides", sides), ("scales", scales)):
             like = torch.tensor(list(numbers), dtype=torch.get_default_dtype())
@@ -95,13 +95,15 @@ class Ball(Constraints):
 
     states: Int[Tensor, " k"]
     center: Float[Tensor, " k"]
+    radius: float
+    side: float
 
     def __init__(self, states: Sequence[int], center: Sequence[float], radius: float, inside: bool, name: str = ""):
         super().__init__()
         if not radius > 0:
             raise ValueError(f"Expected a ball with radius > 0, got {radius:g}.")
         self.radius, self.side = float(radius), -0.5 if inside else 0.5
-        self.names = (name or f"{'inside' if inside else 'outside'} a ball of radius {radius:g}",)
+        self.names: Sequence[str] = (name or f"{'inside' if inside else 'outside'} a ball of radius {radius:g}",)
         self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)
         self.register_buffer("center", torch.tensor(list(center), dtype=torch.get_default_dtype()), persistent=False)
 
@@ -119,8 +121,8 @@ class AllOf(Constraints):
 
     def __init__(self, parts: Sequence[Constraints]):
         super().__init__()
-        self.parts = nn.ModuleList(parts)
-        self.names = tuple(name for part in parts for name in part.names)
+        self.parts: nn.ModuleList = nn.ModuleList(parts)
+        self.names: Sequence[str] = tuple(name for part in parts for name in part.names)
 
     def forward(self, x: State) -> Float[Tensor, "*batch k"]:
         return torch.cat([part(x) for part in self.parts], -1)
@@ -133,6 +135,10 @@ class OfFirstStates(Constraints):
         constraints: of x.
         n: how many states x has.
     """
+
+    constraints: Constraints
+    n: int
+    names: Sequence[str]
 
     def __init__(self, constraints: Constraints, n: int):
         super().__init__()

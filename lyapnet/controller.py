@@ -43,6 +43,10 @@ class Controller:
     Tensors in, tensors out (of the controller's dtype); arrays and lists in, NumPy arrays out.
     """
 
+    problem: Problem
+    program: Program
+    V: ValueFunction
+
     def __init__(
         self,
         problem: Problem,

@@ -47,7 +47,7 @@ class Table(nn.Module):
                 )
         if table.shape != (expected := tuple(map(len, axes))) or not bool(table.isfinite().all()):
             raise ValueError(f"Expected finite values of shape {expected}, got {tuple(table.shape)}; one at each node.")
-        self.degree = DEGREES[method]
+        self.degree: int = DEGREES[method]
         dtype = torch.get_default_dtype()
         self.register_buffer("values", table.to(dtype), persistent=False)
         for axis, nodes in enumerate(axes):

@@ -6,10 +6,13 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
+from lyapnet.cost import Cost
 from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, convex_or, multiply
 from lyapnet.problem import Problem, Response
+from lyapnet.sets import ControlSet
+from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State, Time
 
 DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
@@ -27,6 +30,10 @@ class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
     held: bool = False  # whether u is made to be held for Δt from t on
+    system: ControlAffineSystem
+    cost: Cost
+    controls: ControlSet
+    V: ValueFunction
 
     def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__()
@@ -117,7 +124,7 @@ class SampledPolicy(ValuePolicy):
     goal. About a target, u is counted from u*, and f is f + gu*.
     """
 
-    held = True
+    held: bool = True
 
     def __init__(self, problem: Problem, V: ValueFunction):
         super().__init__(problem, V)

@@ -46,6 +46,13 @@ class Problem(nn.Module):
         ValueError: X₀ has another dimension than the system.
     """
 
+    system: ControlAffineSystem
+    cost: Cost
+    controls: ControlSet
+    initial_states: Box
+    horizon: Horizon
+    constraints: Constraints | None
+
     def __init__(
         self,
         system: ControlAffineSystem,

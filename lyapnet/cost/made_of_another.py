@@ -14,7 +14,7 @@ class MadeOfAnother(Cost):
     """A cost that is another one until a subclass says otherwise: its goal, R(x), q and φ."""
 
     cost: Cost
-    words = ""  # what is made of the other, in words
+    words: str = ""  # what is made of the other, in words
 
     def __init__(self, cost: Cost):
         super().__init__()
@@ -50,6 +50,8 @@ class TargetCost(MadeOfAnother):
         rest: u*, (m,), the control that costs nothing; what holds x* where something does.
     """
 
+    goal: Float[Tensor, " n"]
+    rest: Float[Tensor, " m"]
     shift: Float[Tensor, " n"]
 
     def __init__(self, cost: Cost, target: Sequence[float] | Tensor, rest: Sequence[float] | Tensor):
@@ -57,7 +59,7 @@ class TargetCost(MadeOfAnother):
         goal, u = (torch.as_tensor(entries, dtype=torch.get_default_dtype()) for entries in (target, rest))
         self.register_buffer("shift", goal - (0 if cost.goal is None else cost.goal), persistent=False)
         self.goal, self.rest = goal, u
-        self.words = f"about x* = {goal.tolist()} and u* = {u.tolist()}"
+        self.words: str = f"about x* = {goal.tolist()} and u* = {u.tolist()}"
 
     def from_goal(self, x: State) -> State:
         return Cost.from_goal(self, x)
@@ -89,7 +91,7 @@ class PeriodicCost(MadeOfAnother):
         turns = torch.zeros(n, dtype=torch.get_default_dtype())
         turns[list(angles)] = 1
         self.register_buffer("turns", turns, persistent=False)
-        self.words = f"δ² as 2(1 − cos δ) of the states {list(angles)}"
+        self.words: str = f"δ² as 2(1 − cos δ) of the states {list(angles)}"
 
     def _chords(self, x: State) -> State:
         delta = x if self.cost.goal is None else x - self.cost.goal
@@ -120,6 +122,9 @@ class ObstacleCost(MadeOfAnother):
 
     states: Int[Tensor, " k"]
     centre: Float[Tensor, " k"]
+    radius: float
+    weight: float
+    words: str
 
     def __init__(self, cost: Cost, states: Sequence[int], centre: Sequence[float], radius: float, weight: float):
         super().__init__(cost)

@@ -24,6 +24,8 @@ class PenaltyCost(MadeOfAnother):
     Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalties), with the constraint moved by m.
     """
 
+    constraints: nn.Module
+    margin: float
     weight: Float[Tensor, ""]  # w, in cost per second
 
     def __init__(self, cost: Cost, constraints: nn.Module, margin: float, weight: float = 0.0):

@@ -40,7 +40,7 @@ class QuadraticCost(Cost):
                 f"Expected Q and Q_T of the same shape, got {tuple(self.Q.shape)} and {tuple(self.Q_T.shape)}; "
                 "give one row for each state."
             )
-        self.R_of_state = R if callable(R) else None
+        self.R_of_state: Callable[[State], ControlMatrix] | None = R if callable(R) else None
         constant = None if callable(R) else _symmetric("R", R, definite=True)
         inverse = None if constant is None else torch.linalg.inv(constant)
         self.register_buffer("R_constant", constant, persistent=False)

@@ -1,7 +1,9 @@
 """The Lyapunov program: V falls along its own closed loop at least as fast as the cost accrues."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,9 +30,11 @@ class LyapunovProgram(Program):
     Source: P_L of arXiv 2305.15244.
     """
 
-    degree = 1
-    weighted = (*Program.weighted, "bound")
-    recommended = MappingProxyType({"constraint": 50, "terminal": 50, "trajectory_cost": 1, "margin": 0.02, "bound": 1})
+    degree: ClassVar[int] = 1
+    weighted: ClassVar[tuple[str, ...]] = (*Program.weighted, "bound")
+    recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
+        {"constraint": 50, "terminal": 50, "trajectory_cost": 1, "margin": 0.02, "bound": 1}
+    )
 
     margin: float = 0.0
     bound: float = 0.0

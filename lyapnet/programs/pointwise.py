@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.calculus import time_derivative
+from lyapnet.calculus import ValueFunction, time_derivative
 from lyapnet.programs.base import Program
-from lyapnet.rollout import Rollout
+from lyapnet.rollout import ClosedLoop, Rollout
 from lyapnet.sets import Box
 from lyapnet.types import PerState, State, Time
 
@@ -36,6 +36,16 @@ class PointwiseCondition:
         points: drawn and sought in each step.
         further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
     """
+
+    closed_loop: ClosedLoop
+    V: ValueFunction
+    goal: State
+    program: Program
+    region: Box
+    duration: float
+    weight: float
+    points: int
+    further: Float[Tensor, "k columns"] | None
 
     def __init__(
         self,

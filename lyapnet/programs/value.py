@@ -1,7 +1,9 @@
 """The value program: V is the cost-to-go of its own greedy policy."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import ClassVar
 
 from jaxtyping import Bool
 from torch import Tensor
@@ -28,9 +30,11 @@ class ValueProgram(Program):
     goal begins, and lead the laws of the states around away from it, until all of them are lost.
     """
 
-    degree = 2
-    weighted = (*Program.weighted, "cost_to_go")
-    recommended = MappingProxyType({"constraint": 0, "cost_to_go": 10, "trajectory_cost": 1, "relative": True})
+    degree: ClassVar[int] = 2
+    weighted: ClassVar[tuple[str, ...]] = (*Program.weighted, "cost_to_go")
+    recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
+        {"constraint": 0, "cost_to_go": 10, "trajectory_cost": 1, "relative": True}
+    )
 
     cost_to_go: float = 0.0
     relative: bool = False

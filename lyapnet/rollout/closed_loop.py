@@ -4,13 +4,19 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.cost import Cost
 from lyapnet.policy import PolicyOutput, ValuePolicy
 from lyapnet.problem import Problem
+from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, State, Time
 
 
 class ClosedLoop(nn.Module):
     """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
+
+    system: ControlAffineSystem
+    cost: Cost
+    policy: nn.Module
 
     def __init__(self, problem: Problem, policy: nn.Module):
         super().__init__()

@@ -49,6 +49,11 @@ class DiscreteAdjoint:
             cut to that length. None: no limit, and the exact gradient. It is the exact one too where none is so long.
     """
 
+    loop: ClosedLoop
+    steps: int
+    dt: float
+    stages: int
+
     def __init__(self, loop: ClosedLoop, steps: int, dt: float, method: str, costate_limit: float | None = None):
         self.loop, self.steps, self.dt, self.stages = loop, steps, dt, len(TABLEAUX[method].b)
         self.costate_limit = costate_limit

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
 from lyapnet.errors import DivergenceError
-from lyapnet.horizon import TABLEAUX
+from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop, SteppedLoop
 from lyapnet.rollout.discrete_adjoint import DiscreteAdjoint
@@ -82,6 +82,14 @@ class Rollout(nn.Module):
             an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler; or a
             limit of the costates below 1, or of another gradient.
     """
+
+    problem: Problem
+    closed_loop: ClosedLoop
+    stepped: ClosedLoop
+    horizon: Horizon
+    method: str
+    gradient: str
+    discrete: DiscreteAdjoint | None
 
     def __init__(
         self,

@@ -40,6 +40,9 @@ from lyapnet.types import (
 class Step(nn.Module):
     """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V): one step from a batch of states, and what is kept of it."""
 
+    loop: ClosedLoop
+    tableau: ButcherTableau
+
     def __init__(self, loop: ClosedLoop, tableau: ButcherTableau):
         super().__init__()
         self.loop, self.tableau = loop, tableau
@@ -72,6 +75,9 @@ class Linearisation(NamedTuple):
 
 class Linearise(nn.Module):
     """Linearisation and parameter product over blocks; its forward is both, for a known costate."""
+
+    loop: ClosedLoop
+    tableau: ButcherTableau
 
     def __init__(self, loop: ClosedLoop, tableau: ButcherTableau):
         super().__init__()

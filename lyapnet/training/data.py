@@ -31,6 +31,14 @@ class InitialStateDataModule(L.LightningDataModule):
             than others, found by LostStates.
     """
 
+    problem: Problem
+    batch_size: int
+    validation_states: int
+    seed: int
+    steps_per_epoch: int
+    lost_share: float
+    lost: State
+
     def __init__(
         self,
         problem: Problem,
@@ -56,14 +64,14 @@ class InitialStateDataModule(L.LightningDataModule):
         """States of X₀ that are in no batch, another draw at each step: (count, n), or (E, count, n)."""
         return self.problem.initial_states.sample(count, stream(self.seed, LOST, step))
 
-    def train_dataloader(self) -> DataLoader:
+    def train_dataloader(self) -> DataLoader[Tensor]:
         return DataLoader(_Epoch(self), batch_size=None)
 
     def validation_batch(self) -> State:
         """The states of every validation."""
         return self.problem.initial_states.sample(self.validation_states, stream(self.seed, VALIDATION))
 
-    def val_dataloader(self) -> DataLoader:
+    def val_dataloader(self) -> DataLoader[Tensor]:
         return DataLoader([self.validation_batch()], batch_size=None)  # pyright: ignore[reportArgumentType]
 
     def position(self) -> int:
@@ -126,7 +134,7 @@ class EnsembleDataModule(InitialStateDataModule):
         return torch.stack([member.validation_batch() for member in self.members])
 
 
-class _Epoch(Dataset):
+class _Epoch(Dataset[Tensor]):
     """The batches of the steps of an epoch, from the one that comes next."""
 
     def __init__(self, states: InitialStateDataModule):

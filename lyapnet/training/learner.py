@@ -34,6 +34,16 @@ class Learner(nn.Module):
         UsageError: constraints without what keeps closed loops off them.
     """
 
+    problem: Problem
+    V: ValueFunction
+    rollout: Rollout
+    program: Program
+    pointwise: PointwiseCondition | None
+    seed: int
+    label: str
+    gradient_norm: float
+    steps_per_second: float
+
     def __init__(
         self,
         problem: Problem,
@@ -57,7 +67,7 @@ class Learner(nn.Module):
         self.gradient_norm = self.steps_per_second = math.nan
         self.output: ProgramOutput | None = None
         self.validation: StateTable | None = None
-        self.validation_loss = math.nan
+        self.validation_loss: float = math.nan
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
 
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:

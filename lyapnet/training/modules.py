@@ -38,7 +38,7 @@ class TrainingModule(L.LightningModule):
         super().__init__()
         self.members: Sequence[Learner] = nn.ModuleList(members)  # pyright: ignore
         self.optimizer_options = optimizer
-        self.rate_share = 1.0  # of the scheduled learning rate; less, once a training had to go back
+        self.rate_share: float = 1.0  # of the scheduled learning rate; less, once a training had to go back
         self.metadata: dict[str, Any] = {}  # plain data that checkpoints carry: the config, where there is one
 
     @abstractmethod

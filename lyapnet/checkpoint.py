@@ -27,7 +27,7 @@ UNREADABLE = (
 )  # fmt: skip
 KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
 ZOO = Path(__file__).parent / "zoo"  # the controllers that come with lyapnet, NAME.ckpt with NAME.json
-DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.2
+DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.3
 
 
 def located(path: str | Path) -> Path:

@@ -93,7 +93,7 @@ class InitialStateDataModule(L.LightningDataModule):
                 f"Expected to resume the stream of seed {state_dict['seed']}, got seed {self.seed}; "
                 "keep the seed, or start a new run with --finetune."
             )
-        if "lost" in state_dict:  # since version 0.2
+        if "lost" in state_dict:  # since version 0.3
             for each, lost in zip(self.of_each, state_dict["lost"], strict=True):
                 each.lost = lost
 

@@ -140,11 +140,23 @@ def write_onnx(model: Any, path: Path, about: dict[str, Any]) -> None:
 
 
 def run_onnx(path: Path, law: Law) -> Evaluate:
-    """What a model says in onnxruntime, one state after another."""
-    import onnxruntime  # pyright: ignore[reportMissingImports]
+    """What a model says in onnxruntime, one state after another.
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    Raises:
+        ExportError: onnxruntime lacks an operation in this precision.
+    """
+    import onnxruntime  # pyright: ignore[reportMissingImports]
+    from onnxruntime.capi.onnxruntime_pybind11_state import NotImplemented as Lacking
+
     kind = law.arguments["x"].cpu().numpy().dtype
+    try:
+        session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    except Lacking as error:
+        missing = str(error).split("implementation for ")[-1]
+        raise ExportError(
+            f"Expected operations that onnxruntime {onnxruntime.__version__} has in {kind}, got {missing}; write it "
+            "with --to c or --to torch, or with other functions in f, g and the cost."
+        ) from error
 
     def answer(t: float, state: NDArray) -> Any:
         arguments = (np.asarray(argument, kind) for argument in law.given(t, state))

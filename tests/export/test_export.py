@@ -293,6 +293,15 @@ def test_what_cannot_be_exported_is_refused(make, name, to, error, message, tmp_
     assert (tmp_path / "file").read_text() == "kept"
 
 
+def test_what_onnxruntime_lacks_is_named(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    controller = own_controller(lambda t, x: torch.atan(x[..., 0] ** 2) * (1 + t), reads=False)
+    with pytest.raises(ExportError, match=r"onnxruntime .* has in float64, got Atan.*--to c"):
+        export(controller, tmp_path / "law.onnx", "onnx")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_without_a_compiler_or_onnx_it_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(ExportError, match="Expected a C compiler"):

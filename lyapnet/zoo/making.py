@@ -22,9 +22,8 @@ from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.measurement import evaluation
 from lyapnet.export import export
-from lyapnet.files import write_json
+from lyapnet.files import read_json, write_json
 from lyapnet.loading import load
-from lyapnet.provenance import commit, versions
 
 ALONE = (
     "acrobot", "bryson_denham", "cartpole_balancing", "cartpole_family", "cartpole_swingup", "double_integrator",
@@ -37,6 +36,7 @@ TASKS: dict[str, list[str]] = {  # name ↦ arguments of lyapnet train --config
     "reacher_limited": ["conf/reacher.yaml", "controls={lower: [-1.03, -0.37], upper: [1.03, 0.37]}"],
 }
 SAMPLES, KEPT = 256, 32  # states of the evaluation, and those whose optima the record keeps
+PACKAGES = ("lyapnet", "torch", "lightning", "python")
 PRECISIONS = ("float64", "float32")
 EXPORTS = {"c": "law", "torch": "law.pt2", "onnx": "law.onnx"}
 EVALUATED = ("cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "samples", "violated_fraction")
@@ -57,13 +57,18 @@ def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
     record = {
         "command": shlex.join(["lyapnet", "train", "--config", *TASKS[name]]),
         "seed": config["seed"],
-        "versions": {package: number for package, number in versions("torch").items() if package != "platform"},
-        "commit": commit(),
+        **_origin(trained),
         **_measurements(load(checkpoint), checkpoint),
         "seconds": round(time.monotonic() - began),
     }
     write_json(folder / f"{name}.json", record)
     return record
+
+
+def _origin(trained: Path) -> dict[str, Any]:
+    """With what it was trained, as its run noted."""
+    run = read_json(trained.parents[1] / "run.json", "give a checkpoint in the folder of its run")
+    return {"versions": {package: run[package] for package in PACKAGES}, "commit": run["commit"]}
 
 
 def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The controllers that come with lyapnet: each as good as its record says, named everywhere as zoo:NAME."""
 
 import json
+import shutil
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
@@ -108,11 +109,17 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     monkeypatch.setattr(making, "SAMPLES", 2)
     certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
     monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
-    record = making.make(ONE, located(f"zoo:{ONE}"), tmp_path)
+    trained = tmp_path / "run" / "checkpoints" / "best.ckpt"
+    trained.parent.mkdir(parents=True)
+    shutil.copy(located(f"zoo:{ONE}"), trained)
+    known = dict.fromkeys(making.PACKAGES, "1") | {"commit": "abc", "seed": 0}
+    (tmp_path / "run" / "run.json").write_text(json.dumps(known))
+    record = making.make(ONE, trained, tmp_path / "zoo")
+    assert (record["commit"], record["versions"]["torch"]) == ("abc", "1")
     assert record["evaluation"]["samples"] == 2
     assert record["command"] == "lyapnet train --config conf/cartpole_balancing.yaml"
     for precision, bound in (("float64", 1e-10), ("float32", 1e-4)):
         agreements = record["export"][precision]
         assert set(agreements) == {"c", "torch", "onnx"}
         assert all(max(one["control"], one["value"]) < bound for one in agreements.values())
-    assert {path.name for path in tmp_path.iterdir()} == {f"{ONE}.ckpt", f"{ONE}.json"}
+    assert {path.name for path in (tmp_path / "zoo").iterdir()} == {f"{ONE}.ckpt", f"{ONE}.json"}

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.links import broken_links
 from tests.pages import ROOT
 
 DOCS = ROOT / "docs"
@@ -64,6 +65,18 @@ def test_the_reference_has_the_public_interface():
     assert sorted(shown) == sorted({*lyapnet.__all__} - {"SYSTEMS", "__version__"})
 
 
+def test_links_that_lead_nowhere_are_found(tmp_path):
+    there = '<p id="here"><a href="#here"></a><a href="sub/b.html#x y"></a><a href="https://example.org/none"></a>'
+    (tmp_path / "a.html").write_text(there)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "b.html").write_text('<h1 id="x y"><img src="../picture.png"><a href="../a.html#here"></a>')
+    (tmp_path / "picture.png").touch()
+    assert broken_links(tmp_path) == []
+    (tmp_path / "a.html").write_text(there.replace('id="here"', ""))
+    (tmp_path / "picture.png").unlink()
+    assert broken_links(tmp_path) == ["a.html: #here", "sub/b.html: ../a.html#here", "sub/b.html: ../picture.png"]
+
+
 @pytest.mark.slow
 def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_path):
     pytest.importorskip("myst_nb")
@@ -71,5 +84,6 @@ def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_pa
     built = subprocess.run(command, capture_output=True, text=True, check=False)
     assert built.returncode == 0, built.stderr
     loaded = r"<(?:script|img|iframe)[^>]* src=\"(?:https?:)?//|<link[^>]*stylesheet[^>]*href=\"(?:https?:)?//"
+    assert broken_links(tmp_path) == []
     assert re.search(loaded, '<script async src="https://cdn.example.org/mathjax.js">')
     assert not [page for page in tmp_path.rglob("*.html") if re.search(loaded, page.read_text(encoding="utf-8"))]

@@ -13,11 +13,18 @@ from lyapnet.cli.options import Debug
 STATES = 1000  # that a demonstration draws for its certificate
 
 
-def zoo(debug: Debug = False) -> None:
+def zoo(
+    exports: Annotated[bool, typer.Option("--exports", help="How far each export is from its controller.")] = False,
+    debug: Debug = False,
+) -> None:
     """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
     from lyapnet.certification.tables import floored
     from lyapnet.zoo import entries
 
+    console = Console(highlight=False, markup=False)
+    if exports:
+        console.print(_exports(entries()))
+        return
     table = Table(Column("zoo:", no_wrap=True), "cost / optimum", "worst state", "error of V", "certified share of X₀")
     table.title = "Controllers that come with lyapnet"
     for one in entries():
@@ -29,7 +36,6 @@ def zoo(debug: Debug = False) -> None:
             f"{found['value_error']:.2%}",
             f"≥ {floored(certificate['probability_lower_bound'])}",
         )
-    console = Console(highlight=False, markup=False)
     console.print(table)
     console.print("lyapnet demo NAME shows one; zoo:NAME stands for its checkpoint in any command.")
 
@@ -67,6 +73,17 @@ def demo(
     ):
         console.print(f"{what:<10}{command}", soft_wrap=True)
     console.print(f"{time.monotonic() - began:.1f} s")
+
+
+def _exports(found: list[Any]) -> Table:
+    formats = {to: None for one in found for precision in one.record["export"].values() for to in precision}
+    table = Table(Column("zoo:", no_wrap=True), "precision", *formats, title="Exports against their controllers")
+    for one in found:
+        for precision, agreements in one.record["export"].items():
+            largest = (max(agreements[to]["control"], agreements[to]["value"]) for to in formats)
+            table.add_row(one.name, precision, *(f"{difference:.1e}" for difference in largest))
+    table.caption = "Largest difference of u or V over 10 000 states, relative to the largest |u| or |V|."
+    return table
 
 
 def _table(name: str, trajectory: Any, ratio: float, error: float, certificate: Any) -> Table:

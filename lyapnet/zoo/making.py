@@ -26,7 +26,7 @@ from lyapnet.files import read_json, write_json
 from lyapnet.loading import load
 
 ALONE = (
-    "acrobot", "bryson_denham", "cartpole_balancing", "cartpole_family", "cartpole_swingup", "double_integrator",
+    "bryson_denham", "cartpole_balancing", "cartpole_family", "cartpole_swingup", "double_integrator",
     "landing", "pendulum_limited", "pendulum_periodic", "pendulum_swingup", "planar_quadrotor", "quadrotor", "reacher",
     "reacher_family", "satellite", "three_link_arm",
 )  # fmt: skip

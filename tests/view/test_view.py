@@ -6,11 +6,13 @@ import subprocess
 import sys
 
 import pytest
+import torch
 
 from lyapnet.cli import main
+from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.view import page_of
-from tests.problems import untrained
+from tests.problems import Formula, untrained
 
 pytest.importorskip("plotly")
 BROWSER = shutil.which("chromium-headless-shell") or shutil.which("chromium")
@@ -57,6 +59,28 @@ def test_a_slider_and_a_click_change_what_is_drawn(tmp_path):
     assert before[2] != later[2]
     assert [before[1], later[1], clicked[1]] == ["0", "0", "1"]
     assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("cartpole_family", ["network.hidden=[8]"]),  # parameters of the system, which the page asks for
+        ("three_link_arm", ["network.hidden=[8]"]),  # a linear system of three equations in f
+        ("keep_out", ["network.hidden=[8]"]),  # constraints
+        ("integrator_chain", ["system.parameters.length=1", "network.hidden=[8]"]),  # one state, on both axes
+    ],
+)
+def test_a_page_computes_what_the_controller_does(name, overrides, tmp_path):
+    page = page_of(untrained(name, "horizon.steps=6", *overrides), name)
+    _, check = shown(page, tmp_path)
+    assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9, check
+
+
+def test_a_page_computes_a_function_that_javascript_lacks(tmp_path):
+    problem = untrained("double_integrator", "horizon.steps=6").problem
+    page = page_of(Controller(problem, Formula(lambda t, x: (x**2).sum(-1) * (1 + t) + torch.erf(x[..., 0]))), "erf")
+    _, check = shown(page, tmp_path)
+    assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9, check
 
 
 def test_a_page_that_differs_from_the_controller_says_so(tmp_path):

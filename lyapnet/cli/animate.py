@@ -6,23 +6,13 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import (
-    At,
-    Checkpoint,
-    Constraints,
-    Controls,
-    Cost,
-    Debug,
-    Network,
-    Program,
-    System,
-    load_controller,
-)
+from lyapnet.cli.options import Debug, Given, of_a_controller
 from lyapnet.errors import UsageError
 
 
+@of_a_controller
 def animate(
-    checkpoint: Checkpoint,
+    given: Given,
     out: Annotated[Path, typer.Option(help="The file: a .gif, or an .mp4 where ffmpeg is installed.")],
     start: Annotated[
         str | None, typer.Option("--from", help="The initial state, as x_1,x_2,…", metavar="STATE")
@@ -33,13 +23,6 @@ def animate(
     speed: Annotated[
         float | None, typer.Option(help="1 is real time; without it, that or what makes 3 to 10 s.")
     ] = None,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """Show closed loops in motion, beside their controls, cost and V.
@@ -50,16 +33,7 @@ def animate(
     from lyapnet.evaluation.animation import Film
     from lyapnet.random_streams import FIGURES, stream
 
-    controller = load_controller(
-        checkpoint,
-        at,
-        system=system,
-        network=network,
-        cost=cost,
-        controls=controls,
-        constraints=constraints,
-        program=program,
-    )
+    controller = given.load()
     if start is None:
         x0 = controller.initial_states.sample(samples, stream(seed, FIGURES))
     else:

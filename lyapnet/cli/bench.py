@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, Given, of_a_controller
 from lyapnet.errors import UsageError
 from lyapnet.files import plain
 from lyapnet.sizes import THREADS
@@ -172,8 +172,9 @@ def certify(
 
 
 @app.command()
+@of_a_controller
 def law(
-    checkpoint: Annotated[Path, typer.Argument(help="Whose control law is timed.", metavar="CKPT")],
+    given: Given,
     seconds: Annotated[float, typer.Option(min=0.01, help="For each way.")] = 10.0,
     beside: Annotated[bool, typer.Option("--beside", help="Time MPC and a policy of SB3 too.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print a list of objects, one for each row.")] = False,
@@ -188,9 +189,8 @@ def law(
     """
     from lyapnet.bench.latency import latencies
     from lyapnet.bench.tables import latency_table
-    from lyapnet.cli.options import load_controller
 
-    controller, others = load_controller(checkpoint), None
+    controller, others = given.load(), None
     if beside:
         from lyapnet.comparison.timing import alternatives
 
@@ -200,7 +200,7 @@ def law(
     if as_json:
         print(json.dumps([asdict(row) for row in rows]))
     else:
-        Console(highlight=False, markup=False).print(latency_table(rows, str(checkpoint)))
+        Console(highlight=False, markup=False).print(latency_table(rows, given.title))
 
 
 def _items(values: list[str] | None) -> list[str]:

@@ -14,19 +14,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import (
-    At,
-    Checkpoint,
-    Constraints,
-    Controls,
-    Cost,
-    Debug,
-    Network,
-    Program,
-    System,
-    load_controller,
-    titled,
-)
+from lyapnet.cli.options import Debug, Given, of_a_controller
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
 
@@ -111,21 +99,15 @@ ReportFolder = Annotated[
 
 
 @app.command()
+@of_a_controller
 def sampled(
-    checkpoint: Checkpoint,
+    given: Given,
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 100,
     radius: Radius = None,
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
     report: ReportFolder = None,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """The share of some states whose closed loop succeeds. It proves no more."""
@@ -134,19 +116,16 @@ def sampled(
     from lyapnet.certification.sampling_certificates import sampled_certificate
 
     require_writable(figure, report)
-    own = {
-        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
-        "program": program,
-    }  # fmt: skip
-    certificate = sampled_certificate(load_controller(checkpoint, at, **own), samples, radius, seed)
-    _record(certificate, draws_of(checkpoint, at, **own, radius=radius))
-    _show(certificate, checkpoint, at, as_json)
-    _write(certificate, checkpoint, at, own, as_json, figure, report)
+    certificate = sampled_certificate(given.load(), samples, radius, seed)
+    _record(certificate, draws_of(given.checkpoint, given.at, **given.own, radius=radius))
+    _show(certificate, given, as_json)
+    _write(certificate, given, as_json, figure, report)
 
 
 @app.command()
+@of_a_controller
 def statistical(
-    checkpoint: Checkpoint,
+    given: Given,
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 10_000,
     confidence: Annotated[
         float,
@@ -161,13 +140,6 @@ def statistical(
     as_json: AsJson = False,
     figure: FigureFile = None,
     report: ReportFolder = None,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """A share of X₀ that succeeds, with a confidence."""
@@ -176,22 +148,19 @@ def statistical(
     from lyapnet.certification.sampling_certificates import statistical_certificate
 
     require_writable(figure, report)
-    own = {
-        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
-        "program": program,
-    }  # fmt: skip
-    controller = load_controller(checkpoint, at, **own)
-    draws = draws_of(checkpoint, at, **own, radius=radius)
+    controller = given.load()
+    draws = draws_of(given.checkpoint, given.at, **given.own, radius=radius)
     made = 1 + draws.others(seed, samples)
     certificate = statistical_certificate(controller, samples, confidence, share, radius, seed, draws=made)
     _record(certificate, draws)
-    _show(certificate, checkpoint, at, as_json)
-    _write(certificate, checkpoint, at, own, as_json, figure, report)
+    _show(certificate, given, as_json)
+    _write(certificate, given, as_json, figure, report)
 
 
 @app.command()
+@of_a_controller
 def sound(
-    checkpoint: Checkpoint,
+    given: Given,
     overrides: Annotated[
         list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
     ] = None,
@@ -226,20 +195,13 @@ def sound(
     as_json: AsJson = False,
     figure: FigureFile = None,
     report: ReportFolder = None,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:  # fmt: skip
     """A funnel that no closed loop leaves, and its cost: proved."""
     begun = time.monotonic()
     if refine and keep is not None:
         raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
-    if refine and at:
+    if refine and given.at:
         raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
@@ -250,46 +212,36 @@ def sound(
     if states is not None:
         parse_set(states)
     require_writable(figure, report, keep)
-    own = {
-        "system": system, "network": network, "cost": cost, "controls": controls, "constraints": constraints,
-        "program": program,
-    }  # fmt: skip
     notes = Console(stderr=True, highlight=False, markup=False)
 
     def certified(path: Path, started: float | None = None) -> Any:
         started = started or time.monotonic()
-        controller = load_controller(path, at, **own)
+        found = given.of(path)
+        controller = found.load()
         with proof_progress(notes, "sound") as progress:
             certificate = sound_certificate(
                 controller, alpha, delta, states, seconds, workers, keep, seed, progress, started=started
             )
-        _show(certificate, path, at, as_json)
+        _show(certificate, found, as_json)
         return certificate
 
     if refine:
-        from lyapnet.cli.options import parts_given
         from lyapnet.training.refinement import refine as train_on
 
-        parts = parts_given(checkpoint, **own)
-        checkpoint, certificate = train_on(checkpoint, certified, refine, overrides or [], notes, parts)
+        checkpoint, certificate = train_on(given.checkpoint, certified, refine, overrides or [], notes, given.parts())
+        given = given.of(checkpoint)
     else:
-        certificate = certified(checkpoint, begun)
-    _write(certificate, checkpoint, at, own, as_json, figure, report)
+        certificate = certified(given.checkpoint, begun)
+    _write(certificate, given, as_json, figure, report)
 
 
 @app.command()
+@of_a_controller
 def check(
     proof: Annotated[Path, typer.Argument(help="The file of --keep.", metavar="PROOF")],
-    checkpoint: Checkpoint,
+    given: Given,
     workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
     as_json: AsJson = False,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """Whether a kept proof proves the sound claim: its leaves are bounded anew, without a search."""
@@ -297,22 +249,13 @@ def check(
     from lyapnet.certification.checking import check as checked
     from lyapnet.certification.tables import certificate_table, proof_progress
 
-    controller = load_controller(
-        checkpoint,
-        at,
-        system=system,
-        network=network,
-        cost=cost,
-        controls=controls,
-        constraints=constraints,
-        program=program,
-    )
+    controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
         result = checked(controller, proof, workers, progress)
     if as_json:
         print(json.dumps(result, allow_nan=False))
     else:
-        table = certificate_table(f"{proof}, {titled(checkpoint, at)}", result, LABELS)
+        table = certificate_table(f"{proof}, {given.title}", result, LABELS)
         Console(highlight=False, markup=False).print(table)
     raise typer.Exit(result["verdict"] != "certified")
 
@@ -323,24 +266,21 @@ def _record(certificate: Any, draws: Any) -> None:
     certificate.caveat = draws.record(certificate.kind, options["seed"], options["samples"], certificate.verdict)
 
 
-def _show(certificate: Any, checkpoint: Path, at: list[str] | None, as_json: bool) -> None:
+def _show(certificate: Any, given: Given, as_json: bool) -> None:
     """The certificate as a table, unless JSON is asked for."""
     from lyapnet.certification.tables import certificate_table
 
     if not as_json:
-        table = certificate_table(titled(checkpoint, at), certificate.result, certificate.labels)
+        table = certificate_table(given.title, certificate.result, certificate.labels)
         Console(highlight=False, markup=False).print(table)
 
 
-def _write(
-    certificate: Any, checkpoint: Path, at: list[str] | None, own: dict[str, str | None], as_json: bool,
-    figure: Path | None, report: Path | None,
-) -> None:  # fmt: skip
+def _write(certificate: Any, given: Given, as_json: bool, figure: Path | None, report: Path | None) -> None:
     """The certificate as JSON, and its figure and report, where they are asked for."""
     from lyapnet.certification.report import write_outputs
 
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))
-    command = certificate.command(str(checkpoint), at or [], **own)
-    for path in write_outputs(certificate, checkpoint, command, figure, report):
+    command = certificate.command(str(given.checkpoint), given.at or [], **given.own)
+    for path in write_outputs(certificate, given.checkpoint, command, figure, report):
         Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

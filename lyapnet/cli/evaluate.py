@@ -7,19 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import (
-    At,
-    Checkpoint,
-    Constraints,
-    Controls,
-    Cost,
-    Debug,
-    Network,
-    Program,
-    System,
-    load_controller,
-    titled,
-)
+from lyapnet.cli.options import Debug, Given, of_a_controller
 from lyapnet.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,8 +16,9 @@ if TYPE_CHECKING:
     from lyapnet.evaluation.measurement import Evaluation
 
 
+@of_a_controller
 def evaluate(
-    checkpoint: Checkpoint,
+    given: Given,
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 256,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
@@ -43,13 +32,6 @@ def evaluate(
         float | None,
         typer.Option(help="Also where each law that can follow T leads, up to this many T.", metavar="MULTIPLE"),
     ] = None,
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -65,16 +47,7 @@ def evaluate(
         raise UsageError(
             f"Expected --table in a folder that exists, got {str(table)!r}; make {str(table.parent)!r} first."
         )
-    controller = load_controller(
-        checkpoint,
-        at,
-        system=system,
-        network=network,
-        cost=cost,
-        controls=controls,
-        constraints=constraints,
-        program=program,
-    )
+    controller = given.load()
     count = min(samples, 64)
     if until is not None:
         check_multiple(controller, until, count)
@@ -94,7 +67,7 @@ def evaluate(
     if as_json:
         print(json.dumps(result))
     else:
-        _print_tables(titled(checkpoint, at), result, controller, count)
+        _print_tables(given.title, result, controller, count)
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)

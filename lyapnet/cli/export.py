@@ -6,33 +6,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import (
-    At,
-    Checkpoint,
-    Constraints,
-    Controls,
-    Cost,
-    Debug,
-    Network,
-    Program,
-    System,
-    load_controller,
-)
+from lyapnet.cli.options import Debug, Given, of_a_controller
 
 
+@of_a_controller
 def export(
-    checkpoint: Checkpoint,
+    given: Given,
     to: Annotated[str, typer.Option(help="c, onnx or torch.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
     name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
     beyond: Annotated[str, typer.Option(help="The law after T: hold, receding or riccati.")] = "hold",
-    system: System = None,
-    network: Network = None,
-    cost: Cost = None,
-    controls: Controls = None,
-    constraints: Constraints = None,
-    program: Program = None,
-    at: At = None,
     debug: Debug = False,
 ) -> None:
     """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
@@ -42,19 +25,10 @@ def export(
     """
     from lyapnet.export import export as write
 
-    controller = load_controller(
-        checkpoint,
-        at,
-        system=system,
-        network=network,
-        cost=cost,
-        controls=controls,
-        constraints=constraints,
-        program=program,
-    ).continued(beyond)
+    controller = given.load().continued(beyond)
     notes = Console(highlight=False, markup=False)
     with notes.status("writing and verifying …"):
-        paths, agreement = write(controller, out, to, checkpoint, name)
+        paths, agreement = write(controller, out, to, given.checkpoint, name)
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)

@@ -1,5 +1,9 @@
-"""What several commands share: options, and the controller of a checkpoint."""
+"""What several commands share: options, and the controller that a command is given."""
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,42 +21,82 @@ def _located(path: Path) -> Path:
 Checkpoint = Annotated[
     Path, typer.Argument(help="A checkpoint of a run, or zoo:NAME.", metavar="CKPT", callback=_located)
 ]
-System = Annotated[str | None, typer.Option(help="module:Class of a system of your own.")]
-Network = Annotated[str | None, typer.Option(help="module:Class of a network of your own.")]
-Cost = Annotated[str | None, typer.Option(help="module:Class of a cost of your own.")]
-Controls = Annotated[str | None, typer.Option(help="module:Class of a control set of your own.")]
-Constraints = Annotated[str | None, typer.Option(help="module:Class of constraints of your own.")]
 At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
 ]
-Program = Annotated[str | None, typer.Option(help="module:Class of a program of your own.")]
+OWN = {
+    "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",
+    "constraints": "constraints", "program": "a program",
+}  # fmt: skip
 
 
-def parts_given(checkpoint: Path, **own: str | None) -> Any:
-    """The user's own parts, each by its option's name, where one is given; made with the config of a checkpoint."""
-    from lyapnet.build import Parts, parts_named
-    from lyapnet.checkpoint import read_checkpoint
-    from lyapnet.loading import config_of
+@dataclass(frozen=True)
+class Given:
+    """The controller that a command is given: its checkpoint, the user's own parts, and of a family one member."""
 
-    named = {part: name for part, name in own.items() if name is not None}
-    return parts_named(config_of(read_checkpoint(checkpoint), checkpoint), named) if named else Parts()
+    checkpoint: Path
+    own: dict[str, str | None]  # the user's own parts, as module:Class, each by its option's name
+    at: list[str] | None
+
+    @property
+    def title(self) -> str:
+        """What a table calls the controller."""
+        from lyapnet.checkpoint import ZOO
+
+        name = f"zoo:{self.checkpoint.stem}" if self.checkpoint.parent == ZOO else str(self.checkpoint)
+        return f"{name}, {', '.join(self.at)}" if self.at else name
+
+    def of(self, checkpoint: Path) -> "Given":
+        """The same of another checkpoint."""
+        return Given(checkpoint, self.own, self.at)
+
+    def parts(self) -> Any:
+        """The user's own parts, made with the config of the checkpoint."""
+        from lyapnet.build import Parts, parts_named
+        from lyapnet.checkpoint import read_checkpoint
+        from lyapnet.loading import config_of
+
+        named = {part: name for part, name in self.own.items() if name is not None}
+        return parts_named(config_of(read_checkpoint(self.checkpoint), self.checkpoint), named) if named else Parts()
+
+    def load(self) -> Any:
+        """The controller."""
+        import torch
+
+        from lyapnet.loading import load
+
+        controller = load(self.checkpoint, **vars(self.parts()))
+        torch.set_num_threads(controller.config.training.threads)
+        return member_of(controller, self.at) if self.at else controller
 
 
-def load_controller(checkpoint: Path, at: list[str] | None = None, **own: str | None) -> Any:
-    """The controller of a checkpoint, with the user's own parts; of a family, that of one member if `at` names it."""
-    import torch
+def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
+    """A command with a Given among its parameters, as one with CKPT in its place, --system and its like, and --at."""
+    parameters = inspect.signature(command).parameters.values()
+    (given,) = (parameter.name for parameter in parameters if parameter.annotation is Given)
 
-    from lyapnet.loading import load
+    @functools.wraps(command)
+    def run(**options: Any) -> None:
+        own = {name: options.pop(name) for name in OWN}
+        command(**{given: Given(options.pop("checkpoint"), own, options.pop("at"))}, **options)
 
-    controller = load(checkpoint, **vars(parts_given(checkpoint, **own)))
-    torch.set_num_threads(controller.config.training.threads)
-    return member_of(controller, at) if at else controller
+    def keyword(name: str, annotation: Any, **more: Any) -> inspect.Parameter:
+        return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, **more)
 
-
-def titled(checkpoint: Path, at: list[str] | None) -> str:
-    """What a table calls a controller."""
-    return f"{checkpoint}, {', '.join(at)}" if at else str(checkpoint)
+    checkpoint = keyword("checkpoint", Checkpoint)
+    *own_options, debug = (
+        checkpoint if parameter.name == given else parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for parameter in parameters
+    )
+    named = (
+        keyword(name, Annotated[str | None, typer.Option(help=f"module:Class of {what} of your own.")], default=None)
+        for name, what in OWN.items()
+    )
+    taken = [*own_options, *named, keyword("at", At, default=None), debug]
+    vars(run)["__signature__"] = inspect.Signature(taken)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in taken}
+    return run
 
 
 def member_of(controller: Any, at: list[str]) -> Any:

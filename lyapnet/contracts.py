@@ -23,6 +23,18 @@ STEP = 1e-6  # of central differences, relative to the spread of an argument
 DIRECTIONS = 4  # along which derivatives are compared at each state
 
 
+def _advice(got: tuple[int, ...] | str, batch: int, expected: tuple[int, ...]) -> str:
+    """What to do about a result of another shape than (batch, *expected)."""
+    if got == expected:
+        return f"append .expand(*x.shape[:-1], {', '.join(map(str, expected))}), which gives it to each state"
+    if expected and expected[-1] == 1 and got == (batch, *expected[:-1]):
+        return "append [..., None], which adds the last axis"
+    if len(got) == 1 + len(expected) and got[0] == batch:
+        axis = next(k for k, (one, other) in enumerate(zip(got[1:], expected, strict=True), 1) if one != other)
+        return f"give its axis {axis} {expected[axis - 1]} entries, not {got[axis]}"
+    return "return one result for each state"
+
+
 def check_function(
     name: str,
     function: Callable[..., Any],
@@ -51,7 +63,7 @@ def check_function(
     if got != ((batch, *shape), given[0].dtype):
         shapes = " and ".join(str(tuple(argument.shape)) for argument in given)
         precision = "append .to(x), which gives it the precision of x"
-        advice = precision if got[0] == (batch, *shape) else "return one result for each state"
+        advice = precision if got[0] == (batch, *shape) else _advice(got[0], batch, tuple(shape))
         raise UsageError(
             f"Expected {name} as a tensor of {(batch, *shape)} and {given[0].dtype} for arguments of shape {shapes}, "
             f"got {got}; {advice}."

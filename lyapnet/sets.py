@@ -72,6 +72,18 @@ class Box(nn.Module):
         """max |x_i − point_i| over the box, for each component."""
         return torch.maximum((self.lower - point).abs(), (self.upper - point).abs())
 
+    def corners(self, axes: int = 12) -> State:
+        """The corners; those along so many of its axes, the others at the centre, where it has more."""
+        free = torch.nonzero(self.widths > 0).flatten()[:axes]
+        found = self.center.repeat(2 ** len(free), 1)
+        for k, i in enumerate(free):
+            upper = torch.arange(len(found)).bitwise_right_shift(k) % 2 == 1
+            found[:, i] = torch.where(upper, self.upper[i], self.lower[i])
+        return found
+
+    def extra_repr(self) -> str:
+        return f"{self.lower.tolist()}, {self.upper.tolist()}"
+
     def sample(self, count: int, generator: torch.Generator | None = None) -> State:
         """`count` states drawn uniformly and independently; on a CPU generator whatever the box's device,
         so that a seed names the same states everywhere."""

@@ -473,7 +473,10 @@ WRITTEN = {
     "np.sin": ({"f": np.sin}, "torch.sin for np.sin"),
     "NumPy and detach": ({"f": lambda q: torch.as_tensor(np.sin(q.detach().numpy()))}, "lyapnet.Table"),
     "float32": ({"g": lambda x: torch.ones(*x.shape, 1).float()}, r"append \.to\(x\)"),
-    "another shape": ({"g": lambda x: torch.ones(*x.shape)}, "return one result for each state"),
+    "an axis missing": ({"g": lambda x: torch.ones(*x.shape)}, r"append \[\.\.\., None\]"),
+    "one for all": ({"g": lambda x: torch.ones(2, 1)}, r"append \.expand\(\*x\.shape\[:-1\], 2, 1\)"),
+    "a row more": ({"g": lambda x: torch.ones(*x.shape[:-1], 3, 1)}, "give its axis 1 2 entries, not 3"),
+    "another shape": ({"g": lambda x: torch.ones(7)}, "return one result for each state"),
     "anything else": ({"f": lambda q: q.nothing}, "correct it there"),
 }
 

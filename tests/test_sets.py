@@ -31,6 +31,14 @@ def test_a_box_knows_its_geometry(box):
     assert box.magnitude.tolist() == [1.0, 0.5, 6.0]
 
 
+def test_a_box_has_corners_and_shows_its_bounds(box):
+    assert {tuple(corner) for corner in box.corners().tolist()} == {
+        (i, 0.5, k) for i in (-1.0, 1.0) for k in (2.0, 6.0)
+    }
+    assert {tuple(corner) for corner in box.corners(axes=1).tolist()} == {(-1.0, 0.5, 4.0), (1.0, 0.5, 4.0)}
+    assert repr(box) == "Box([-1.0, 0.5, 2.0], [1.0, 0.5, 6.0])"
+
+
 def looks_uniform(samples, lower, upper):
     """Mean and variance of every component within five standard errors of the uniform distribution's."""
     count, lower, widths = len(samples), torch.tensor(lower), torch.tensor(upper) - torch.tensor(lower)

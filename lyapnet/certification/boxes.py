@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Integer
 from torch import Tensor
 
-from lyapnet.sets import Box
-from lyapnet.types import Corner, Corners, PerBox, State
+from lyapnet.types import Corner, Corners, PerBox
 
 
 class Boxes(NamedTuple):
@@ -118,16 +117,6 @@ class CutTree:
         if len(leaves.key) != self.size + 1:  # a node cut twice, or one that no cut makes
             raise ValueError("Expected cuts that part a box and its halves, got others.")
         return leaves
-
-
-def corners(states: Box) -> State:
-    """The corners of a box of states; those along twelve of its axes, the others at the centre, where it has more."""
-    free = torch.nonzero(states.widths > 0).flatten()[:12]  # as many corners as 4096
-    found = states.center.repeat(2 ** len(free), 1)
-    for k, i in enumerate(free):
-        upper = torch.arange(len(found)).bitwise_right_shift(k) % 2 == 1
-        found[:, i] = torch.where(upper, states.upper[i], states.lower[i])
-    return found
 
 
 def faces(lower: Corner, upper: Corner, axes: Iterable[int]) -> tuple[Corners, Corners]:

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import gradients
-from lyapnet.certification.boxes import corners
 from lyapnet.certification.branch_and_bound import Budget, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.constraints import Constraints, names_of
@@ -100,7 +99,7 @@ def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.G
     constraints, horizon = problem.constraints, problem.horizon
     if constraints is None:
         return None
-    x0 = torch.cat([corners(problem.initial_states), problem.initial_states.sample(LOOPS, generator)])
+    x0 = torch.cat([problem.initial_states.corners(), problem.initial_states.sample(LOOPS, generator)])
     finer = problem.in_steps(steps=FINER * horizon.steps, dt=horizon.dt / FINER)
     try:
         with torch.no_grad():

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import corners, faces
+from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum, share_below
 from lyapnet.certification.condition import (
     DecreaseCondition,
@@ -239,7 +239,7 @@ def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float)
 
 def _largest_seen(V: Value, initial_states: Box) -> float:
     """The largest V(0, ·) among the corners of X₀ and 10 000 of its states."""
-    states = torch.cat([corners(initial_states), initial_states.sample(10_000, torch.Generator().manual_seed(0))])
+    states = torch.cat([initial_states.corners(), initial_states.sample(10_000, torch.Generator().manual_seed(0))])
     with torch.no_grad():
         return float(V(states.new_zeros(len(states)), states).max())
 

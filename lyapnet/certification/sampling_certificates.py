@@ -10,6 +10,7 @@ from lyapnet.certification.statistical import SampledClaim, StatisticalClaim, sa
 from lyapnet.certification.tables import floored
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
+from lyapnet.programs import ValueProgram
 from lyapnet.random_streams import CERTIFICATION, stream
 
 
@@ -31,12 +32,13 @@ class SampledCertificate(Certificate):
         "confidence_over_draws": "confidence over all of them",
         "decrease_lower_bound": "condition holds on at least",
         "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
-        "cost_lower_bound": "cost ≤ V(0, x₀) on at least",
+        "cost_lower_bound": "cost ≤ V(0, x₀), up to the tolerance, on at least",
         "constraints_lower_bound": "constraints kept on at least",
         "probability_lower_bound": "all that is asked for on at least",
         "required_share": "share of X₀ that the verdict is about",
         "failure": "a state that fails",
         "caveat": "this draw",
+        "advice": "what to do",
     }
     claim: SampledClaim
 
@@ -100,7 +102,19 @@ class StatisticalCertificate(SampledCertificate):
             "confidence": claim.confidence, "draws": claim.draws,
             "confidence_over_draws": claim.confidence_over_draws, "required_share": claim.share, **claim.named_bounds,
         }  # fmt: skip
-        return {**super().numbers(), **bounds, **({"caveat": self.caveat} if self.caveat else {})}
+        said = {"caveat": self.caveat, "advice": self._advice}
+        return {**super().numbers(), **bounds, **{key: text for key, text in said.items() if text}}
+
+    @property
+    def _advice(self) -> str | None:
+        """What to do where V is no bound, as that of the value program need not be."""
+        estimate, share = isinstance(self.controller.program, ValueProgram), self.claim.shares["cost"]
+        if self.verdict == "certified" or not estimate or share >= self.claim.share:
+            return None
+        return (
+            "V of the value program estimates the cost and need not bound it; for a bound train on with --finetune and "
+            "program.name=lyapunov"
+        )
 
     def in_words(self) -> str:
         bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]

@@ -36,12 +36,13 @@ def evaluate(
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
 
-    The optimum of a linear task is Riccati's; that of any other takes the extra lyapnet[oracle], and is computed
+    The optimum of a linear task is Riccati's; that of any other takes CasADi, the extra oracle, and is computed
     once for each state: the next evaluation of any controller of the task reads it.
     """
     from lyapnet.evaluation.afterwards import afterwards, check_multiple, in_plain_data
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.robustness import robustness
+    from lyapnet.evaluation.tables import evaluation_table
 
     if table is not None and not table.parent.is_dir():
         raise UsageError(
@@ -57,6 +58,8 @@ def evaluate(
             controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
         )
         result = measured.result()
+        if not as_json:
+            Console(highlight=False, markup=False).print(evaluation_table(given.title, result))
         if disturbed:
             rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
             result["robustness"] = [row._asdict() for row in rows]
@@ -67,7 +70,7 @@ def evaluate(
     if as_json:
         print(json.dumps(result))
     else:
-        _print_tables(given.title, result, controller, count)
+        _print_further_tables(result, controller, count)
     if table is not None:
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
@@ -75,13 +78,12 @@ def evaluate(
         notes.print(_write_figures(figures, controller, measured, later), soft_wrap=True)
 
 
-def _print_tables(title: str, result: dict[str, Any], controller: "Controller", count: int) -> None:
-    """What was measured; of what was asked for besides, from `count` states."""
+def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:
+    """What was asked for besides, from `count` states."""
     from lyapnet.evaluation.robustness import nominal
-    from lyapnet.evaluation.tables import afterwards_table, evaluation_table, robustness_table
+    from lyapnet.evaluation.tables import afterwards_table, robustness_table
 
     console = Console(highlight=False, markup=False)
-    console.print(evaluation_table(title, result))
     if "robustness" in result:
         member = nominal(controller) if controller.system.constants else {}
         console.print(robustness_table(result["robustness"], count, member))

@@ -57,7 +57,8 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         ("watch", shlex.join(["tensorboard", "--logdir", str(plan.config.logs)])),
         ("measure", f"lyapnet evaluate {quoted}{options}"),
         ("animate", f"lyapnet animate {quoted}{options} --out closed_loops.gif"),
-        ("certify", f"lyapnet certify {quoted}{options}"),
+        ("certify", f"lyapnet certify statistical {quoted}{options}"),
+        ("export", f"lyapnet export {quoted}{options} --to c --out law"),
         ("fine-tune", f"{command} --finetune {quoted}"),
         ("use", f"lyapnet.load({json.dumps(str(best), ensure_ascii=False)}{arguments})"),
     ):

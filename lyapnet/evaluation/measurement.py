@@ -9,7 +9,7 @@ import torch
 
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
-from lyapnet.errors import OracleError
+from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.problem import Problem
@@ -21,6 +21,18 @@ from lyapnet.types import ControlPath, State
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 
 
+CORNER_AXES = 8  # of X₀ along which corners are asked, 256 at most
+
+
+class Corner(NamedTuple):
+    """The corner of X₀ with the dearest closed loop: uniform draws come near no corner."""
+
+    count: int  # of how many
+    x0: list[float]
+    cost: float | None  # J; none where closed loops from the corners leave the finite numbers
+    value: float  # V(0, x₀)
+
+
 class Evaluation(NamedTuple):
     """What a controller does from fresh states of X₀."""
 
@@ -29,6 +41,7 @@ class Evaluation(NamedTuple):
     notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
     seed: int
     problem: Problem
+    corner: Corner
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -45,7 +58,15 @@ class Evaluation(NamedTuple):
         if self.table.violated is not None:
             used["violated_fraction"] = float(self.table.violated.double().mean())
             used["constraints"] = self.table.violations(names_of(self.problem.constraints))
-        return {**self.table.summary(), **paper, "terminal_errors": terminal, **used, **counts, **self._note()}
+        return {
+            **self.table.summary(),
+            **paper,
+            "terminal_errors": terminal,
+            **used,
+            **counts,
+            **self._note(),
+            "worst_corner": self.corner._asdict(),
+        }
 
     def write(self, path: Path) -> None:
         """The table as comma-separated values with a line of names and units.
@@ -112,16 +133,31 @@ def evaluation(
     trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
+    corner = dearest_corner(controller)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     if not optimum:
-        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.problem)
+        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.problem, corner)
     try:
         optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
     except OracleError as reason:
-        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.problem)
+        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.problem, corner)
     return Evaluation(
-        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.problem
+        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.problem, corner
     )
+
+
+def dearest_corner(controller: Controller) -> Corner:
+    """The corner of X₀ whose closed loop costs most, of those along its first CORNER_AXES axes."""
+    x0 = controller.initial_states.corners(CORNER_AXES)
+    with torch.no_grad():
+        value = controller.value(0.0, x0)
+        try:
+            cost = controller.rollout(x0).cost
+        except DivergenceError:
+            cost = torch.full_like(value, torch.inf)
+    i = int(cost.argmax())
+    finite = bool(cost[i].isfinite())
+    return Corner(len(x0), x0[i].tolist(), float(cost[i]) if finite else None, float(value[i]))
 
 
 def _optima(controller: Controller, x0: State, known: ControlPath, progress: Report) -> Optima:

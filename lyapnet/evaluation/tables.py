@@ -44,6 +44,9 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
         )
     for name, found in result.get("constraints", {}).items():
         table.add_row(f"{name}: greatest h, when", f"{found['worst']:.4g}, {found['time']:.4g} s")
+    if corner := result.get("worst_corner"):  # since version 0.3
+        cost = "not finite" if corner["cost"] is None else f"{corner['cost']:.4g}"
+        table.add_row(f"dearest of {corner['count']} corners of X₀: cost J, V(0, x₀)", f"{cost}, {corner['value']:.4g}")
     table.caption = _caption([result])
     return table
 

@@ -4,7 +4,7 @@ import resource
 import shlex
 import statistics
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import lightning as L
 import torch
 from rich.console import Console
+from rich.status import Status
 from rich.text import Text
 
 from lyapnet.build import Parts
@@ -144,7 +145,7 @@ def _seeks_start(plan: Plan) -> bool:
 def _relax(plan: Plan, console: Console, told: bool) -> None:
     """Set the penalty that stands for constraints, and say what it keeps."""
     with console.status("constraints …") if told else nullcontext() as status:
-        report = silent if status is None else lambda stage: status.update(f"constraints: {stage} …")
+        report = silent if status is None else _told(console, status, "constraints")
         relaxation = find_relaxation(plan.module.members[0].problem, report)
     assert plan.module.penalty is not None
     plan.module.penalty.weight.fill_(relaxation.weight)
@@ -153,10 +154,22 @@ def _relax(plan: Plan, console: Console, told: bool) -> None:
         console.print(str(relaxation), soft_wrap=True)
 
 
+def _told(console: Console, status: Status, what: str) -> Callable[[str], None]:
+    """Shows a stage beside the spinner of a terminal; elsewhere, as in a log, on a line of its own."""
+
+    def report(stage: str) -> None:
+        if console.is_terminal:
+            status.update(f"{what}: {stage} …")
+        else:
+            console.print(f"{what}: {stage} …", soft_wrap=True)
+
+    return report
+
+
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
     with console.status("start …") if told else nullcontext() as status:
-        report = silent if status is None else lambda stage: status.update(f"start: {stage} …")
+        report = silent if status is None else _told(console, status, "start")
         start = choose_start(list(plan.module.members), report)
     if told and start is not None:
         plan.run.note(start=start.as_json())

@@ -15,13 +15,14 @@ from lyapnet.certification.sampling_certificates import (
     SampledCertificate,
     StatisticalCertificate,
     sampled_certificate,
+    statistical_certificate,
 )
 from lyapnet.certification.sound_certificate import SoundCertificate, sound_certificate
 from lyapnet.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.controller import Controller
 from lyapnet.loading import load
-from lyapnet.programs import Tolerances
+from lyapnet.programs import LyapunovProgram, Tolerances, ValueProgram
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator
 from tests.problems import Formula, problem_of
@@ -195,3 +196,11 @@ def test_nothing_is_infinite_in_json(checkpoint):
     result = sound_certificate(load(checkpoint), alpha=1.0, delta=0.0, seconds=0.1).result
     assert json.dumps(result, allow_nan=False)
     assert result["terminal_excess"] is None, "κ is infinite where no funnel was proved"
+
+
+@pytest.mark.parametrize(("program", "told"), [(ValueProgram(), True), (LyapunovProgram(), False)])
+def test_a_value_function_that_is_no_bound_is_told_what_to_do(program, told):
+    V = Formula(lambda t, x: 1e-3 * (x**2).sum(-1))
+    certificate = statistical_certificate(Controller(problem_of(DoubleIntegrator()), V, program=program), samples=50)
+    assert certificate.verdict == "falsified"
+    assert ("program.name=lyapunov" in certificate.result.get("advice", "")) is told

@@ -115,9 +115,7 @@ def test_what_does_not_fit_is_refused(checkpoint, line, message, capsys):
 
 
 def test_options_are_refused_before_any_work(monkeypatch, capsys):
-    monkeypatch.setattr(
-        certify, "load_controller", lambda *_, **own: pytest.fail("Expected no work on a wrong request.")
-    )
+    monkeypatch.setattr(certify.Given, "load", lambda _: pytest.fail("Expected no work on a wrong request."))
     for wrong in (
         ["sound", "any.ckpt", "--alpha=2"],
         ["statistical", "any.ckpt", "--share=2"],
@@ -134,7 +132,7 @@ def certifiable(*arguments, **own):
 
 
 def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(certify, "load_controller", certifiable)
+    monkeypatch.setattr(certify.Given, "load", certifiable)
     monkeypatch.setattr(funnel, "LEVELS", 20.0)
     path = str(tmp_path / "kept.proof")
     options = ["--alpha", "0.9", "--delta", "0.05", "--keep", path]
@@ -153,7 +151,7 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(checking, "sound_claim", lambda *a, **o: pytest.fail("Expected no work on another proof."))
     for other, why in ((0.999, "name its checkpoint."), (1.0, "changed or damaged")):  # another V, then a changed file
         V = planted.stationary(other * planted.riccati())
-        monkeypatch.setattr(certify, "load_controller", lambda *a, V=V, **own: Controller(planted.problem(), V))
+        monkeypatch.setattr(certify.Given, "load", lambda _, V=V: Controller(planted.problem(), V))
         if other == 1.0:
             content = Path(path).read_bytes()
             Path(path).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))

@@ -32,6 +32,7 @@ WITH_TENSORS = {  # operators ↦ those that take tensors in the place of number
     },
     aten.clamp.default: aten.clamp.Tensor,
 }
+SIMPLER: dict[Any, Any] = {aten.tan.default: lambda v: v.sin() / v.cos()}  # onnxruntime has none in double precision
 ABOUT = "lyapnet.json"  # in a program of torch.export
 
 
@@ -71,6 +72,8 @@ def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
     """A copy with tensors for the numbers in its arithmetic, which ONNX would round to float32."""
     graph = copy.deepcopy(graph)
     for node in [node for node in graph.graph.nodes if node.op == "call_function"]:
+        if node.target is aten.slice_scatter.default:
+            _end_within(node)
         value = node.meta.get("val")
         if not isinstance(value, torch.Tensor) or not value.is_floating_point():
             continue
@@ -85,6 +88,13 @@ def _with_exact_numbers(graph: GraphModule, dtype: torch.dtype) -> GraphModule:
             node.target = WITH_TENSORS[node.target]
     graph.recompile()
     return graph
+
+
+def _end_within(node: Node) -> None:
+    """Gives a slice_scatter without end the size of its axis: torch.vmap overflows at the largest integer."""
+    given: dict[str, Any] = dict(zip(("whole", "part", "axis", "start", "end"), node.args, strict=False))
+    if given.get("end") is not None:
+        node.update_arg(4, min(given["end"], given["whole"].meta["val"].shape[given["axis"]]))
 
 
 def _constant_before(node: Node, graph: GraphModule, value: torch.Tensor, place: int = 0) -> Node:
@@ -126,8 +136,8 @@ def onnx_model_of(law: Law) -> Any:
         raise ExportError(
             f"Expected onnx, onnxscript and onnxruntime, got {error}; pip install 'lyapnet[onnx]'."
         ) from error
-    program = program_of(law)
     with _quiet("ONNX does not have"):
+        program = program_of(law).run_decompositions(SIMPLER)
         return torch.onnx.export(
             program, dynamo=True, input_names=[*law.arguments], output_names=RESULTS, verbose=False
         )

@@ -179,6 +179,8 @@ def own_controller(V=lambda t, x: (x**2).sum(-1) * (1 + t), **options):
 
 OWN = {
     "a square": lambda t, x: (x**2).sum(-1) * (1 + t),
+    "a tangent": lambda t, x: torch.tan(0.1 * x[..., 0]) ** 2 * (1 + t),
+    "a part of an axis": lambda t, x: (torch.cat([x, x], -1)[..., 1:] ** 2).sum(-1) * (1 + t),
     "no time": lambda t, x: (x**2).sum(-1),
     "numbers": lambda t, x: torch.remainder(x[..., 0], 0.7) * x[..., 0] * (1 + t) + torch.full_like(x[..., 0], 0.1),
 }

@@ -207,7 +207,8 @@ def test_evaluation_has_the_designed_keys(controller):
     result = evaluate(controller, samples=5, seed=2)
     assert result.keys() >= DESIGNED_KEYS
     assert (result["samples"], result["seed"]) == (5, 2)
-    errors = result.pop("terminal_errors")
+    errors, corner = result.pop("terminal_errors"), result.pop("worst_corner")
+    assert corner.keys() == {"count", "x0", "cost", "value"}
     assert errors.keys() == {"position (m)", "velocity (m/s)"}
     assert all(isinstance(value, int | float) for value in (*result.values(), *errors.values()))
     assert json.loads(json.dumps(result)) == result

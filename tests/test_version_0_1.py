@@ -37,12 +37,18 @@ def approximately(expected, rel=1e-9):
     return pytest.approx(expected, rel=rel, abs=1e-12) if isinstance(expected, float) else expected
 
 
+def known_then(evaluation):
+    """An evaluation, or that of several seeds, without what 0.3 measures besides."""
+    seeds = {"seeds": [known_then(seed) for seed in evaluation["seeds"]]} if "seeds" in evaluation else {}
+    return {key: value for key, value in (evaluation | seeds).items() if key != "worst_corner"}
+
+
 @pytest.mark.parametrize("path", EVALUATED, ids=named)
 def test_checkpoint_is_measured_as_by_version_0_1(path):
     expected = json.loads(path.read_text())
     name = path.stem.removeprefix("evaluate_")
     controller = lyapnet.load(path.parent / "checkpoints" / f"{name}.ckpt")
-    assert evaluate(controller, expected["samples"], expected["seed"]) == approximately(expected)
+    assert known_then(evaluate(controller, expected["samples"], expected["seed"])) == approximately(expected)
 
 
 @pytest.mark.parametrize("kind", ["sampled", "statistical", pytest.param("sound", marks=pytest.mark.slow)])
@@ -87,7 +93,7 @@ def distance(new, old):
 def test_stopped_run_goes_on_to_the_end_that_it_had_under_version_0_1(name, members, tmp_path, monkeypatch):
     run, end = resumed(f"{name}_stopped", tmp_path, monkeypatch), FIXTURES / f"{name}_finished"
     assert distance(weights(run.last), weights(end / "checkpoints/last.ckpt")) < 1e-9
-    assert run.evaluation == approximately(json.loads((end / "evaluation.json").read_text()))
+    assert known_then(run.evaluation) == approximately(json.loads((end / "evaluation.json").read_text()))
     curves = json.loads((FIXTURES / "curves.json").read_text())
     for member in members:
         expected = curves[f"{name}_finished" + ("" if member == "." else f"/{member}")]

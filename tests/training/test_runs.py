@@ -140,7 +140,8 @@ def test_the_commands_that_come_next_can_be_pasted(tmp_path, monkeypatch, capsys
     shown = {line[:10].strip(): line[10:] for line in capsys.readouterr().out.splitlines()}
     assert shlex.split(shown["watch"]) == ["tensorboard", "--logdir", str(folder)]
     assert shlex.split(shown["measure"]) == ["lyapnet", "evaluate", str(best)]
-    assert shlex.split(shown["certify"]) == ["lyapnet", "certify", str(best)]
+    assert shlex.split(shown["certify"]) == ["lyapnet", "certify", "statistical", str(best)]
+    assert shlex.split(shown["export"])[:3] == ["lyapnet", "export", str(best)]
     assert shlex.split(shown["fine-tune"])[-2:] == ["--finetune", str(best)]
     assert ast.literal_eval(shown["use"].removeprefix("lyapnet.load")) == str(best)
 

@@ -120,6 +120,7 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     pytest.importorskip("casadi")
     pytest.importorskip("onnxscript")
     monkeypatch.setattr(making, "SAMPLES", 2)
+    monkeypatch.setattr(making, "PRECISIONS", ("float64",))
     certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
     monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
     trained = tmp_path / "run" / "checkpoints" / "best.ckpt"

@@ -17,8 +17,8 @@ STATES = 10_000
 LOOPS = 100  # closed loops, of whose states half of them are
 AROUND = 0.2  # of the widths of the box of those states, by which the others may leave it
 AFTER = 1.25  # of T: their latest time
-TOLERANCES = {torch.float64: 1e-10, torch.float32: 1e-4}  # relative to the largest |u| and |V|
-LOOSER = 1e4  # for a law that compares costs: rounding decides between controls that cost the same
+TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # relative to the largest |u| and |V|
+LOOSER = 1e3  # for a law that compares costs: rounding decides between controls that cost the same
 
 Evaluate = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]  # t (k,), x (k, n) ↦ u (k, m), V (k,)
 

@@ -26,7 +26,7 @@ DIRECTIONS = 4  # along which derivatives are compared at each state
 def _advice(got: tuple[int, ...] | str, batch: int, expected: tuple[int, ...]) -> str:
     """What to do about a result of another shape than (batch, *expected)."""
     if got == expected:
-        return f"append .expand(*x.shape[:-1], {', '.join(map(str, expected))}), which gives it to each state"
+        return f"append .expand({', '.join(['*x.shape[:-1]', *map(str, expected)])}), which gives it to each state"
     if expected and expected[-1] == 1 and got == (batch, *expected[:-1]):
         return "append [..., None], which adds the last axis"
     if len(got) == 1 + len(expected) and got[0] == batch:

@@ -17,7 +17,6 @@ from lyapnet.export.law import Law
 from lyapnet.export.verification import points
 from lyapnet.graphs.c_text import literal
 from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import Trajectory
 
 RATE = 1000  # controls per second
 STATES = 1000  # that are asked for in turn
@@ -86,15 +85,16 @@ def latencies(controller: Controller, seconds: float, others: Mapping[str, Polic
         fast = CompiledLaw(folder / "law", Law(controller), controller.system.m, FAST)
     for way, policy in (("Python, compiled", fast.policy), ("Python", controller.policy)):
         found.append(_summary(way, _in_python(policy, t, x, count)))
-    x0 = controller.initial_states.sample(LOOPS, stream(0, TEST, 2)).to(controller.initial_states.lower)
-    loops = controller.rollout(x0)
-    for way, policy in (others or {}).items():
-        found.append(_summary(way, _in_python(policy, *_in_turn(loops), count)))
+    if others:
+        t, x = _along_loops(controller)
+        found += [_summary(way, _in_python(policy, t, x, count)) for way, policy in others.items()]
     return found
 
 
-def _in_turn(loops: Trajectory) -> tuple[NDArray, NDArray]:
+def _along_loops(controller: Controller) -> tuple[NDArray, NDArray]:
     """(t, x) of closed loops at their steps, one loop after another."""
+    x0 = controller.initial_states.sample(LOOPS, stream(0, TEST, 2)).to(controller.initial_states.lower)
+    loops = controller.rollout(x0)
     t, x = loops.t[:-1].double().cpu().numpy(), loops.x[:-1].double().cpu().numpy()
     return np.tile(t, x.shape[1]), x.transpose(1, 0, 2).reshape(-1, x.shape[2])
 

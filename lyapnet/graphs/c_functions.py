@@ -2,7 +2,8 @@
 
 An operation on constants alone is torch's own, and its result a table. One that only looks at entries in another way, a
 transposition or a slice, writes nothing: an array is a place in memory with strides, on which torch itself does the
-operation. What is left are loops, of which RULES has the inner line. Nothing is allocated but on the stack.
+operation. What is left are loops, of which RULES has the inner line; loops that stand already are not written again.
+Nothing is allocated but on the stack.
 """
 
 from collections.abc import Sequence
@@ -141,10 +142,10 @@ class _Reader(Interpreter):
             if name == "as_strided" or (self.logical and name in ("add", "sub")):
                 raise NotImplementedError
             if is_view(target):
-                return self.text.viewed(target, *args, **kwargs)
+                return self.text.once(lambda: self.text.viewed(target, *args, **kwargs))
             if name not in RULES:
                 raise NotImplementedError
-            return RULES[name](self.text, *args, **kwargs)
+            return self.text.once(lambda: RULES[name](self.text, *args, **kwargs))
         except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise ExportError(
                 f"Expected operations that can be written in {self.text.language}, got {target}; write f, g, the cost "

@@ -1,8 +1,9 @@
 """C99 as it is written: arrays in memory, tables of constants, and loops over them."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -66,23 +67,40 @@ class Text:
     """
 
     language, otherwise = "C", "take --to torch"  # for messages
+    declaration = "double {name}[{size}];"  # of an array
     counter = "int"  # how one is declared
     whole = "(int)"  # makes an index of a number
 
     def __init__(self, tables: Tables):
         self.tables, self.lines, self.bytes, self._count = tables, list[str](), 0, 0
+        self._known: dict[str, int] = {}  # lines, with their new arrays counted from 0 ↦ the first of these
 
     def new(self, shape: Sequence[int]) -> Array:
         """A new array."""
         name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
         size = max(1, layout.numel())
         self._count, self.bytes = self._count + 1, self.bytes + 8 * size
-        self.declare(name, size)
+        self.lines.append(self.declaration.format(name=name, size=size))
         return Array(name, layout)
 
-    def declare(self, name: str, size: int) -> None:
-        """Write a new array."""
-        self.lines.append(f"double {name}[{size}];")
+    def once(self, write: Callable[[], Any]) -> Any:
+        """What `write` returns, whose lines are kept unless the same stand already: then their arrays are returned.
+
+        An array is written to where it is made, and never again, so that the same lines have the same results.
+        """
+        lines, first, size = len(self.lines), self._count, self.bytes
+        result = write()
+        earlier = self._known.setdefault(_renamed("\n".join(self.lines[lines:]), first, "v+", 0), first)
+        if self._count == first or earlier == first:
+            return result
+        del self.lines[lines:]
+        self._count, self.bytes = first, size
+        return tree_map(
+            lambda leaf: (
+                replace(leaf, name=_renamed(leaf.name, first, "v", earlier)) if isinstance(leaf, Array) else leaf
+            ),
+            result,
+        )
 
     def unused(self, name: str) -> None:
         """Write that an array may serve nobody, which a compiler would point out else."""
@@ -138,6 +156,13 @@ class Text:
             return self.tables.of(value)
         number = literal(float(value))
         return f"({number})" if number.startswith("-") else number
+
+
+def _renamed(text: str, first: int, letter: str, start: int) -> str:
+    """A text whose arrays from v`first` on are counted from `start`."""
+    return re.sub(
+        r"\bv(\d+)\b", lambda name: name[0] if int(name[1]) < first else f"{letter}{int(name[1]) - first + start}", text
+    )
 
 
 def literal(number: float) -> str:

@@ -22,14 +22,8 @@ class JavaScriptText(Text):
     """The body of a JavaScript function, line by line; its arrays stand outside of it."""
 
     language, otherwise = "JavaScript", "take lyapnet animate"
+    declaration = "const {name} = new Float64Array({size});"
     counter, whole = "let", ""
-
-    def __init__(self, tables: Tables):
-        super().__init__(tables)
-        self.arrays: list[str] = []
-
-    def declare(self, name: str, size: int) -> None:
-        self.arrays.append(f"const {name} = new Float64Array({size});")
 
     def unused(self, name: str) -> None:
         pass
@@ -52,8 +46,8 @@ def javascript_function(
     """
     text = JavaScriptText(tables)
     write_body(text, graph, arguments, results)
-    body = "\n".join(text.lines)
-    head, given = "\n".join(text.arrays), ", ".join([*arguments, *results])
+    head, body = ("\n".join(line for line in text.lines if line.startswith("const ") is made) for made in (True, False))
+    given = ", ".join([*arguments, *results])
     return f"const {name} = (() => {{\n{head}\nreturn ({given}) => {{\n{body}\n}};\n}})();\n"
 
 

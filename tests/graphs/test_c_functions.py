@@ -27,6 +27,7 @@ FUNCTIONS = OF_CASADI | {
     "nothing": lambda x: torch.cat([x[:, :0], x, x[:, 4:]], -1) + 0.0 * x[:, :0].sum(),
     "singular": lambda x: torch.linalg.det(torch.zeros(3, 3).to(x) * x[0, 0]) + x,
     "shares": lambda x: torch.softmax(x, -1) + torch.nn.functional.pad(x, (1, 0))[:, :4] + torch.hypot(x, x + 1),
+    "alike": lambda x: x.sin().sum(-1) * x[0].sin() + x.sin() + (1 + x).sin().sum() + (1 + x[0]).cumsum(-1)[1:].sum(),
     "undefined": lambda x: torch.nan_to_num(x / x - 1, nan=2.0),
 }  # fmt: skip
 POINT = torch.tensor([[0.3, -0.8, 1.7, -2.2]], dtype=torch.float64)
@@ -68,6 +69,20 @@ def in_c(tmp_path_factory):
 def test_operations_of_user_systems_are_written(name, in_c):
     for x in (POINT, POINT.flip(-1) / 2, torch.zeros_like(POINT)):
         assert_close(in_c[name](x), FUNCTIONS[name](x).flatten(), rtol=1e-12, atol=1e-13, equal_nan=True)
+
+
+def test_the_same_operations_are_written_once():
+    def lines_of(function):
+        graph = core_trace(lambda x: (function(x),), [torch.zeros(1, 4)], "a function", ExportError)
+        return c_function("void f(const double *x, double *y)", graph, {"x": POINT}, ["y"], Tables())
+
+    once, size = lines_of(lambda x: x.sin().exp())
+    again, same_size = lines_of(lambda x: x.sin().exp() + 0 * x[0].sin().exp()[None])
+    other, larger_size = lines_of(lambda x: x.sin().exp() + 0 * (1.0 + x[0]).sin().exp()[None])
+    assert again.count("sin(") == again.count("exp(") == once.count("sin(") == 1
+    assert same_size == size + 2 * 4 * 8
+    assert other.count("sin(") == 2
+    assert larger_size > same_size
 
 
 def test_what_is_not_a_number_stays_so(in_c):

@@ -166,6 +166,33 @@ def test_shipped_config_is_its_task(name):
     assert rollout.method == "euler"
 
 
+def test_a_number_stands_for_every_state_or_control():
+    numbers = objects(load_config(CONF / "reacher.yaml", ["cost={Q: 2, R: 3, Q_T: 4}"]))[0].cost
+    lists = objects(load_config(CONF / "reacher.yaml", ["cost={Q: [2, 2, 2, 2], R: [3, 3], Q_T: [4, 4, 4, 4]}"]))[
+        0
+    ].cost
+    assert_close(numbers.Q, lists.Q)
+    assert_close(numbers.Q_T, lists.Q_T)
+    assert_close(numbers.R_constant, lists.R_constant)
+    assert_close(numbers.R_constant, 3 * torch.eye(2, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("cost.Q=[1,1,1]", r"cost.Q with 4 entries \(.*\), got 3"),
+        ("cost.Q_T=[1,1,1]", r"cost.Q_T with 4 entries \(.*\), got 3"),
+        ("cost.R=[1,1,1]", r"cost.R with 2 entries \(.*\), got 3"),
+        ("cost.R=true", "R as a number, the diagonal's numbers or a list of rows, got True"),
+        ("initial_states.lower=[1,1,1]", r"initial_states.lower with 4 entries \(.*\), got 3"),
+        ("initial_states.upper=[1,1,1]", r"initial_states.upper with 4 entries \(.*\), got 3"),
+    ],
+)
+def test_lists_that_do_not_fit_are_named(override, reason):
+    with pytest.raises(UsageError, match=f"Expected {reason}"):
+        objects(load_config(CONF / "reacher.yaml", [override]))
+
+
 # The user's own classes
 
 

@@ -110,7 +110,7 @@ network: {{name: fcn}}
     rows = load_config(tmp_path / "small.yaml", [f"cost.R={(0.5 * torch.eye(m)).tolist()}"])
     assert torch.equal(build_problem(rows).cost.R_constant, cost.R_constant)
     assert_close(cost.R_inverse, 2 * torch.eye(m))
-    with pytest.raises(UsageError, match=rf"Expected cost.R with {m} entries"):
+    with pytest.raises(UsageError, match=rf"Expected cost.R with {'one entry' if m == 1 else f'{m} entries'}"):
         build_problem(load_config(tmp_path / "small.yaml", [f"cost.R={[0.5] * (m + 1)}"]))
 
 

@@ -67,11 +67,16 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
-        cls = getattr(importlib.import_module(module_name), class_name)
+        module = importlib.import_module(module_name)
+        cls = getattr(module, class_name, None)
     except (Exception, SystemExit) as error:  # of any kind: the module is the user's
         raise UsageError(
-            f"Expected {key} as {choices}, got {name!r} ({raised(error)}); correct the name, or the module."
+            f"Expected {key} as module:Class, got {name!r} ({raised(error)}); correct the name, or the module."
         ) from error
+    if cls is None:
+        classes = [known for known, value in vars(module).items() if isinstance(value, type)]
+        hint = did_you_mean(class_name, classes, "correct the name, or the module.", f"{module_name}:")
+        raise UsageError(f"Expected {key} as a class of {module_name}, got {name!r}, which it has not; {hint}")
     if not (isinstance(cls, type) and issubclass(cls, base)):
         raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
     return cls

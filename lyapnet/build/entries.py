@@ -11,7 +11,7 @@ from lyapnet.systems import ControlAffineSystem
 def rows(name: str, matrix: Any) -> Any:
     """A flat list of numbers as the diagonal matrix it stands for."""
     if not isinstance(matrix, list | tuple):
-        raise ValueError(f"Expected {name} as a list of rows, or of the diagonal's numbers, got {matrix!r}.")
+        raise ValueError(f"Expected {name} as a number, the diagonal's numbers or a list of rows, got {matrix!r}.")
     if all(type(entry) in (int, float) for entry in matrix):
         return torch.diag(torch.tensor(matrix, dtype=torch.get_default_dtype()))
     return matrix
@@ -30,9 +30,10 @@ def entry_per_state(key: str, entries: list[float] | None, system: ControlAffine
 
 
 def repeated(entries: Any, n: int) -> Any:
-    """A list of one number as the number of every state; anything else as it is."""
-    alone = isinstance(entries, list | tuple) and len(entries) == 1 and isinstance(entries[0], int | float)
-    return [*entries] * n if alone else entries
+    """A number, or a list of one, as the number of every state; anything else as it is."""
+    listed = [entries] if type(entries) in (int, float) else entries
+    alone = isinstance(listed, list | tuple) and len(listed) == 1 and isinstance(listed[0], int | float)
+    return [*listed] * n if alone else entries
 
 
 def require_length(key: str, length: int, system: ControlAffineSystem, expected: int | None = None) -> None:
@@ -40,7 +41,8 @@ def require_length(key: str, length: int, system: ControlAffineSystem, expected:
     expected = system.n if expected is None else expected
     if length != expected:
         names = ", ".join(system.state_names if expected == system.n else system.control_names)
-        raise UsageError(f"Expected {key} with {expected} entries ({names}), got {length}; give one for each.")
+        entries = "one entry" if expected == 1 else f"{expected} entries"
+        raise UsageError(f"Expected {key} with {entries} ({names}), got {length}; give one for each.")
 
 
 def index_of(name: str, key: str, system: ControlAffineSystem) -> int:

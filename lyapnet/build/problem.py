@@ -42,9 +42,10 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         with section("initial_states"):
-            bounds = (config.initial_states.lower, config.initial_states.upper)
-            initial_states = Box(*(repeated(bound, system.n) for bound in bounds))
-            require_length("initial_states.lower", initial_states.dimension, system)
+            bounds = {side: repeated(getattr(config.initial_states, side), system.n) for side in ("lower", "upper")}
+            for side, bound in bounds.items():
+                require_length(f"initial_states.{side}", len(bound), system)
+            initial_states = Box(**bounds)
         with section("horizon"):
             method = config.rollout.method
             held = method if method in TABLEAUX else "rk4"  # of an adaptive method
@@ -91,8 +92,10 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
     if config.parameters:
         raise UsageError("Expected no cost.parameters with the quadratic cost, got some; it has Q, R and Q_T.")
     R = _control_weight(config.R, system)
-    cost = QuadraticCost(rows("Q", repeated(config.Q, system.n)), R, rows("Q_T", repeated(config.Q_T, system.n)))
-    require_length("cost.Q", len(cost.Q), system)
+    weights = {key: rows(key, repeated(getattr(config, key), system.n)) for key in ("Q", "Q_T")}
+    for key, weight in weights.items():
+        require_length(f"cost.{key}", len(weight), system)
+    cost = QuadraticCost(R=R, **weights)
     return _going_round(config.periodic, cost, system) if config.periodic else cost
 
 

@@ -86,7 +86,10 @@ class ControlAffineSystem(nn.Module, ABC):
             if not listed or len(set(listed)) < len(listed):
                 raise UsageError(f"Expected {name}.{names} with a name for each, got {listed!r}; declare them.")
             if len(of_each) != len(listed):
-                raise UsageError(f"Expected one unit for each of {name}.{names}, got {len(of_each)}; declare {units}.")
+                raise UsageError(
+                    f"Expected one unit for each of the {len(listed)} {name}.{names}, got {len(of_each)}; "
+                    f"declare {units}."
+                )
         for attribute in ("angles", "constants"):
             listed = getattr(self, attribute)
             if not all(isinstance(i, int) and 0 <= i < self.n for i in listed):

@@ -1,5 +1,6 @@
 """The lists of a config: a number for each state or control, or one for all."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,7 +26,7 @@ def entry_per_state(key: str, entries: list[float] | None, system: ControlAffine
     """
     every = repeated(entries, system.n)
     if every is not None:
-        require_length(key, len(every), system)
+        require_length(key, len(every), system.state_names)
     return every
 
 
@@ -36,13 +37,11 @@ def repeated(entries: Any, n: int) -> Any:
     return [*listed] * n if alone else entries
 
 
-def require_length(key: str, length: int, system: ControlAffineSystem, expected: int | None = None) -> None:
-    """Refuse a list that has another number of entries than there are states, or than is expected."""
-    expected = system.n if expected is None else expected
-    if length != expected:
-        names = ", ".join(system.state_names if expected == system.n else system.control_names)
-        entries = "one entry" if expected == 1 else f"{expected} entries"
-        raise UsageError(f"Expected {key} with {entries} ({names}), got {length}; give one for each.")
+def require_length(key: str, length: int, names: Sequence[str]) -> None:
+    """Refuse a list that has another number of entries than there are states, or controls, of these names."""
+    if length != len(names):
+        entries = "one entry" if len(names) == 1 else f"{len(names)} entries"
+        raise UsageError(f"Expected {key} with {entries} ({', '.join(names)}), got {length}; give one for each.")
 
 
 def index_of(name: str, key: str, system: ControlAffineSystem) -> int:

@@ -44,7 +44,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("initial_states"):
             bounds = {side: repeated(getattr(config.initial_states, side), system.n) for side in ("lower", "upper")}
             for side, bound in bounds.items():
-                require_length(f"initial_states.{side}", len(bound), system)
+                require_length(f"initial_states.{side}", len(bound), system.state_names)
             initial_states = Box(**bounds)
         with section("horizon"):
             method = config.rollout.method
@@ -94,7 +94,7 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
     R = _control_weight(config.R, system)
     weights = {key: rows(key, repeated(getattr(config, key), system.n)) for key in ("Q", "Q_T")}
     for key, weight in weights.items():
-        require_length(f"cost.{key}", len(weight), system)
+        require_length(f"cost.{key}", len(weight), system.state_names)
     cost = QuadraticCost(R=R, **weights)
     return _going_round(config.periodic, cost, system) if config.periodic else cost
 
@@ -123,10 +123,10 @@ def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
     """R as a matrix, or as the function of the state that inverse_mass names."""
     if not isinstance(R, str):
         R = rows("R", repeated(R, system.m))
-        require_length("cost.R", len(R), system, system.m)
+        require_length("cost.R", len(R), system.control_names)
         return R
     if R != "inverse_mass":
-        raise ValueError(f"Expected R as a matrix or inverse_mass, got {R!r}; write R as a list of rows.")
+        raise ValueError(f"Expected R as a number, the diagonal's numbers, a list of rows or inverse_mass, got {R!r}.")
     inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
     if inverse_mass is None:
         raise ValueError(
@@ -159,5 +159,5 @@ def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> l
     if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):
         raise UsageError(f"Expected {key} as a number or a list of them, got {given!r}; write null where is no limit.")
     entries = repeated(entries, system.m)
-    require_length(key, len(entries), system, system.m)
+    require_length(key, len(entries), system.control_names)
     return entries

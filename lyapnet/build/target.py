@@ -20,12 +20,12 @@ def about_target(config: Config, cost: Cost, system: ControlAffineSystem, contro
     if config.target is None:
         return cost
     target, given = repeated(config.target, system.n), repeated(config.target_control, system.m)
-    require_length("target", len(target), system)
+    require_length("target", len(target), system.state_names)
     x = torch.tensor(target, dtype=torch.float64)
     if given is None:
         u = holding(system, x)
     else:
-        require_length("target_control", len(given), system, system.m)
+        require_length("target_control", len(given), system.control_names)
         u = torch.tensor(given, dtype=torch.float64)
     if not bool(controls.contains(u)):
         raise UsageError(

@@ -51,6 +51,7 @@ OWN = (
     "quadrotor",
     "satellite",
     "three_link_arm",
+    "quadrotor_transfer",
 )  # of four sections, as a user writes them
 
 

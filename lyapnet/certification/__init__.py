@@ -1,6 +1,7 @@
 """Certificates: on how much of X₀ a controller keeps its promises, and how sure that is.
 
-Three claims of growing strength: sampled, statistical, sound. Each class says in its first line what it claims.
+Three claims of growing strength, sampled, statistical and sound, and one about the receding law, region. Each class
+says in its first line what it claims.
 """
 
 from lyapnet.certification.branch_and_bound import Budget
@@ -8,6 +9,7 @@ from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample, violations
 from lyapnet.certification.funnel import SoundClaim, enclosing_box, sound_claim
 from lyapnet.certification.proof import Progress, Proof, prove
+from lyapnet.certification.region import RegionClaim, region_claim
 from lyapnet.certification.statistical import (
     SampledClaim,
     StatisticalClaim,
@@ -23,6 +25,7 @@ __all__ = [
     "DecreaseCondition",
     "Progress",
     "Proof",
+    "RegionClaim",
     "SampledClaim",
     "SoundClaim",
     "StatisticalClaim",
@@ -30,6 +33,7 @@ __all__ = [
     "enclosing_box",
     "lower_bound",
     "prove",
+    "region_claim",
     "sampled_claim",
     "sound_claim",
     "statistical_claim",

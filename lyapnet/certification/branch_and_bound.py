@@ -218,14 +218,19 @@ def minimum(
     enough: float = float("inf"),
     unit: float = 0.0,
     tolerance: float = 1e-3,
+    bounded: BoundedFunction | None = None,
 ) -> float:
     """A lower bound of min f over boxes, on the part with where(t, x) ≤ level; ∞ where it is empty.
 
     Boxes are cut until the bound comes within tolerance · max(|min|, unit) of a value of f or reaches what is enough,
     or the budget is spent.
+
+    Args:
+        bounded: of (f, where), if it is at hand: a trace takes longer than a few boxes.
     """
     where = where or function
-    bounded = BoundedFunction(lambda t, x: (function(t, x), where(t, x)), (lower.amin(0), upper.amax(0)))
+    if bounded is None:
+        bounded = BoundedFunction(lambda t, x: (function(t, x), where(t, x)), (lower.amin(0), upper.amax(0)))
     question = LeastValue(function, where, bounded, level, enough, unit, tolerance)
     left = searched(question, roots(lower, upper), budget).least
     return min(question.found, left)

@@ -1,7 +1,8 @@
-"""Certificates drawn as matplotlib figures: sampled states, and slices of funnels."""
+"""Certificates drawn as matplotlib figures: sampled states, and slices of funnels and regions."""
 
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,13 +13,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from torch import Tensor
 
-from lyapnet.certification import Counterexample, SampledClaim, SoundClaim
+from lyapnet.certification import Counterexample, RegionClaim, SampledClaim, SoundClaim
 from lyapnet.certification.tables import floored
 from lyapnet.constraints import Constraints
 from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
 from lyapnet.evaluation.figures import widest_axes
 from lyapnet.sets import Box
 from lyapnet.types import State, Value
+
+Slices = SoundClaim | RegionClaim  # what is drawn in slices
 
 NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
 
@@ -108,29 +111,98 @@ def funnel(
         V, initial_states, goal, labels: of the states that the claim is about.
         constraints: what they exclude is hatched.
     """
-    seen = [k for k in range(claim.states.dimension) if k not in claim.left_out]
-    dimension = len(seen)
-    pairs = [(seen[0], seen[-1])] if dimension <= 2 else list(combinations(_telling(initial_states, seen), 2))
-    columns = min(3, len(pairs))
-    rows = -(-len(pairs) // columns)
-    size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
-    figure = Figure(figsize=size, layout="constrained")
+    seen = _seen(claim)
+    figure, panels = _slices(claim, initial_states)
     handles: dict[str, Artist] = {}
-    for panel, pair in zip(figure.subplots(rows, columns, squeeze=False).flat, pairs, strict=True):
-        if dimension == 1:
+    for panel, pair in panels:
+        if len(seen) == 1:
             _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
         else:
-            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, handles, constraints)
-    legend_below(figure, [*handles.values()], columns=2 if len(pairs) == 1 else 4)
+            levels = _levels(claim, fine=len(seen) == 2)
+            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
+            _draw_violation(panel, claim, pair, handles)
+    legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
     amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
     share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
     figure.suptitle(f"{claim.verdict}: {share}, α = {claim.alpha:g}, δ = {claim.delta:.3g}", fontsize=9)
     return figure
 
 
+# Regions of attraction
+
+
+def region(
+    claim: RegionClaim,
+    V: Value,
+    initial_states: Box,
+    goal: State,
+    labels: Sequence[str],
+    constraints: Constraints | None = None,
+    paths: Tensor | None = None,
+) -> Figure:
+    """The proved region {V(0, ·) ≤ ρ} in D with X₀, the counterexample and what was left undecided.
+
+    More than two states are drawn in slices through the goal, as those of a funnel.
+
+    Args:
+        V, initial_states, goal, labels, constraints: as of a funnel.
+        paths: (times, k, n), closed loops that begin in the region of two states.
+    """
+    figure, panels = _slices(claim, initial_states)
+    handles: dict[str, Artist] = {}
+    for panel, pair in panels:
+        _draw_slice(panel, claim, V, initial_states, goal, labels, pair, _levels_of_region(claim), handles, constraints)
+        if paths is not None and len(_seen(claim)) == 2:
+            x, y = (numpy_of(paths[..., k]) for k in pair)
+            line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under u(0, x)")
+            handles.setdefault("closed loops", line)
+    legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
+    share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the region of attraction"
+    proved = claim.rho > -float("inf")
+    figure.suptitle(f"{claim.verdict}: {share if proved else 'no region proved'}", fontsize=9)
+    return figure
+
+
+def _levels_of_region(claim: RegionClaim) -> list["Level"]:
+    """The region, and the level that is wanted where it is higher."""
+    name = "V(0, x) ≤ ρ: goes to the goal, for ever"
+    proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
+    wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
+    return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+# Slices
+
+
+class Level(NamedTuple):
+    """A sublevel set of V(t, ·) that is drawn."""
+
+    t: float
+    level: float
+    colour: str
+    name: str
+    proved: bool
+
+
+def _seen(claim: Slices) -> list[int]:
+    """The states that a claim is about."""
+    return [k for k in range(claim.states.dimension) if k not in claim.left_out]
+
+
+def _slices(claim: Slices, initial_states: Box) -> tuple[Figure, list[tuple[Axes, tuple[int, int]]]]:
+    """A figure, and a panel for each pair of states that is shown."""
+    seen = _seen(claim)
+    pairs = [(seen[0], seen[-1])] if len(seen) <= 2 else list(combinations(_telling(initial_states, seen), 2))
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(zip(figure.subplots(rows, columns, squeeze=False).flat, pairs, strict=True))
+
+
 def _draw_slice(
-    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
-    pair: tuple[int, int], handles: dict[str, Artist], constraints: Constraints | None,
+    panel: Axes, claim: Slices, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    pair: tuple[int, int], levels: Sequence[Level], handles: dict[str, Artist], constraints: Constraints | None,
 ) -> None:  # fmt: skip
     """One slice; what is new in it is added to the handles of the legend."""
     i, j = pair
@@ -139,15 +211,13 @@ def _draw_slice(
     states = goal.repeat(201, 201, 1)
     states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
     axes = [numpy_of(axis) for axis in grid]
-    for t, level, colour, name in _levels(claim, fine=not others):
+    for t, level, colour, name, proved in levels:
         with torch.no_grad():
             excess = numpy_of(V(states.new_tensor(t).expand(201, 201), states) - level).T
-        proved = level <= claim.rho + claim.delta * t
         _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
         handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
     if constraints is not None:
         _draw_excluded(panel, axes, numpy_of(constraints.worst(states)).T, handles)
-        _draw_violation(panel, claim, pair, handles)
     through = bool(((initial_states.lower <= goal) & (initial_states.upper >= goal))[others].all())
     name = "X₀" if through else "X₀, projected"
     box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
@@ -185,13 +255,16 @@ def _draw_violation(panel: Axes, claim: SoundClaim, pair: tuple[int, int], handl
         handles.setdefault(name, point)
 
 
-def _levels(claim: SoundClaim, fine: bool) -> list[tuple[float, float, str, str]]:
-    """(t, level of V(t, ·), colour, name) of what is drawn: the funnel at some times, and the level that is wanted."""
+def _levels(claim: SoundClaim, fine: bool) -> list[Level]:
+    """The funnel at some times, and the level that is wanted."""
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
-    proved = [(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s") for t, colour in at]
-    wanted = (0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved")
-    return (proved if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+    funnel = [
+        Level(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s", proved=True)
+        for t, colour in at
+    ]
+    wanted = Level(0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved", proved=False)
+    return (funnel if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
 
 
 def _draw_sublevel(

@@ -110,7 +110,7 @@ class SoundCertificate(Certificate):
         if violation is not None:
             return (
                 "The verdict is on the claim that no closed loop from X₀ violates a constraint: the one from "
-                f"x₀ = {_listed(violation.x0)} does at t = {violation.t:.6g} s, {violation.constraint}, by h = "
+                f"x₀ = {listed(violation.x0)} does at t = {violation.t:.6g} s, {violation.constraint}, by h = "
                 f"{violation.h:.3g} (Runge-Kutta steps of a quarter of Δt)."
             )
         why = {
@@ -120,7 +120,7 @@ class SoundCertificate(Certificate):
         }[self.verdict]
         where = ""
         if found is not None:
-            where = f" At t = {found.t:.6g} s, x = {_listed(found.x)} it fails by {found.condition:.3g}."
+            where = f" At t = {found.t:.6g} s, x = {listed(found.x)} it fails by {found.condition:.3g}."
         return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:
@@ -131,7 +131,8 @@ class SoundCertificate(Certificate):
         )
 
 
-def _listed(x: Sequence[float]) -> str:
+def listed(x: Sequence[float]) -> str:
+    """A state in a sentence."""
     return f"({', '.join(f'{entry:.6g}' for entry in x)})"
 
 

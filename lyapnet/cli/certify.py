@@ -1,4 +1,4 @@
-"""lyapnet certify sampled | statistical | sound | check."""
+"""lyapnet certify sampled | statistical | sound | region | check."""
 
 import json
 import math
@@ -90,6 +90,11 @@ Radius = Annotated[
         "Success at T needs ‖x(T) − goal‖ within it; not asked for if none.",
     ),
 ]  # fmt: skip
+States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:upper,…; found if none.", metavar="BOX")]
+Seconds = Annotated[
+    float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
+]  # fmt: skip
+Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Threads.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
@@ -178,13 +183,9 @@ def sound(
             "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
         ),
     ] = None,
-    states: Annotated[
-        str | None, typer.Option("--set", help="The set D, as lower:upper,…; found if none.", metavar="BOX")
-    ] = None,
-    seconds: Annotated[
-        float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
-    ] = 60.0,
-    workers: Annotated[int, typer.Option(min=1, max=THREADS, help="Threads.")] = 1,
+    states: States = None,
+    seconds: Seconds = 60.0,
+    workers: Workers = 1,
     keep: Annotated[
         str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
     ] = None,
@@ -232,6 +233,43 @@ def sound(
         given = given.of(checkpoint)
     else:
         certificate = certified(given.checkpoint, begun)
+    _write(certificate, given, as_json, figure, report)
+
+
+@app.command()
+@of_a_controller
+def region(
+    given: Given,
+    decay: Annotated[
+        float | None,
+        _number(
+            lambda d: 0 < d < math.inf, "> 0", "give it in 1/s",
+            "λ, at which V(0, ·) has to fall, in 1/s; 1 % of 1/T if none.",
+        ),
+    ] = None,
+    states: States = None,
+    seconds: Seconds = 60.0,
+    workers: Workers = 1,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+    figure: FigureFile = None,
+    report: ReportFolder = None,
+    debug: Debug = False,
+) -> None:  # fmt: skip
+    """A region of attraction of the receding law u(0, x), for ever: proved."""
+    begun = time.monotonic()
+    from lyapnet.certification.region_certificate import region_certificate
+    from lyapnet.certification.report import require_writable
+    from lyapnet.certification.sound_certificate import parse_set
+    from lyapnet.certification.tables import proof_progress
+
+    if states is not None:
+        parse_set(states)
+    require_writable(figure, report)
+    controller = given.load()
+    with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
+        certificate = region_certificate(controller, decay, states, seconds, workers, seed, progress, started=begun)
+    _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
 
 

@@ -39,7 +39,12 @@ def checkpoint(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reported(checkpoint, tmp_path_factory):
     """kind ↦ the folder of its report."""
-    options = {"sampled": [], "statistical": ["--samples", "50", "--radius", "2"], "sound": ["--seconds", "0.5"]}
+    options = {
+        "sampled": [],
+        "statistical": ["--samples", "50", "--radius", "2"],
+        "sound": ["--seconds", "0.5"],
+        "region": ["--seconds", "3"],
+    }
     root = tmp_path_factory.mktemp("reports")
     for kind, rest in options.items():
         assert main(["certify", kind, str(checkpoint), *rest, "--report", str(root / kind)]) == 0
@@ -53,7 +58,7 @@ def content(folder):
     return json.loads((folder / "report.json").read_text(encoding="utf-8"), parse_constant=refuse)
 
 
-@pytest.mark.parametrize("kind", ["sampled", "statistical", "sound"])
+@pytest.mark.parametrize("kind", ["sampled", "statistical", "sound", "region"])
 def test_a_report_names_what_was_certified(kind, reported, checkpoint):
     report = content(reported / kind)
     assert report["kind"] == report["certificate"]["kind"] == kind
@@ -83,7 +88,7 @@ def test_a_report_has_the_limits_of_the_controller(checkpoint):
     assert controls_of(controls=ControlBox(-1.0, math.inf)) == limited
 
 
-@pytest.mark.parametrize("kind", ["sampled", "statistical", "sound"])
+@pytest.mark.parametrize("kind", ["sampled", "statistical", "sound", "region"])
 def test_its_markdown_says_the_same(kind, reported):
     report, text = content(reported / kind), (reported / kind / "report.md").read_text(encoding="utf-8")
     assert text == markdown(report).rstrip() + "\n"

@@ -77,7 +77,7 @@ def test_tables(checkpoint, capsys):
 
 
 REFUSED = [
-    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, got 'certain'"),
+    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, region, got 'certain'"),
     ("certify sound --set=1,2", "Expected --set as lower:upper"),
     ("certify sound --set=-0.5:0.5,-2:2", "Expected a set around X₀"),
     ("certify sound --set=-2:2", "Expected a set of 2 states, got 1"),
@@ -92,7 +92,10 @@ REFUSED = [
     ("certify statistical --share=1.1", "Expected --share in (0, 1], got 1.1"),
     ("certify sampled --radius=-1", "Expected --radius ≥ 0, got -1"),
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
-    ("certify sond", "Expected sampled, statistical, sound, check or a checkpoint, got 'sond'; did you mean sound?"),
+    (
+        "certify sond",
+        "Expected sampled, statistical, sound, region, check or a checkpoint, got 'sond'; did you mean sound?",
+    ),
     ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),
     ("certify sampled --share=0.9", "No such option: --share"),

@@ -1,0 +1,136 @@
+"""What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lyapnet.certification.condition import DecreaseCondition, OwnOperations, own_constraints
+from lyapnet.contracts import check_function
+from lyapnet.errors import UsageError
+from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.branches import JUMPS
+from lyapnet.linear_algebra import apply
+from lyapnet.problem import TRIED
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.sets import Box
+from lyapnet.types import Corner, Corners, State, Value
+
+NOTHING = 1e-200  # bounds of zero have the least room for rounding
+
+
+def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None:
+    """Trace V and h once, for every question that is asked of them, after a look at what they are."""
+    own = OwnOperations(condition.V, sample)
+    if condition.constraints is not None:
+        condition.constraints = own_constraints(condition.constraints, sample)
+    check_states(condition, sample)
+    condition.V = own
+
+
+def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
+    """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
+    lower, upper = domain
+    _require_constant(condition.closed_loop, domain)
+    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
+    points = lower + (upper - lower) * share
+
+    def all_three(t: Tensor, x: Tensor) -> Tensor:
+        return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
+
+    t, x = points[:, 0], points[:, 1:]
+    check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False)
+    if condition.constraints is not None:
+        k = len(condition.constraints.names)
+        check_function("h(x) with a number for each name", condition.constraints, [x], (k,), differentiable=False)
+    with torch.no_grad():
+        own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
+        if not _close(own, condition.V(t, x)):
+            raise UsageError(
+                "Expected V to be one function of (t, x), got another one than at first; read nothing else."
+            )
+        _check_parts(condition.closed_loop, t, x)
+
+
+def _check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
+    """Refuse a closed loop that runs as another one than its parts say, and a cost below 0, at some states."""
+    system, u = loop.system, loop.policy(t, x)
+    parts = torch.cat([system.f(x) + apply(system.g(x), u), loop.cost.running(x, u)[..., None]], -1)
+    if not _close(loop.slope(x, u), parts) or not _close(loop.control(t, x).u, u):
+        raise UsageError(
+            f"Expected a closed loop that runs by ẋ = f(x) + g(x)u, ℓ and u = policy(t, x), got another one; make "
+            f"{type(system).__name__}.dynamics, {type(loop.policy).__name__}.with_value and "
+            f"{type(loop).__name__}.slope agree with these each time."
+        )
+    cost = parts[..., -1]
+    least = int(cost.argmin())
+    if cost[least] < -1e-9 * cost.abs().max():
+        raise UsageError(
+            f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there: "
+            "correct the cost, or choose a smaller set."
+        )
+
+
+def _close(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6 * float(other.abs().max()))
+
+
+def require_continuous(V: Value, x_low: State, x_high: State) -> None:
+    """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
+    lower, upper = at_time(0.0, x_low, x_high)
+    jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
+    if jumps:
+        raise UsageError(
+            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write it with "
+            "relu, abs, maximum, minimum or clamp."
+        )
+
+
+def at_time(t: float, lower: State, upper: State) -> tuple[Corners, Corners]:
+    """The box {t} × [lower, upper] as one of (t, x)."""
+    time = torch.tensor([t], dtype=lower.dtype)
+    return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
+
+
+def without(states: Box, left_out: Sequence[int]) -> Box:
+    """The slice of a box at 0 of the states that are left out, in float64."""
+    lower, upper = states.lower.double(), states.upper.double()
+    seen = torch.tensor([i not in left_out for i in range(states.dimension)])
+    return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
+
+
+def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
+    """Refuse constants that move: D has no faces along them."""
+    constants = list(loop.system.constants)
+    if constants:
+        moved = BoundedFunction(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
+        ((low, high),) = moved.bounds(*(end[None] for end in domain))
+        if not bool(torch.maximum(-low, high).max() <= NOTHING):
+            raise UsageError("Expected ẋ = 0 for the constants of a system, got others; leave them out.")
+
+
+def domain_around(
+    states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
+) -> tuple[Corner, Corner]:
+    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+    if states.dimension != initial_states.dimension:
+        raise UsageError(
+            f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
+        )
+    outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
+    for i in constants:
+        outside[i] = states.lower[i] > initial_states.lower[i] or states.upper[i] < initial_states.upper[i]
+    outside[left_out] = False
+    if outside.any():
+        i = int(torch.nonzero(outside)[0])
+        raise UsageError(
+            f"Expected a set around X₀, got [{states.lower[i]:g}, {states.upper[i]:g}] around "
+            f"[{initial_states.lower[i]:g}, {initial_states.upper[i]:g}] at index {i}; choose a larger one."
+        )
+    return over_time(states, duration)
+
+
+def over_time(states: Box, duration: float) -> tuple[Corner, Corner]:
+    """[0, T] × a box as (lower, upper)."""
+    time = torch.tensor([0.0, duration], dtype=torch.float64)
+    return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])

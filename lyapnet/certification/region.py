@@ -1,0 +1,219 @@
+"""The region of attraction of the receding law u(0, x): a sublevel set of V(0, ·) that goes to the goal."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from lyapnet.certification.boxes import faces
+from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
+from lyapnet.certification.condition import DecreaseCondition, own_constraints, require_own_gradient
+from lyapnet.certification.contraction import Contraction, contraction_around
+from lyapnet.certification.counterexamples import Counterexample
+from lyapnet.certification.funnel import enclosing_box, for_levels, largest_seen, proof_within, share_of
+from lyapnet.certification.ignorable_states import ignorable_states
+from lyapnet.certification.preconditions import (
+    at_time,
+    check_states,
+    domain_around,
+    freeze,
+    require_continuous,
+    without,
+)
+from lyapnet.certification.proof import Progress, Proof
+from lyapnet.certification.verdict import Verdict
+from lyapnet.constraints import Constraints, names_of
+from lyapnet.contracts import copied
+from lyapnet.errors import UsageError
+from lyapnet.problem import Problem
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.sets import Box
+from lyapnet.types import Corner, PerState, Points, State, Time, Value
+
+PER_HORIZON = 0.01  # λT, unless it is given
+
+
+@dataclass(frozen=True)
+class RegionClaim:
+    """Of the receding law u(0, x), read at every t, with V(x) = V(0, x) and F = f + g u(0, ·): at each x ∈ D with
+    V(x) ≤ ρ, outside the hole {x ∈ B: V(x) < c},
+
+        V̇ = V_xᵀF(x) ≤ −λ max(V(x), c),
+
+    V > ρ on the boundary of D and wherever a constraint has h_j ≥ 0, V > c on the boundary of a box B around the goal,
+    and F contracts on B (Contraction). Hence {x ∈ D: V(x) ≤ ρ} is a region of attraction: no closed loop that starts in
+    it leaves it or violates a constraint, each is in the hole after at most λ⁻¹ ln(ρ/c) seconds where V ≥ c, and from
+    then on goes to the goal exponentially at the rate κ, for ever.
+
+    States that neither f, g, nor V and u depend on are left out: D is all of ℝ along them, and nothing is said of where
+    they go.
+
+    The verdict is about X₀: whether all of it lies in the region. Whatever it is, `rho` is the largest level proved.
+    """
+
+    decay: float  # λ in 1/s
+    states: Box  # D
+    rho: float  # the largest level proved; −∞ where there is none
+    rim: float  # a lower bound of V on the boundary of D and where a constraint is violated: no ρ is higher
+    wanted: float  # max V on X₀, or up to 0.1 % more
+    least: float  # the largest V that was seen on X₀
+    hole: float  # c
+    contraction: Contraction | None
+    slowest: float  # the largest real part among the eigenvalues of the linearised law, in 1/s
+    volume_share: float  # of X₀ in the region; a lower bound
+    region_share: float  # of D in it; a lower bound
+    proof: Proof | None  # that V falls; none is tried where nothing contracts
+    seconds: float
+    left_out: list[int]  # ignorable states
+    constraints: Sequence[str] = ()
+
+    @property
+    def counterexample(self) -> Counterexample | None:
+        """Where V does not fall, of lowest V."""
+        return None if self.proof is None else self.proof.counterexample
+
+    @property
+    def undecided(self) -> Points:
+        """Centres (t, x) of boxes that remain; all of them lie above ρ."""
+        return torch.zeros(0, 1 + self.states.dimension) if self.proof is None else self.proof.undecided
+
+    @property
+    def verdict(self) -> Verdict:
+        """On the claim that all of X₀ is in the region of attraction."""
+        if self.rho >= self.wanted:
+            return "certified"
+        found = self.counterexample
+        return "falsified" if found is not None and found.height <= self.least else "unknown"
+
+    @property
+    def reason(self) -> str | None:
+        """Why the verdict is not certified, and what may help."""
+        if self.verdict == "certified":
+            return None
+        if self.contraction is None and self.slowest >= 0:
+            return (
+                f"u(0, x) does not hold the goal: linearised, an eigenvalue has the real part {self.slowest:.3g} 1/s; "
+                "weigh every state, train on a longer horizon, or from states all around the goal"
+            )
+        if self.contraction is None:
+            return "no box around the goal was found on which u(0, x) contracts: allow more seconds"
+        if self.verdict == "falsified":
+            return "V(0, ·) does not fall there under u(0, ·): train on a longer horizon, or from states all around it"
+        if self.proof is not None and self.proof.remaining_volume > 0:
+            return "seconds spent: allow more"
+        if self.rim <= self.wanted:
+            return "the region meets the boundary of D or a constraint: choose a larger set"
+        return "V(0, ·) does not fall close to what X₀ needs"
+
+    @property
+    def volume(self) -> float:
+        """That of the region, without the states that are left out; a lower bound."""
+        widths = [w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out]
+        return self.region_share * math.prod(widths)
+
+
+class RecedingDecrease(DecreaseCondition):
+    """c(x) = V̇ + λ max(V, c) with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)): V falls exponentially where c ≤ 0."""
+
+    def __init__(self, closed_loop: ClosedLoop, decay: float):
+        super().__init__(closed_loop, 1.0, 0.0)
+        if not 0 < decay < math.inf:
+            raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
+        self.decay, self.hole = decay, 0.0
+
+    def open_hole(self, box: Box, seen: Sequence[int], level: float, budget: Budget) -> None:
+        """Ask nothing in {x ∈ box: V < c}, with c below V on the boundary of the box, and at most a level."""
+        (low,), (high,) = at_time(0.0, box.lower, box.upper)
+        self.hole = min(level, just_below(minimum(self.V, *faces(low, high, [1 + i for i in seen]), budget)))
+        self.constraints = OutsideTheHole(self.V, box, self.hole)
+
+    def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
+        value, slope = self.V.value_and_state_gradient(t, x)
+        fall = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
+        return fall + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), fall
+
+
+class OutsideTheHole(Constraints):
+    """h(x) > 0 where x ∈ B and V(0, x) < c: there the contraction speaks, and V need not fall."""
+
+    names = ("outside the hole",)
+
+    def __init__(self, V: torch.nn.Module, box: Box, level: float):
+        super().__init__()
+        self.V, self.level = V, level
+        ends = zip(box.center.tolist(), box.widths.tolist(), strict=True)
+        self.axes = [(i, middle, width / 2) for i, (middle, width) in enumerate(ends) if width > 0]
+
+    def forward(self, x: State) -> Tensor:
+        below = self.level - self.V(x.new_zeros(()), x)
+        within = [1 - 1e-9 - (x[..., i] - middle).abs() / reach for i, middle, reach in self.axes]
+        return reduce(torch.minimum, within, below)[..., None]
+
+
+def region_claim(
+    closed_loop: ClosedLoop,
+    problem: Problem,
+    decay: float | None = None,
+    states: Box | None = None,
+    budget: Budget | None = None,
+    generator: torch.Generator | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> RegionClaim:
+    """The largest region of attraction of the receding law that is a sublevel set of V(0, ·), as the budget allows.
+
+    Args:
+        closed_loop: with the law of a V; its float64 copy is what the claim is about.
+        problem: whose X₀, constraints and goal are meant.
+        decay: λ > 0 in 1/s; 1 % of 1/T if None.
+        states: D, around X₀; by default a box around {V(0, ·) ≤ max over X₀}.
+        report: of prove.
+
+    Raises:
+        UsageError: λ or D do not fit, it is about a family, or the closed loop has an operator without a rule.
+    """
+    started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
+    if problem.system.constants:
+        raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
+    decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
+    condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
+    goal, X0 = problem.goal.double(), problem.initial_states
+    (low,), (high,) = at_time(0.0, X0.lower.double(), X0.upper.double())
+    freeze(condition, (low, high))
+    left_out = ignorable_states(condition.closed_loop, problem.constraints)
+    X0, seen = without(X0, left_out), [i for i in range(X0.dimension) if i not in left_out]
+    require_continuous(condition.V, X0.lower, X0.upper)
+    wanted = -minimum(lambda t, x: -condition.V(t, x), *at_time(0.0, X0.lower, X0.upper), for_levels(budget))
+    states = without(states or enclosing_box(condition.height, X0, goal, 0.0, wanted), left_out)
+    domain = domain_around(states, X0, 0.0, left_out, [])
+    require_own_gradient(condition.V, domain)
+    check_states(condition, domain)
+    rim = _rim(condition.V, problem.constraints, domain, seen, for_levels(budget))
+    contraction, slowest = contraction_around(condition.closed_loop, goal, states, seen, for_levels(budget).seconds)
+    proof, rho = None, -math.inf
+    if contraction is not None:
+        level = just_below(rim)
+        condition.open_hole(contraction.box, seen, level, for_levels(budget))
+        proof = proof_within(condition, domain, level, budget, generator=generator, report=report)
+        rho = proof.level if proof.level >= condition.hole else rho
+    return RegionClaim(
+        decay, states, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
+        share_of(condition.V, X0.lower, X0.upper, rho, budget),
+        share_of(condition.V, states.lower, states.upper, rho, budget), proof, time.monotonic() - started, left_out,
+        names_of(problem.constraints),
+    )  # fmt: skip
+
+
+def _rim(
+    V: Value, constraints: Constraints | None, domain: tuple[Corner, Corner], seen: Sequence[int], budget: Budget
+) -> float:
+    """A lower bound of V on the boundary of D, and where some h_j ≥ 0 in it."""
+    rim = minimum(V, *faces(*domain, [1 + i for i in seen]), budget)
+    if constraints is None:
+        return rim
+    h, (lower, upper) = own_constraints(constraints, domain), (side[None] for side in domain)
+    each = range(len(names_of(constraints)))
+    return min(rim, *(minimum(V, lower, upper, budget, lambda t, x, j=j: -h(x)[..., j], 0.0) for j in each))

@@ -1,0 +1,159 @@
+"""Certificates by proof of the receding law: a region of attraction."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torchdiffeq import odeint
+
+from lyapnet.certification import figures
+from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.proof import Progress
+from lyapnet.certification.region import RegionClaim, region_claim
+from lyapnet.certification.sound_certificate import listed, parse_set
+from lyapnet.certification.tables import floored
+from lyapnet.controller import Controller
+from lyapnet.random_streams import CERTIFICATION, stream
+
+PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the region they begin
+
+
+class RegionCertificate(Certificate):
+    """A set from which closed loops of the receding law go to the goal, and stay there for ever."""
+
+    kind: ClassVar[str] = "region"
+    picture: ClassVar[str] = "region.png"
+    labels: ClassVar[Mapping[str, str]] = {
+        "reason": "why",
+        "set": "D",
+        "states_left_out": "states that nothing depends on",
+        "region_volume_proved": "volume of the region, at least",
+        "set_volume_share": "share of D in the region, at least",
+        "volume_share": "share of X₀ in the region, at least",
+        "rho_wanted": "ρ for all of X₀",
+        "rho": "largest ρ proved",
+        "rim": "V(0, ·) on the boundary of D, at least",
+        "decay": "λ, 1/s",
+        "hole": "c, below which the contraction speaks",
+        "contraction_box": "B",
+        "contraction_rate": "κ, 1/s",
+        "remainder": "‖x − x*‖ as t → ∞, at most",
+        "constraints": "constraints that no closed loop of the region violates",
+        "counterexample": "counterexample of lowest V",
+        "remaining_volume": "share of D undecided",
+        "boxes": "boxes",
+        "seconds": "seconds",
+        "fingerprint": "fingerprint of what was bounded",
+    }
+    claim: RegionClaim
+
+    def numbers(self) -> dict[str, Any]:
+        claim, names, found = self.claim, self.controller.system.state_names, self.claim.counterexample
+        proved, B, proof = claim.rho > -float("inf"), claim.contraction, claim.proof
+        around = {} if B is None else {
+            "hole": claim.hole, "contraction_box": [B.box.lower.tolist(), B.box.upper.tolist()],
+            "contraction_rate": B.rate, "remainder": B.remainder,
+        }  # fmt: skip
+        searched = {} if proof is None else {
+            "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
+        }  # fmt: skip
+        return {
+            "decay": claim.decay, "rho": claim.rho if proved else None, "rho_wanted": claim.wanted, "rim": claim.rim,
+            "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
+            "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
+            "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
+            "constraints": list(claim.constraints) if proved else [],
+            "counterexample": found and {"x": found.x, "condition": found.condition, "V": found.height},
+            "seconds": claim.seconds, **around, **searched,
+        }  # fmt: skip
+
+    def in_words(self) -> str:
+        claim = self.claim
+        if claim.rho == -float("inf"):
+            return "No level ρ was proved: nothing is claimed. The conditions below were sought."
+        names = self.controller.system.state_names
+        left_out = ", ".join(names[i] for i in claim.left_out)
+        kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
+        return (
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} is a region of attraction of the receding law u(0, x), "
+            f"proved in continuous time for this model: no closed loop that starts in it leaves it{kept}, and each "
+            f"goes to the goal exponentially, for ever. Its volume is at least {claim.volume:.6g}, in the units of the "
+            f"states; it holds at least {floored(claim.volume_share)} of X₀."
+            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} It is about the operations that "
+            "f, g, V and u were traced to, of this fingerprint; whatever else their code reads (globals, counters, "
+            "files) is frozen as it was then."
+        )
+
+    def in_formulas(self) -> list[str]:
+        claim, B = self.claim, self.claim.contraction
+        rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
+        hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
+        return [
+            f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
+            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}",
+            f"V > {rho} on the boundary of D,  V > {hole} on the boundary of B",
+            f"½(M + Mᵀ) ≤ −{rate}  with M = Y J Y⁻¹, J the Jacobian of f + g u, at each x ∈ B",
+        ]
+
+    def of_the_verdict(self) -> str:
+        found = self.claim.counterexample
+        why = {
+            "certified": "it does",
+            "falsified": "V does not fall inside the region that this would take",
+            "unknown": self.claim.reason,
+        }[self.verdict]
+        where = "" if found is None else f" At x = {listed(found.x)} it fails by {found.condition:.3g}."
+        return f"The verdict is on the claim that a region of attraction holds all of X₀: {why}.{where}"
+
+    def figure(self) -> figures.Figure:
+        controller, problem = self.controller, self.controller.problem
+        labels = controller.system.state_labels
+        return figures.region(
+            self.claim, controller.V, problem.initial_states, problem.goal, labels, problem.constraints, self._paths()
+        )
+
+    def _paths(self) -> Tensor | None:
+        """Closed loops of the receding law over T from states just inside the region, (times, k, n)."""
+        claim, loop, horizon = self.claim, self.controller.closed_loop, self.controller.horizon
+        x = claim.states.sample(20_000, stream(0, CERTIFICATION)).to(claim.states.lower)
+        t = x.new_zeros(())
+        with torch.no_grad():
+            share = self.controller.V(t, x) / claim.rho
+            x0 = x[(share <= 1) & (share > 1 - EDGE)][:PATHS]
+            if not len(x0):
+                return None
+            times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
+            paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
+        return torch.as_tensor(paths)
+
+
+def region_certificate(
+    controller: Controller,
+    decay: float | None = None,
+    set: str | None = None,
+    seconds: float = 60.0,
+    workers: int = 1,
+    seed: int = 0,
+    report: Callable[[Progress], None] | None = None,
+    *,
+    started: float | None = None,
+) -> RegionCertificate:
+    """The region of attraction of a controller's receding law.
+
+    Args:
+        decay: λ in 1/s; 1 % of 1/T if None.
+        set: D, as parse_set reads it; found if None.
+        seconds: when to stop undecided.
+        report: is told how far the proof is.
+        started: time.monotonic() from which the seconds count; now if None.
+    """
+    budget = Budget(seconds, workers=workers, started=time.monotonic() if started is None else started)
+    claim = region_claim(
+        controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
+        stream(seed, CERTIFICATION), report,
+    )  # fmt: skip
+    options = {"decay": decay, "set": set, "seconds": seconds, "workers": workers, "seed": seed}
+    return RegionCertificate(controller, claim, options)

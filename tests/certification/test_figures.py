@@ -4,8 +4,8 @@ import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from lyapnet.certification import Counterexample, SampledClaim, SoundClaim, StatisticalClaim
-from lyapnet.certification.figures import funnel, sampled_states
+from lyapnet.certification import Counterexample, RegionClaim, SampledClaim, SoundClaim, StatisticalClaim
+from lyapnet.certification.figures import funnel, region, sampled_states
 from lyapnet.certification.sampling_certificates import SampledCertificate, StatisticalCertificate
 from lyapnet.controller import Controller
 from lyapnet.programs import Tolerances
@@ -172,3 +172,26 @@ def test_a_projection_says_so_and_one_free_state_is_binned():
     (axes,) = figure.axes
     assert axes.get_xlabel() == "pole angle (rad)"
     assert sum(patch.get_height() for patch in axes.patches) == 50
+
+
+def region_of(rho, wanted):
+    proved = 0.25 if rho > 0 else 0.0
+    return RegionClaim(0.01, cube(2.0, 2), rho, 4.0, wanted, wanted, 0.1, None, -1.0, proved, proved, None, 1.0, [])
+
+
+def test_the_region_is_drawn_with_its_level():
+    paths = torch.zeros(3, 5, 2)
+    figure = draw(region(region_of(1.0, 1.0), bowl(), cube(0.5, 2), torch.zeros(2), LABELS, paths=paths))
+    (edge,) = outlines(figure.axes[0])
+    assert edge == pytest.approx(1.0, rel=1e-2)
+    assert "certified: 25.000% of D, 25.000% of X₀" in figure.get_suptitle()
+    assert "closed loops under u(0, x)" in legend(figure)
+
+
+def test_a_region_that_is_not_proved_is_not_drawn_as_proved():
+    figure = draw(region(region_of(-float("inf"), 2.0), bowl(), cube(0.5, 2), torch.zeros(2), LABELS))
+    (wanted,) = outlines(figure.axes[0])
+    assert wanted == pytest.approx(2.0, rel=1e-2)
+    assert "no region proved" in figure.get_suptitle()
+    assert "V(0, x) ≤ ρ for all of X₀, not proved" in legend(figure)
+    assert not any(name.startswith("V(0, x) ≤ ρ: ") for name in legend(figure))

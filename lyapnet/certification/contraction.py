@@ -1,6 +1,7 @@
 """Where closed loops at one instant's law converge exponentially: a box on which the linearised law contracts."""
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -22,24 +23,32 @@ from lyapnet.types import PerState, State, Time
 
 BOXES, SAMPLES = 2000, 200  # that are bounded, and states that are tried, for one size of the box
 GROWTH, SIZES = 1.6, 20  # sizes of the box that are tried, as long as they do, up to half of D
+NEAR = 1e-6  # how far YZ may be from 1
 LEAST = 0.2  # of the linearised law's own rate, that is enough
+
+JUMPING_SLOPES = {  # operator ↦ (which of its arguments decides, at which value)
+    torch.ops.aten.threshold_backward.default: (1, 0.0),
+    torch.ops.aten.leaky_relu_backward.default: (1, 0.0),
+}
 
 
 @dataclass(frozen=True)
 class Contraction:
-    """With F(x) = f(x) + g(x)u(0, x), J its Jacobian and y = Y(x − x*): on all of a box around x*
+    """With F(x) = f(x) + g(x)u(0, x), continuous on a box B around x*, J its Jacobian and P = YᵀY:
 
-        ½(M + Mᵀ) ≤ −κ,   M = Y J(x) Y⁻¹,
+        ½(P J(x) + J(x)ᵀP) ≤ −κP   almost everywhere on B.
 
-    so that ‖y‖ falls at the rate κ along each closed loop in the box, up to what F(x*) ≠ 0 leaves:
-    d/dt ‖y‖ ≤ −κ‖y‖ + ‖Y F(x*)‖, by the mean value theorem on the segment from x* to x.
+    By the mean value theorem on the segment between them, ‖Y(x − x')‖ falls at the rate κ for any two closed loops in
+    B. Those of a set that none leaves therefore converge to one equilibrium x_e, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
 
     Source: Lohmiller, Slotine, "On contraction analysis for non-linear systems", Automatica 1998.
     """
 
     box: Box
     rate: float  # κ in 1/s
-    remainder: float  # ‖x − x*‖ that is left as t → ∞, at most: rounding, where x* is an equilibrium
+    coordinates: Tensor  # Y, (k, k), of the states that the law depends on
+    offset: float  # ‖x_e − x*‖, at most: rounding, where x* is an equilibrium
+    fingerprint: str  # of F and its Jacobian as they were traced
 
 
 class _Law:
@@ -50,17 +59,15 @@ class _Law:
         (low,), (high,) = at_time(0.0, lower, upper)
         self.domain = low, high
         self.bounded = BoundedFunction(lambda t, x: (self._declared(t, x),), self.domain)
-
         jumps = _jumps(self.bounded.graph)
         self.decisions = None if jumps is None else BoundedFunction(jumps, self.domain)
 
     def is_continuous_on(self, box: Box) -> bool:
-        """Whether nothing that jumps does so in a box: its bounds there are one number."""
+        """Whether every truth and every sign in F is decided in a box: all else is continuous."""
         if self.decisions is None:
             return True
-        return all(
-            bool((low == high).all()) for low, high in self.decisions.bounds(*at_time(0.0, box.lower, box.upper))
-        )
+        decided = self.decisions.bounds(*at_time(0.0, box.lower, box.upper))
+        return all(bool((high - low < 0.5).all()) for low, high in decided)
 
     def _declared(self, t: Time, x: State) -> State:
         return self.loop.system.dynamics(x, self.loop.policy(t, x))
@@ -90,15 +97,16 @@ def contraction_around(
     """
     law, reach = _Law(loop, states.lower, states.upper), torch.minimum(goal - states.lower, states.upper - goal)
     A = law.jacobian(goal.new_zeros(()), goal, seen).detach().numpy()
-    slowest = float(np.linalg.eigvals(A).real.max())
-    if not slowest < 0:
-        return None, slowest
+    slowest = float(np.linalg.eigvals(A).real.max()) if np.isfinite(A).all() else math.nan
     own = -slowest / 2
-    Y, inverse = (torch.from_numpy(each) for each in _coordinates(A, reach[list(seen)].numpy(), own))
+    found = _coordinates(A, reach[list(seen)].numpy(), own) if own > 0 else None
+    if found is None:
+        return None, slowest
+    Y, inverse = (torch.from_numpy(each) for each in found)
 
     def contracted(t: Time, x: State) -> PerState:
-        """A lower bound of the least eigenvalue of −½(M + Mᵀ), by Gershgorin's discs."""
-        M = Y @ law.jacobian(t, x, seen) @ inverse
+        """A lower bound of the least eigenvalue of −½ZᵀPJZ and its transpose, by Gershgorin's discs; Z is near Y⁻¹."""
+        M = inverse.mT @ (Y.mT @ (Y @ (law.jacobian(t, x, seen) @ inverse)))
         S = -(M + M.mT) / 2
         rows = range(len(seen))
         discs = [S[..., i, i] - sum((S[..., i, j].abs() for j in rows if j != i), 0 * S[..., i, i]) for i in rows]
@@ -119,17 +127,25 @@ def contraction_around(
         rate = minimum(contracted, *at_time(0.0, box.lower, box.upper), tried, enough=LEAST * own, bounded=bounded)
         if rate < LEAST * own * (1 - 1e-6):
             break
-        found = Contraction(box, rate, _remainder(law, goal, seen, Y, inverse, rate))
+        rate /= 1 + NEAR  # ZᵀPZ is 1 but for as much
+        offset = _offset(law, goal, seen, Y, rate)
+        found = Contraction(box, rate, Y, offset, bounded.fingerprint)
     return found, slowest
 
 
 def _jumps(graph: GraphModule) -> GraphModule | None:
-    """(t, x) ↦ what each operator that jumps gives in a graph, as numbers; None where there is none."""
+    """(t, x) ↦ every truth and every sign that occurs in a graph, as numbers; None where there is none."""
     nodes, found = copy.deepcopy(graph.graph), list[Node]()
     for node in list(nodes.nodes):
         if node.op == "call_function" and node.target in JUMPS:
             with nodes.inserting_after(node):
-                found.append(nodes.call_function(torch.ops.aten.mul.Tensor, (node, 1.0)))
+                truth = node
+                if node.target in JUMPING_SLOPES:
+                    of, at = JUMPING_SLOPES[node.target]
+                    truth = nodes.call_function(torch.ops.aten.gt.Scalar, (node.args[of], at))
+            with nodes.inserting_after(truth):
+                number = nodes.call_function(torch.ops.aten._to_copy.default, (truth,), {"dtype": torch.float64})
+                found.append(number)
     if not found:
         return None
     next(node for node in nodes.nodes if node.op == "output").args = (tuple(found),)
@@ -137,19 +153,26 @@ def _jumps(graph: GraphModule) -> GraphModule | None:
     return GraphModule(graph, nodes)
 
 
-def _coordinates(A: np.ndarray, reach: np.ndarray, own: float) -> tuple[np.ndarray, np.ndarray]:
-    """(Y, Y⁻¹) with ½(M + Mᵀ) diagonal and at most −own for M = Y A Y⁻¹, where A's eigenvalues have less than that."""
+def _coordinates(A: np.ndarray, reach: np.ndarray, own: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """(Y, Z ≈ Y⁻¹) with ½(M + Mᵀ) diagonal and at most −own for M = Y A Z, where A's eigenvalues have less than that.
+
+    None where rounding leaves none of it.
+    """
     scaled, eye = A * reach / reach[:, None], np.eye(len(A))
-    P = solve_continuous_lyapunov((scaled + own * eye).T, -eye)
-    L = np.linalg.cholesky((P + P.T) / 2)
-    M = L.T @ scaled @ np.linalg.inv(L.T)
-    _, turn = np.linalg.eigh((M + M.T) / 2)
-    Y = turn.T @ L.T / reach
-    return Y, np.linalg.inv(Y)
+    try:
+        P = solve_continuous_lyapunov((scaled + own * eye).T, -eye)
+        L = np.linalg.cholesky((P + P.T) / 2)
+        M = L.T @ scaled @ np.linalg.inv(L.T)
+        _, turn = np.linalg.eigh((M + M.T) / 2)
+        Y = turn.T @ L.T / reach
+        Z = np.linalg.inv(Y)
+    except np.linalg.LinAlgError:
+        return None
+    return (Y, Z) if np.linalg.norm(Y @ Z - eye) < NEAR / 10 else None
 
 
-def _remainder(law: _Law, goal: State, seen: Sequence[int], Y: Tensor, inverse: Tensor, rate: float) -> float:
-    """‖Y⁻¹‖ ‖Y F(x*)‖ / κ, with the bounds of F(x*)."""
+def _offset(law: _Law, goal: State, seen: Sequence[int], Y: Tensor, rate: float) -> float:
+    """‖Y F(x*)‖ / (κ σ), with the bounds of F(x*) and the least singular value σ of Y."""
     ((low, high),) = law.bounded.bounds(*at_time(0.0, goal, goal))
     size = torch.maximum(low.abs(), high.abs())[0, list(seen)]
-    return float(torch.linalg.matrix_norm(inverse, 2) * torch.linalg.vector_norm(Y.abs() @ size) / rate)
+    return float(torch.linalg.vector_norm(Y.abs() @ size) / (rate * torch.linalg.matrix_norm(Y, -2)))

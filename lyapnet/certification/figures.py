@@ -150,8 +150,12 @@ def region(
     """
     figure, panels = _slices(claim, initial_states)
     handles: dict[str, Artist] = {}
+    levels = _levels_of_region(claim)
     for panel, pair in panels:
-        _draw_slice(panel, claim, V, initial_states, goal, labels, pair, _levels_of_region(claim), handles, constraints)
+        if len(_seen(claim)) == 1:
+            _draw_over_state(panel, claim, V, initial_states, goal, labels, levels, handles)
+            continue
+        _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
         if paths is not None and len(_seen(claim)) == 2:
             x, y = (numpy_of(paths[..., k]) for k in pair)
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under u(0, x)")
@@ -163,9 +167,29 @@ def region(
     return figure
 
 
+def _draw_over_state(
+    panel: Axes, claim: RegionClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    levels: Sequence["Level"], handles: dict[str, Artist],
+) -> None:  # fmt: skip
+    """V(0, ·) over the one state that a claim is about, with levels and X₀."""
+    (i,) = _seen(claim)
+    states = goal.repeat(401, 1)
+    states[:, i] = torch.linspace(float(claim.states.lower[i]), float(claim.states.upper[i]), 401).to(goal)
+    with torch.no_grad():
+        x, value = numpy_of(states[:, i]), numpy_of(V(states.new_zeros(401), states))
+    handles["V"] = panel.plot(x, value, color="black", linewidth=1.2, label="V(0, x)")[0]
+    for _, level, colour, name, proved in levels:
+        handles[name] = panel.axhline(level, color=colour, linestyle="-" if proved else ":", label=name)
+        if proved:
+            panel.fill_between(x, value, level, where=(value <= level).tolist(), color=colour, alpha=0.25)
+    ends = [float(initial_states.lower[i]), float(initial_states.upper[i])]
+    handles["X₀"] = panel.plot(ends, [0, 0], color="black", linewidth=4, label="X₀", clip_on=False)[0]
+    panel.set(xlim=x[[0, -1]], xlabel=labels[i], ylabel="V(0, x)")
+
+
 def _levels_of_region(claim: RegionClaim) -> list["Level"]:
     """The region, and the level that is wanted where it is higher."""
-    name = "V(0, x) ≤ ρ: goes to the goal, for ever"
+    name = "V(0, x) ≤ ρ: never left, and attracted"
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
     wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
     return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])

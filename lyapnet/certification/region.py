@@ -35,24 +35,29 @@ from lyapnet.sets import Box
 from lyapnet.types import Corner, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
+STOPPED = "Stopped while certifying: nothing is kept."
 
 
 @dataclass(frozen=True)
 class RegionClaim:
-    """Of the receding law u(0, x), read at every t, with V(x) = V(0, x) and F = f + g u(0, ·): at each x ∈ D with
-    V(x) ≤ ρ, outside the hole {x ∈ B: V(x) < c},
+    """Of the receding law u(0, x), read at every t, with V(x) = V(0, x), F = f + g u(0, ·) and levels ρ ≥ c > 0:
 
-        V̇ = V_xᵀF(x) ≤ −λ max(V(x), c),
+    at each x ∈ D with V(x) ≤ ρ, outside the hole {x ∈ B: V(x) < c},
+
+        V̇ = V_xᵀF(x) ≤ −λ max(V(x), c) < 0,
 
     V > ρ on the boundary of D and wherever a constraint has h_j ≥ 0, V > c on the boundary of a box B around the goal,
     and F contracts on B (Contraction). Hence {x ∈ D: V(x) ≤ ρ} is a region of attraction: no closed loop that starts in
-    it leaves it or violates a constraint, each is in the hole after at most λ⁻¹ ln(ρ/c) seconds where V ≥ c, and from
-    then on goes to the goal exponentially at the rate κ, for ever.
+    it leaves it or violates a constraint, V falls until the hole is reached, none leaves the hole, and there all go to
+    one equilibrium exponentially, at the rate κ, for ever. It is within `contraction.offset` of the goal: rounding,
+    where the goal is an equilibrium of u(0, ·) itself.
+
+    Outside B, F may jump: V̇ ≤ … holds of every value between, so that it is about Filippov's solutions.
 
     States that neither f, g, nor V and u depend on are left out: D is all of ℝ along them, and nothing is said of where
     they go.
 
-    The verdict is about X₀: whether all of it lies in the region. Whatever it is, `rho` is the largest level proved.
+    The verdict is about X₀: whether such a region holds all of it. Whatever it is, `rho` is the largest level proved.
     """
 
     decay: float  # λ in 1/s
@@ -83,7 +88,7 @@ class RegionClaim:
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that all of X₀ is in the region of attraction."""
+        """On the claim that a sublevel set in D on which V falls so holds all of X₀; not on whether X₀ is attracted."""
         if self.rho >= self.wanted:
             return "certified"
         found = self.counterexample
@@ -94,19 +99,24 @@ class RegionClaim:
         """Why the verdict is not certified, and what may help."""
         if self.verdict == "certified":
             return None
-        if self.contraction is None and self.slowest >= 0:
+        if self.contraction is None and not self.slowest < 0:
             return (
                 f"u(0, x) does not hold the goal: linearised, an eigenvalue has the real part {self.slowest:.3g} 1/s; "
                 "weigh every state, train on a longer horizon, or from states all around the goal"
             )
         if self.contraction is None:
-            return "no box around the goal was found on which u(0, x) contracts: allow more seconds"
+            return "no box around the goal was found on which u(0, x) is seen to contract, in the time for it"
+        if not self.hole > 0:
+            return "V(0, ·) is not above 0 around the goal, or not seen to be in the time for it"
         if self.verdict == "falsified":
-            return "V(0, ·) does not fall there under u(0, ·): train on a longer horizon, or from states all around it"
+            return (
+                "V(0, ·) does not fall at the rate λ there under u(0, ·): train on a longer horizon, or from states "
+                "all around it, or allow a smaller --decay"
+            )
         if self.proof is not None and self.proof.remaining_volume > 0:
-            return "seconds spent: allow more"
+            return "undecided boxes are left: allow more seconds; beside another equilibrium some always are"
         if self.rim <= self.wanted:
-            return "the region meets the boundary of D or a constraint: choose a larger set"
+            return "the region meets the boundary of D or a constraint, as far as bounds tell: choose a larger set"
         return "V(0, ·) does not fall close to what X₀ needs"
 
     @property
@@ -117,7 +127,7 @@ class RegionClaim:
 
 
 class RecedingDecrease(DecreaseCondition):
-    """c(x) = V̇ + λ max(V, c) with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)): V falls exponentially where c ≤ 0."""
+    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially."""
 
     def __init__(self, closed_loop: ClosedLoop, decay: float):
         super().__init__(closed_loop, 1.0, 0.0)
@@ -188,6 +198,7 @@ def region_claim(
     require_continuous(condition.V, X0.lower, X0.upper)
     wanted = -minimum(lambda t, x: -condition.V(t, x), *at_time(0.0, X0.lower, X0.upper), for_levels(budget))
     states = without(states or enclosing_box(condition.height, X0, goal, 0.0, wanted), left_out)
+    _require_inside(states, goal, seen)
     domain = domain_around(states, X0, 0.0, left_out, [])
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
@@ -197,14 +208,29 @@ def region_claim(
     if contraction is not None:
         level = just_below(rim)
         condition.open_hole(contraction.box, seen, level, for_levels(budget))
-        proof = proof_within(condition, domain, level, budget, generator=generator, report=report)
-        rho = proof.level if proof.level >= condition.hole else rho
+        proof = proof_within(condition, domain, level, budget, STOPPED, generator=generator, report=report)
+        rho = proof.level if proof.level >= condition.hole > 0 else rho
+    share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
         decay, states, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
-        share_of(condition.V, X0.lower, X0.upper, rho, budget),
-        share_of(condition.V, states.lower, states.upper, rho, budget), proof, time.monotonic() - started, left_out,
-        names_of(problem.constraints),
+        share, share_of(condition.V, states.lower, states.upper, rho, budget), proof, time.monotonic() - started,
+        left_out, names_of(problem.constraints),
     )  # fmt: skip
+
+
+def _half(budget: Budget) -> Budget:
+    """Half of what is left."""
+    return Budget(budget.left / 2, chunk=budget.chunk)
+
+
+def _require_inside(states: Box, goal: State, seen: Sequence[int]) -> None:
+    """Refuse a D that has not the goal in its interior."""
+    for i in seen:
+        if not states.lower[i] < goal[i] < states.upper[i]:
+            raise UsageError(
+                f"Expected a set around the goal, got [{states.lower[i]:g}, {states.upper[i]:g}] around {goal[i]:g} at "
+                f"index {i}; choose a larger one."
+            )
 
 
 def _rim(

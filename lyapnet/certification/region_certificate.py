@@ -35,12 +35,12 @@ class RegionCertificate(Certificate):
         "volume_share": "share of X₀ in the region, at least",
         "rho_wanted": "ρ for all of X₀",
         "rho": "largest ρ proved",
-        "rim": "V(0, ·) on the boundary of D, at least",
+        "rim": "V(0, ·) on the boundary of D and of constraints, at least",
         "decay": "λ, 1/s",
         "hole": "c, below which the contraction speaks",
         "contraction_box": "B",
         "contraction_rate": "κ, 1/s",
-        "remainder": "‖x − x*‖ as t → ∞, at most",
+        "equilibrium_offset": "distance of the equilibrium from the goal, at most",
         "constraints": "constraints that no closed loop of the region violates",
         "counterexample": "counterexample of lowest V",
         "remaining_volume": "share of D undecided",
@@ -55,7 +55,8 @@ class RegionCertificate(Certificate):
         proved, B, proof = claim.rho > -float("inf"), claim.contraction, claim.proof
         around = {} if B is None else {
             "hole": claim.hole, "contraction_box": [B.box.lower.tolist(), B.box.upper.tolist()],
-            "contraction_rate": B.rate, "remainder": B.remainder,
+            "contraction_rate": B.rate, "equilibrium_offset": B.offset,
+            "contraction_coordinates": B.coordinates.tolist(), "contraction_fingerprint": B.fingerprint,
         }  # fmt: skip
         searched = {} if proof is None else {
             "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
@@ -77,36 +78,42 @@ class RegionCertificate(Certificate):
         names = self.controller.system.state_names
         left_out = ", ".join(names[i] for i in claim.left_out)
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
+        assert claim.contraction is not None
         return (
             f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} is a region of attraction of the receding law u(0, x), "
-            f"proved in continuous time for this model: no closed loop that starts in it leaves it{kept}, and each "
-            f"goes to the goal exponentially, for ever. Its volume is at least {claim.volume:.6g}, in the units of the "
-            f"states; it holds at least {floored(claim.volume_share)} of X₀."
+            f"proved in continuous time for this model: no closed loop that starts in it leaves it{kept}, and all go "
+            f"to one equilibrium exponentially, for ever, which is within {claim.contraction.offset:.3g} of the goal "
+            f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
+            f"least {floored(claim.volume_share)} of X₀."
             f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} It is about the operations that "
-            "f, g, V and u were traced to, of this fingerprint; whatever else their code reads (globals, counters, "
-            "files) is frozen as it was then."
+            "f, g, V and u were traced to in float64, of these fingerprints; whatever else their code reads (globals, "
+            "counters, files) is frozen as it was then."
         )
 
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction
         rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
+        box = "B" if B is None else f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]"
+        Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
             f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
             f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}",
-            f"V > {rho} on the boundary of D,  V > {hole} on the boundary of B",
-            f"½(M + Mᵀ) ≤ −{rate}  with M = Y J Y⁻¹, J the Jacobian of f + g u, at each x ∈ B",
+            f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''},  "
+            f"V > {hole} > 0 on the boundary of {box}",
+            f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
+            f"continuous; {Y}",
         ]
 
     def of_the_verdict(self) -> str:
         found = self.claim.counterexample
         why = {
             "certified": "it does",
-            "falsified": "V does not fall inside the region that this would take",
+            "falsified": "V does not fall so in the set that this would take (closed loops may go to the goal even so)",
             "unknown": self.claim.reason,
         }[self.verdict]
         where = "" if found is None else f" At x = {listed(found.x)} it fails by {found.condition:.3g}."
-        return f"The verdict is on the claim that a region of attraction holds all of X₀: {why}.{where}"
+        return f"The verdict is on the claim that a sublevel set on which V falls so holds all of X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:
         controller, problem = self.controller, self.controller.problem

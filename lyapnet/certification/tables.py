@@ -12,7 +12,8 @@ from rich.table import Table
 
 @contextmanager
 def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
-    """A bar in a terminal: how much of [0, T] × D a proof has decided. It is told of Progress."""
+    """A bar in a terminal: how much of [0, T] × D, or of D, a proof has decided. It is told of Progress."""
+    domain = "D" if kind == "region" else "[0, T] × D"
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -23,7 +24,7 @@ def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None
         task = bar.add_task(f"certifying, {kind}", total=None, state="")
 
         def report(progress: Any) -> None:
-            state = f"{progress.boxes} boxes, {progress.remaining:.2%} of [0, T] × D undecided"
+            state = f"{progress.boxes} boxes, {progress.remaining:.2%} of {domain} undecided"
             bar.update(task, total=1.0, completed=1 - progress.remaining, state=state)
 
         yield report
@@ -47,7 +48,7 @@ def _shown(key: str, value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{name} {_shown('', entry)}" for name, entry in value.items() if entry is not None)
     if isinstance(value, str):
-        return value[:16] if key == "fingerprint" else value
+        return value[:16] if key.endswith("fingerprint") else value
     if key == "states_left_out":
         return ", ".join(value)
     if isinstance(value, int):

@@ -2,15 +2,18 @@
 
 import json
 import math
-from functools import cache
+import re
+from functools import cache, partial
 
 import pytest
 import torch
 
 from lyapnet.certification import Budget, region_claim
 from lyapnet.certification.contraction import contraction_around
+from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.cli import main
 from lyapnet.constraints import StateLimits
+from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.policy import HJBPolicy
 from lyapnet.problem import Problem
@@ -86,7 +89,7 @@ def test_its_contraction_is_that_of_the_linear_law():
     slowest = -float(torch.linalg.eigvals(A).real.max())
     found = plain_claim().contraction
     assert 0.1 * slowest < found.rate < slowest
-    assert found.remainder < 1e-12
+    assert found.offset < 1e-12
     assert 0 < plain_claim().hole < plain_claim().rho
 
 
@@ -121,12 +124,13 @@ def test_a_law_that_leaves_the_goal_has_no_region():
 
 
 def test_a_law_that_leaves_further_out_is_falsified():
-    """With u = −x₂ + x₂³ the speed grows beyond |x₂| = 1."""
+    """With V = x₁² + x₂² − x₂⁴/2 and u = −x₂ + x₂³, V̇ > 0 beyond |x₂| = 1.2."""
     system = Linear([[-1.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
     V = Formula(lambda t, x: x[..., 0] ** 2 + x[..., 1] ** 2 - x[..., 1] ** 4 / 2 + 0 * t)
     about = problem_of(system, cost(), 100, 0.02, Box([-1.5, -1.5], [1.5, 1.5]))
     claim = region_claim(loop_of(V, about), about, None, Box([-2.0, -2.0], [2.0, 2.0]), Budget(100, 2000, chunk=128))
     assert claim.verdict != "certified"
+    assert claim.rho < 0.5, "V at (0, 1), beyond which V falls as |x₂| grows"
 
 
 def test_a_second_well_is_not_taken_for_the_hole():
@@ -206,7 +210,67 @@ def test_where_the_goal_is_no_equilibrium_it_says_how_far_closed_loops_end():
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     about = problem(Shifted())
     found, _ = contraction_around(loop_of(V, about), torch.zeros(2), D, [0, 1])
-    assert 0.01 <= found.remainder < 0.1
+    assert 0.01 <= found.offset < 0.1
+
+
+def test_a_certificate_does_not_say_the_goal_where_it_is_another_equilibrium():
+    V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
+    about = problem(Shifted())
+    claim = claimed(V, about)
+    assert claim.verdict == "certified"
+    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).in_words()
+    (within,) = re.findall(r"one equilibrium exponentially, for ever, which is within (\S+) of the goal", words)
+    assert 0.01 <= float(within) < 0.1
+
+
+@pytest.mark.parametrize("well", [lambda x: x**2 - 1, lambda x: (x * (x - 2)) ** 2 - 5])
+def test_a_hole_below_zero_is_none(well):
+    """V̇ ≤ −λ max(V, c) lets V rise there."""
+    about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
+    V = Formula(lambda t, x: well(x[..., 0]) + 0 * t)
+    claim = region_claim(loop_of(V, about), about, None, Box([-1.0], [1.0]), Budget(5, 1000, chunk=64))
+    assert claim.verdict != "certified"
+    assert claim.rho == -math.inf
+    assert "not above 0 around the goal" in claim.reason
+
+
+def test_a_rate_that_is_asked_in_vain_is_not_called_unstable():
+    """ẋ = −x with V = x² falls at the rate 2, and no faster."""
+    about = problem_of(Linear([[-1.0]], [[0.0]]), None, 100, 0.02, Box([-0.8], [0.8]))
+    V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
+    at = partial(region_claim, loop_of(V, about), about, states=Box([-1.0], [1.0]), budget=Budget(100, 1000, chunk=64))
+    assert at(1.9).verdict == "certified"
+    claim = at(2.1)
+    assert claim.verdict != "certified"
+    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).of_the_verdict()
+    assert "closed loops may go to the goal even so" in words
+
+
+class Switched(Linear):
+    """ẋ = −x, and −2x beyond 1.9."""
+
+    dynamics = ControlAffineSystem.dynamics
+
+    def __init__(self):
+        super().__init__([[-1.0]], [[0.0]])
+
+    def f(self, x):
+        return torch.where(x > 1.9, -2 * x, -x)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_what_jumps_far_from_the_goal_is_no_obstacle_there(dtype):
+    """The twin of friction: truths that are decided on B; the box does not reach beyond the jump."""
+    about = problem_of(Switched(), None, 100, 0.02, Box([-0.5], [0.5]))
+    V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
+    default = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        states = Box(torch.tensor([-8.0]).double(), torch.tensor([8.0]).double())
+        found, _ = contraction_around(loop_of(V, about).double(), torch.zeros(1).double(), states, [0])
+    finally:
+        torch.set_default_dtype(default)
+    assert 1.0 < float(found.box.upper) < 1.9
 
 
 def test_a_constraint_bounds_the_region():
@@ -222,6 +286,8 @@ def test_what_is_no_claim_is_refused():
         region_claim(loop_of(stationary(riccati()), problem()), problem(), -1.0, D)
     with pytest.raises(UsageError, match=r"Expected a set around X₀"):
         claimed(states=Box([-0.1, -4.0], [3.0, 4.0]))
+    with pytest.raises(UsageError, match=r"Expected a set around the goal, got \[0\.1, 3\] around 0 at index 0"):
+        claimed(states=Box([0.1, -4.0], [3.0, 4.0]))
 
 
 @pytest.fixture(scope="module")

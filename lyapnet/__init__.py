@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
     from lyapnet.constraints import AllOf, Ball, Constraints, StateLimits
     from lyapnet.controller import Controller
-    from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
+    from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
     from lyapnet.horizon import Horizon
     from lyapnet.interpolation import Table
@@ -33,7 +33,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "calculus": ["ValueFunction"],
     "constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
     "controller": ["Controller"],
-    "cost": ["Cost", "ObstacleCost", "PeriodicCost", "QuadraticCost", "TargetCost"],
+    "cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
     "loading": ["load"],
@@ -71,6 +71,7 @@ __all__ = [
     "PeriodicCost",
     "Problem",
     "Program",
+    "PseudoHuberCost",
     "QuadraticCost",
     "Rollout",
     "SontagPolicy",

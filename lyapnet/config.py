@@ -97,6 +97,7 @@ class CostConfig:
     R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
     Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
     periodic: list[str] = option([], "Angles δ whose δ² counts as 2(1 − cos δ), names of states.")
+    huber: float | None = option(None, "δ: q and φ count as 2δ²(√(1 + q/δ²) − 1), less far away.", above=0)
     obstacles: list[dict[str, Any]] = option([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
     parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
 

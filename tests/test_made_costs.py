@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.config import config_from_plain, load_config
-from lyapnet.cost import ObstacleCost, PeriodicCost, QuadraticCost, TargetCost
+from lyapnet.cost import ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under
@@ -47,6 +47,20 @@ def test_an_angle_that_goes_round():
     assert_close(cost.state(small), quadratic().state(small), rtol=1e-4, atol=0)
     assert not torch.allclose(cost.state(x), quadratic().state(x), rtol=0.1)
     assert not torch.allclose(cost.state(x), cost.state(x + torch.tensor([0.0, 2 * math.pi])))
+
+
+def test_a_cost_that_grows_less_far_away():
+    cost, x = PseudoHuberCost(quadratic(), 3.0), 4 * torch.randn(50, 2)
+    for ours, q in ((cost.state(x), quadratic().state(x)), (cost.terminal(x), quadratic().terminal(x))):
+        assert_close(ours, 18 * ((1 + q / 9).sqrt() - 1))
+    assert_close(cost.state(1e-4 * x), quadratic().state(1e-4 * x), rtol=1e-6, atol=0)
+    assert_close(cost.state(1e6 * x), 6 * quadratic().state(1e6 * x).sqrt(), rtol=1e-4, atol=0)
+    u = torch.randn(50, 1)
+    assert_close(cost.control(x, u), quadratic().control(x, u))
+    about = problem_of(made(huber=3.0, obstacles=[BUMP]), "target=[0.5,0]").cost
+    bump = 8 * torch.exp(-2 * ((x[:, 0] - 1) / 0.4) ** 2)
+    assert_close(about.state(x), cost.state(x - torch.tensor([0.5, 0.0])) + bump)
+    assert problem_of(made()).cost.state(x).max() > about.state(x).max(), "the twin: without it, it is dearer"
 
 
 def test_an_obstacle():
@@ -114,6 +128,8 @@ def test_it_trains_and_comes_back(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("cost", "reason"),
     [
+        ({"huber": 0}, "cost.huber > 0"),
+        ({"huber": "much"}, "cost.huber"),
         ({"periodic": ["angel"]}, "cost.periodic among angle, velocity, got 'angel'"),
         ({"periodic": ["angle"], "Q": [[1, 0.1], [0.1, 1]]}, "no products of a cost.periodic angle"),
         ({"obstacles": [{**BUMP, "radius": 0}]}, "radius > 0"),

@@ -15,7 +15,7 @@ from lyapnet.build.family import family_of
 from lyapnet.build.target import about_target
 from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised
-from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, QuadraticCost
+from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.problem import Problem
@@ -52,6 +52,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             horizon = Horizon(config.horizon.steps, config.horizon.dt, held)
         with section("cost"):
             cost = build_cost(config.cost, system) if cost is None else cost.double()
+            if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
+                cost = PseudoHuberCost(cost, config.cost.huber)
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         if config.family:

@@ -1,7 +1,14 @@
 """What a problem charges: a running cost and a terminal cost."""
 
 from lyapnet.cost.base import Cost
-from lyapnet.cost.made_of_another import MadeOfAnother, ObstacleCost, PeriodicCost, TargetCost, innermost
+from lyapnet.cost.made_of_another import (
+    MadeOfAnother,
+    ObstacleCost,
+    PeriodicCost,
+    PseudoHuberCost,
+    TargetCost,
+    innermost,
+)
 from lyapnet.cost.penalty import PenaltyCost
 from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
 
@@ -14,6 +21,7 @@ __all__ = [
     "ObstacleCost",
     "PenaltyCost",
     "PeriodicCost",
+    "PseudoHuberCost",
     "QuadraticCost",
     "TargetCost",
     "innermost",

@@ -1,5 +1,6 @@
-"""Costs made of another: about a target, with angles that go round, with obstacles."""
+"""Costs made of another: about a target, with angles that go round, less dear far away, with obstacles."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -102,6 +103,40 @@ class PeriodicCost(MadeOfAnother):
 
     def terminal(self, x: State) -> PerState:
         return self.cost.terminal(self._chords(x))
+
+
+class PseudoHuberCost(MadeOfAnother):
+    """Another cost whose q counts as h(q) = 2δ²(√(1 + q/δ²) − 1), and φ likewise.
+
+    As dear as before where √q is far below δ, and 2δ√q where it is far above: of a quadratic q, a norm. So what is far
+    away does not outweigh what is near, and V spans fewer orders of magnitude.
+
+    Args:
+        cost: q, R and φ.
+        delta: δ, in the unit of √q.
+
+    Raises:
+        ValueError: δ is not positive.
+
+    Source: Hartley, Zisserman, "Multiple View Geometry in Computer Vision", 2003, A6.8.
+    """
+
+    def __init__(self, cost: Cost, delta: float):
+        super().__init__(cost)
+        if not 0 < delta < math.inf:
+            raise ValueError(f"Expected delta > 0, got {delta:g}; give it in the unit of √q.")
+        self.delta = delta
+        self.words: str = f"q and φ as pseudo-Huber losses, δ = {delta:g}"
+
+    def state(self, x: State) -> PerState:
+        return self._less(self.cost.state(x))
+
+    def terminal(self, x: State) -> PerState:
+        return self._less(self.cost.terminal(x))
+
+    def _less(self, q: PerState) -> PerState:
+        """h(q) as 2q/(√(1 + q/δ²) + 1), without cancellation near 0."""
+        return 2 * q / (torch.sqrt(1 + q / self.delta**2) + 1)
 
 
 class ObstacleCost(MadeOfAnother):

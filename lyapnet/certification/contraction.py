@@ -39,7 +39,7 @@ class Contraction:
         ½(P J(x) + J(x)ᵀP) ≤ −κP   almost everywhere on B.
 
     By the mean value theorem on the segment between them, ‖Y(x − x')‖ falls at the rate κ for any two closed loops in
-    B. Those of a set that none leaves therefore converge to one equilibrium x_e, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
+    B. Those of a set that none leaves therefore converge to one equilibrium x_e in B, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
 
     Source: Lohmiller, Slotine, "On contraction analysis for non-linear systems", Automatica 1998.
     """
@@ -128,7 +128,7 @@ def contraction_around(
         if rate < LEAST * own * (1 - 1e-6):
             break
         rate /= 1 + NEAR  # ZᵀPZ is 1 but for as much
-        offset = _offset(law, goal, seen, Y, rate)
+        offset = min(_offset(law, goal, seen, Y, rate), float(torch.linalg.vector_norm(radii)))  # it lies in B
         found = Contraction(box, rate, Y, offset, bounded.fingerprint)
     return found, slowest
 

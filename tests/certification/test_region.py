@@ -211,6 +211,9 @@ def test_where_the_goal_is_no_equilibrium_it_says_how_far_closed_loops_end():
     about = problem(Shifted())
     found, _ = contraction_around(loop_of(V, about), torch.zeros(2), D, [0, 1])
     assert 0.01 <= found.offset < 0.1
+    small = Box([-0.05, -0.05], [0.05, 0.05]).double()
+    near, _ = contraction_around(loop_of(V, about), torch.zeros(2), small, [0, 1])
+    assert 0.01 <= near.offset <= float(torch.linalg.vector_norm(near.box.widths / 2))
 
 
 def test_a_certificate_does_not_say_the_goal_where_it_is_another_equilibrium():

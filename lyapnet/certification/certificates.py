@@ -11,6 +11,9 @@ from lyapnet.certification.verdict import Verdict
 from lyapnet.controller import Controller
 from lyapnet.files import plain
 
+NOT_PROVED = "No level ρ was proved: nothing is claimed. The conditions below were sought."
+FROZEN = "whatever else their code reads (globals, counters, files) is frozen as it was then."
+
 
 class Certificate(ABC):
     """A claim about a controller. Each kind is a class of its own, the only place that knows it.

@@ -1,6 +1,5 @@
 """Where closed loops at one instant's law converge exponentially: a box on which the linearised law contracts."""
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +9,12 @@ import numpy as np
 import torch
 from scipy.linalg import solve_continuous_lyapunov
 from torch import Tensor
-from torch.fx import GraphModule, Node
 
 from lyapnet.calculus import gradients
 from lyapnet.certification.branch_and_bound import Budget, minimum
-from lyapnet.certification.preconditions import at_time
+from lyapnet.certification.preconditions import at_time, over_time
 from lyapnet.graphs.bounds import BoundedFunction
-from lyapnet.graphs.branches import JUMPS
+from lyapnet.graphs.branches import decisions
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import PerState, State, Time
@@ -25,11 +23,6 @@ BOXES, SAMPLES = 2000, 200  # that are bounded, and states that are tried, for o
 GROWTH, SIZES = 1.6, 20  # sizes of the box that are tried, as long as they do, up to half of D
 NEAR = 1e-6  # how far YZ may be from 1
 LEAST = 0.2  # of the linearised law's own rate, that is enough
-
-JUMPING_SLOPES = {  # operator ↦ (which of its arguments decides, at which value)
-    torch.ops.aten.threshold_backward.default: (1, 0.0),
-    torch.ops.aten.leaky_relu_backward.default: (1, 0.0),
-}
 
 
 @dataclass(frozen=True)
@@ -54,13 +47,11 @@ class Contraction:
 class _Law:
     """F(0, x), as its own operations at one x, so that its derivative is theirs; as it is on batches."""
 
-    def __init__(self, loop: ClosedLoop, lower: State, upper: State):
-        self.loop = loop
-        (low,), (high,) = at_time(0.0, lower, upper)
-        self.domain = low, high
+    def __init__(self, loop: ClosedLoop, states: Box):
+        self.loop, self.domain = loop, over_time(states, 0.0)
         self.bounded = BoundedFunction(lambda t, x: (self._declared(t, x),), self.domain)
-        jumps = _jumps(self.bounded.graph)
-        self.decisions = None if jumps is None else BoundedFunction(jumps, self.domain)
+        decided = decisions(self.bounded.graph)
+        self.decisions = None if decided is None else BoundedFunction(decided, self.domain)
 
     def is_continuous_on(self, box: Box) -> bool:
         """Whether every truth and every sign in F is decided in a box: all else is continuous."""
@@ -95,7 +86,7 @@ def contraction_around(
     Returns:
         None for the contraction where the linearised law is not stable, or contracts on no box that was tried.
     """
-    law, reach = _Law(loop, states.lower, states.upper), torch.minimum(goal - states.lower, states.upper - goal)
+    law, reach = _Law(loop, states), torch.minimum(goal - states.lower, states.upper - goal)
     A = law.jacobian(goal.new_zeros(()), goal, seen).detach().numpy()
     slowest = float(np.linalg.eigvals(A).real.max()) if np.isfinite(A).all() else math.nan
     own = -slowest / 2
@@ -131,26 +122,6 @@ def contraction_around(
         offset = min(_offset(law, goal, seen, Y, rate), float(torch.linalg.vector_norm(radii)))  # it lies in B
         found = Contraction(box, rate, Y, offset, bounded.fingerprint)
     return found, slowest
-
-
-def _jumps(graph: GraphModule) -> GraphModule | None:
-    """(t, x) ↦ every truth and every sign that occurs in a graph, as numbers; None where there is none."""
-    nodes, found = copy.deepcopy(graph.graph), list[Node]()
-    for node in list(nodes.nodes):
-        if node.op == "call_function" and node.target in JUMPS:
-            with nodes.inserting_after(node):
-                truth = node
-                if node.target in JUMPING_SLOPES:
-                    of, at = JUMPING_SLOPES[node.target]
-                    truth = nodes.call_function(torch.ops.aten.gt.Scalar, (node.args[of], at))
-            with nodes.inserting_after(truth):
-                number = nodes.call_function(torch.ops.aten._to_copy.default, (truth,), {"dtype": torch.float64})
-                found.append(number)
-    if not found:
-        return None
-    next(node for node in nodes.nodes if node.op == "output").args = (tuple(found),)
-    nodes.eliminate_dead_code()
-    return GraphModule(graph, nodes)
 
 
 def _coordinates(A: np.ndarray, reach: np.ndarray, own: float) -> tuple[np.ndarray, np.ndarray] | None:

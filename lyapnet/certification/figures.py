@@ -146,7 +146,7 @@ def region(
 
     Args:
         V, initial_states, goal, labels, constraints: as of a funnel.
-        paths: (times, k, n), closed loops that begin in the region of two states.
+        paths: (times, k, n), closed loops that begin in the region, where it is one of two states.
     """
     figure, panels = _slices(claim, initial_states)
     handles: dict[str, Artist] = {}
@@ -156,7 +156,7 @@ def region(
             _draw_over_state(panel, claim, V, initial_states, goal, labels, levels, handles)
             continue
         _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
-        if paths is not None and len(_seen(claim)) == 2:
+        if paths is not None:
             x, y = (numpy_of(paths[..., k]) for k in pair)
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under u(0, x)")
             handles.setdefault("closed loops", line)

@@ -29,7 +29,7 @@ from lyapnet.certification.preconditions import (
     without,
 )
 from lyapnet.certification.proof import Progress, Proof, prove
-from lyapnet.certification.verdict import Verdict
+from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import names_of
 from lyapnet.contracts import copied
 from lyapnet.errors import Interrupted, signals_taken
@@ -93,10 +93,8 @@ class SoundClaim:
         """On the claim that a funnel holds all of X₀, and that no closed loop from there violates a constraint."""
         if self.violation is not None:
             return "falsified"
-        if self.rho >= self.wanted:
-            return "certified"
         found = self.counterexample
-        return "falsified" if found is not None and found.height <= self.least else "unknown"
+        return verdict_on(self.rho, self.wanted, None if found is None else found.height, self.least)
 
     @property
     def reason(self) -> str | None:
@@ -222,7 +220,7 @@ def enclosing_box(
     inner = initial_states.reach_from(goal).double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
-    times = torch.linspace(0, duration, 9, dtype=torch.float64)
+    times = torch.linspace(0, duration, 9, dtype=torch.float64).unique()  # one, where T = 0
     radii = torch.logspace(-2, 1.5, 71, dtype=torch.float64)
     for _ in range(2):
         rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The region of attraction of the receding law u(0, x): a sublevel set of V(0, ·) that goes to the goal."""
+"""The region of attraction of the receding law u(0, x): a sublevel set of V(0, ·) that is never left."""
 
 import math
 import time
@@ -21,11 +21,12 @@ from lyapnet.certification.preconditions import (
     check_states,
     domain_around,
     freeze,
+    over_time,
     require_continuous,
     without,
 )
 from lyapnet.certification.proof import Progress, Proof
-from lyapnet.certification.verdict import Verdict
+from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import Constraints, names_of
 from lyapnet.contracts import copied
 from lyapnet.errors import UsageError
@@ -89,10 +90,8 @@ class RegionClaim:
     @property
     def verdict(self) -> Verdict:
         """On the claim that a sublevel set in D on which V falls so holds all of X₀; not on whether X₀ is attracted."""
-        if self.rho >= self.wanted:
-            return "certified"
         found = self.counterexample
-        return "falsified" if found is not None and found.height <= self.least else "unknown"
+        return verdict_on(self.rho, self.wanted, None if found is None else found.height, self.least)
 
     @property
     def reason(self) -> str | None:
@@ -137,8 +136,8 @@ class RecedingDecrease(DecreaseCondition):
 
     def open_hole(self, box: Box, seen: Sequence[int], level: float, budget: Budget) -> None:
         """Ask nothing in {x ∈ box: V < c}, with c below V on the boundary of the box, and at most a level."""
-        (low,), (high,) = at_time(0.0, box.lower, box.upper)
-        self.hole = min(level, just_below(minimum(self.V, *faces(low, high, [1 + i for i in seen]), budget)))
+        rim = minimum(self.V, *faces(*over_time(box, 0.0), [1 + i for i in seen]), budget)
+        self.hole = min(level, just_below(rim))
         self.constraints = OutsideTheHole(self.V, box, self.hole)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
@@ -191,8 +190,7 @@ def region_claim(
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
     condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
     goal, X0 = problem.goal.double(), problem.initial_states
-    (low,), (high,) = at_time(0.0, X0.lower.double(), X0.upper.double())
-    freeze(condition, (low, high))
+    freeze(condition, over_time(X0, 0.0))
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
     X0, seen = without(X0, left_out), [i for i in range(X0.dimension) if i not in left_out]
     require_continuous(condition.V, X0.lower, X0.upper)

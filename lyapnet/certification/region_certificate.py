@@ -10,7 +10,7 @@ from torchdiffeq import odeint
 
 from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
-from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.region import RegionClaim, region_claim
 from lyapnet.certification.sound_certificate import listed, parse_set
@@ -22,7 +22,7 @@ PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the re
 
 
 class RegionCertificate(Certificate):
-    """A set from which closed loops of the receding law go to the goal, and stay there for ever."""
+    """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium."""
 
     kind: ClassVar[str] = "region"
     picture: ClassVar[str] = "region.png"
@@ -74,7 +74,7 @@ class RegionCertificate(Certificate):
     def in_words(self) -> str:
         claim = self.claim
         if claim.rho == -float("inf"):
-            return "No level ρ was proved: nothing is claimed. The conditions below were sought."
+            return NOT_PROVED
         names = self.controller.system.state_names
         left_out = ", ".join(names[i] for i in claim.left_out)
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
@@ -86,8 +86,7 @@ class RegionCertificate(Certificate):
             f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
             f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} It is about the operations that "
-            "f, g, V and u were traced to in float64, of these fingerprints; whatever else their code reads (globals, "
-            "counters, files) is frozen as it was then."
+            f"f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
         )
 
     def in_formulas(self) -> list[str]:
@@ -123,8 +122,10 @@ class RegionCertificate(Certificate):
         )
 
     def _paths(self) -> Tensor | None:
-        """Closed loops of the receding law over T from states just inside the region, (times, k, n)."""
+        """Closed loops of the receding law over T from states just inside a region of two, (times, k, n)."""
         claim, loop, horizon = self.claim, self.controller.closed_loop, self.controller.horizon
+        if claim.states.dimension - len(claim.left_out) != 2:  # elsewhere they would not lie in the slice
+            return None
         x = claim.states.sample(20_000, stream(0, CERTIFICATION)).to(claim.states.lower)
         t = x.new_zeros(())
         with torch.no_grad():

@@ -10,7 +10,7 @@ import torch
 
 from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
-from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
 from lyapnet.certification.funnel import SoundClaim, sound_claim
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.tables import floored
@@ -77,14 +77,13 @@ class SoundCertificate(Certificate):
     def in_words(self) -> str:
         claim = self.claim
         if not claim.volume_share:
-            return "No level ρ was proved: nothing is claimed. The conditions below were sought."
+            return NOT_PROVED
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
             f"model: no closed loop that starts in it leaves the funnel, or D,{self._or_violates} up to "
             f"T = {claim.duration:g} s, and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. It is about the operations that f, g, ℓ, V and u were "
-            "traced to, of this fingerprint; whatever else their code reads (globals, counters, files) is frozen as it "
-            f"was then.{self.of_parameters}"
+            f"traced to, of this fingerprint; {FROZEN}{self.of_parameters}"
         )
 
     @property

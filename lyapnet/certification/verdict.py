@@ -3,3 +3,17 @@
 from typing import Literal
 
 Verdict = Literal["certified", "falsified", "unknown"]
+
+
+def verdict_on(proved: float, wanted: float, fails: float | None, least: float) -> Verdict:
+    """On the claim that a sublevel set of W on which a condition holds contains all of X₀.
+
+    Args:
+        proved: the level up to which the condition was proved.
+        wanted: a level that does for all of X₀.
+        fails: W where the condition fails; None where no such point was found.
+        least: a level below which none does for all of X₀.
+    """
+    if proved >= wanted:
+        return "certified"
+    return "falsified" if fails is not None and fails <= least else "unknown"

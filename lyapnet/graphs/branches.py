@@ -4,12 +4,14 @@ The truth of a comparison is a number, 1 or 0, and ½ ± ½ on a box that does n
 room for rounding: of two boxes that touch where a comparison turns, at least one is undecided.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.fx import GraphModule, Node
 
 from lyapnet.graphs import taylor
 from lyapnet.graphs.elementary_functions import linearised
@@ -227,3 +229,32 @@ CHOICES: dict[Any, Callable[..., TaylorForm]] = {
     **dict.fromkeys((aten.masked_fill.Scalar, aten.masked_fill.Tensor), lambda x, mask, value: where(mask, value, x)),
 }
 """Operator ↦ its rule, for the operators that choose: they jump where their truth does, unless the choices agree."""
+
+
+# What a graph decides
+
+DECIDES = {  # slope that jumps ↦ (x, threshold) of the comparison x > threshold in it, from its arguments
+    aten.threshold_backward.default: lambda gradient, x, threshold: (x, threshold),
+    aten.leaky_relu_backward.default: lambda gradient, x, negative_slope, self_is_result: (x, 0.0),
+}
+
+
+def decisions(graph: GraphModule) -> GraphModule | None:
+    """(t, x) ↦ every truth and every sign that occurs in a graph, as numbers; None where there is none.
+
+    Where all of them are constant, the graph is continuous: what else it does is, or choose by them.
+    """
+    nodes, found = copy.deepcopy(graph.graph), list[Node]()
+    for node in list(nodes.nodes):
+        if node.op == "call_function" and node.target in JUMPS:
+            truth = node
+            if node.target in DECIDES:
+                with nodes.inserting_after(node):
+                    truth = nodes.call_function(aten.gt.Scalar, DECIDES[node.target](*node.args))
+            with nodes.inserting_after(truth):
+                found.append(nodes.call_function(aten._to_copy.default, (truth,), {"dtype": torch.float64}))
+    if not found:
+        return None
+    next(node for node in nodes.nodes if node.op == "output").args = (tuple(found),)
+    nodes.eliminate_dead_code()
+    return GraphModule(graph, nodes)

@@ -13,6 +13,7 @@ from torch.nn import functional
 from lyapnet.graphs import elementary_functions, taylor
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.branches import decisions
 
 aten = torch.ops.aten
 AXES = 3
@@ -350,3 +351,13 @@ def test_elementary_functions_err_by_less_at_many_points(name):
 def test_a_function_in_single_precision_errs_by_more(monkeypatch):
     monkeypatch.setitem(ELEMENTARY, "exp", (lambda v: torch.exp(v.float()).double(), mpmath.exp, -80, 80))
     assert largest_error("exp", 200) > 8
+
+
+def test_a_slope_that_jumps_decides_where_it_jumps():
+    """At its own threshold, not at 0; a graph without a truth decides nothing."""
+    box = torch.tensor([0.0, -2.0]), torch.tensor([1.0, 2.0])
+    slope = BoundedFunction(lambda t, x: (aten.threshold_backward(3 * x, x, 0.5),), box).graph
+    decided = decisions(slope)
+    for at in (-1.0, 0.2, 0.6):
+        assert decided(torch.zeros(()), torch.tensor([at]))[0].tolist() == [float(at > 0.5)]
+    assert decisions(BoundedFunction(lambda t, x: (3 * x,), box).graph) is None

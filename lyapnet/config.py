@@ -159,6 +159,7 @@ class NetworkConfig:
     ignored_states: list[str] = option([], "Names of states on which V does not depend.")
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
+    smooth: bool | None = option(None, "Smooth in time, for sound certificates (expansion).")
     terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
     state_scale: list[float] | None = option(
         None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0

@@ -1,5 +1,6 @@
 """Interpolation in torch, with a derivative, bounds and a translation: tables of measurements, and curves in time."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -112,6 +113,65 @@ class Curve(nn.Module):
             )
         self.nodes.copy_(nodes)
         self.values.copy_(values)
+
+
+class SmoothCurve(nn.Module):
+    """t (*batch) ↦ (*batch, *shape) on [0, T], smooth: y(T) + Σ_k a_k (σ((τ − τ_k)/w) − σ((0 − τ_k)/w)), with
+
+        τ = log(1 + (T − t)/s) / log(1 + T/s)
+
+    the time that is left, drawn out where it is short of s. Unlike a Curve it has no kinks, at which V_t would jump and
+    bounds of V̇ would hold both slopes possible, and follows a solution of Riccati's equation to five digits or six. Its
+    numbers are part of a checkpoint.
+
+    Args:
+        duration: T.
+        shape: of y.
+    """
+
+    scale: Float[Tensor, ""]  # s
+    end: Float[Tensor, "*shape"]  # y(T)
+    weights: Float[Tensor, "K *shape"]  # a
+
+    STEPS = torch.arange(-2, 27) / 24  # τ_k
+    WIDTH = 1.5 / 24  # w
+    SCALES = (0.025, 0.05, 0.1, 0.2, 0.4)  # of T, that are tried for s
+    RIDGE = 1e-9  # of Σ a² beside Σ error², in units of y
+
+    def __init__(self, duration: float, shape: Sequence[int]):
+        super().__init__()
+        self.duration = duration
+        self.register_buffer("scale", torch.tensor(self.SCALES[-1] * duration))
+        self.register_buffer("end", torch.zeros(*shape))
+        self.register_buffer("weights", torch.zeros(len(self.STEPS), *shape))
+
+    def forward(self, t: Float[Tensor, "*batch"]) -> Tensor:
+        y = self.end.flatten() + self._rises(t, self.scale) @ self.weights.flatten(1)
+        return y.unflatten(-1, self.end.shape)
+
+    def _rises(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
+        """What each a_k is multiplied with."""
+        left = torch.log(1 + (self.duration - t) / scale) / torch.log(1 + self.duration / scale)
+        steps = self.STEPS.to(left)
+        return torch.sigmoid((left[..., None] - steps) / self.WIDTH) - torch.sigmoid(-steps / self.WIDTH)
+
+    @torch.no_grad()
+    def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
+        """Become the curve closest to these points by least squares, the last of them at T, which it passes."""
+        t, y = nodes.double(), values.double().flatten(1)
+        end, unit = y[-1], y.abs().amax(0).clamp_min(torch.finfo(y.dtype).tiny)
+        best = math.inf
+        for share in self.SCALES:
+            scale = torch.tensor(share * self.duration, dtype=torch.float64)
+            rises = self._rises(t, scale)
+            gram = rises.mT @ rises + self.RIDGE * torch.eye(rises.shape[-1]).to(rises)
+            weights = torch.linalg.solve(gram, rises.mT @ ((y - end) / unit))
+            error = float((rises @ weights - (y - end) / unit).square().sum())
+            if error < best:
+                best = error
+                self.scale.copy_(scale)
+                self.weights.copy_((weights * unit).unflatten(-1, self.end.shape))
+        self.end.copy_(values[-1])
 
 
 def _furthest_from(nodes: Tensor, values: Tensor, kept: list[int]) -> int:

@@ -75,6 +75,7 @@ def test_the_limited_pendulum_has_limits_besides():
 def test_every_shipped_config_is_a_task_of_the_sheet():
     alone = {"integrator_chain", "pendulum_limited", "pendulum_held", "pendulum_periodic", "obstacle"}
     alone |= {"cartpole_family", "reacher_family", "bryson_denham", "keep_out", "double_integrator_region"}
+    alone |= {"double_integrator_two_sided"}
     assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, *OWN, *alone}
     assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(REFERENCE)
     assert {path.stem for path in SCRATCH.glob("*.yaml")} == {*REFERENCE, "double_integrator_value"}

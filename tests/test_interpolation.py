@@ -1,14 +1,17 @@
-"""Tables: SciPy's interpolations, their derivatives and bounds, in torch and in CasADi."""
+"""Tables: SciPy's interpolations, their derivatives and bounds, in torch and in CasADi; and curves in time."""
 
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline, RegularGridInterpolator
 from torch.testing import assert_close
 
 import lyapnet
+from lyapnet.calculus import gradients
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
+from lyapnet.interpolation import Curve, SmoothCurve
 from tests.functions import box, points_in
 from tests.problems import problem_of
 
@@ -125,3 +128,59 @@ def test_other_coordinates_and_methods_are_refused():
         lyapnet.Table([NODES], VALUES)(torch.zeros(3, 2))
     with pytest.raises(ValueError, match="linear or cubic"):
         lyapnet.Table([NODES], VALUES, "quintic")
+
+
+def riccati_path(steps):
+    """(t, P(t)) of the double integrator with the cost of conf/double_integrator.yaml, by an integrator of SciPy."""
+    Q, A, B = np.diag([10.0, 0.1]), np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+
+    def backward(s, p):
+        P = p.reshape(2, 2)
+        return (Q + P @ A + A.T @ P - P @ B @ B.T @ P).ravel()
+
+    t = np.linspace(0, 4, steps + 1)
+    P = solve_ivp(backward, (0, 4), Q.ravel(), t_eval=t, rtol=1e-11, atol=1e-12).y.T[::-1].reshape(-1, 2, 2)
+    return torch.tensor(t), torch.tensor(P.copy()), torch.tensor(np.array([-backward(0, p.ravel()) for p in P]))
+
+
+def test_a_smooth_curve_follows_a_solution_of_riccatis_equation_and_its_slope():
+    """From the nodes of 400 steps; the slope, which V_t is made of, too. A piecewise linear curve has 50 times more."""
+    t, P, slope = riccati_path(400)
+    errors = []
+    for curve in (SmoothCurve(4.0, [2, 2]), Curve(torch.linspace(0, 4, 65), torch.zeros(65, 2, 2))):
+        curve.take(t, P)
+        at = t.clone().requires_grad_()
+        y = curve(at)
+        assert_close(y[-1], P[-1], rtol=0, atol=1e-12)
+        slopes = [torch.autograd.grad(y[:, i, j].sum(), at, retain_graph=True)[0] for i in (0, 1) for j in (0, 1)]
+        apart = (y - P).abs().max(), (torch.stack(slopes, -1) - slope.flatten(1)).abs().max()
+        errors.append([float(error.detach()) for error in apart])
+    (value, rate), (_, coarse) = errors
+    assert value < 1e-4
+    assert rate < 0.02
+    assert coarse > 50 * rate
+
+
+def test_a_smooth_curve_takes_constants_as_they_are_and_few_nodes():
+    curve = SmoothCurve(2.0, [3])
+    curve.take(torch.linspace(0, 2, 5), torch.tensor([[0.0, -3.0, 1e-30]]).expand(5, 3))
+    assert_close(curve(torch.linspace(0, 2, 50)), torch.tensor([[0.0, -3.0, 1e-30]]).expand(50, 3), rtol=0, atol=0)
+
+
+def test_bounds_of_a_smooth_curve_have_no_kinks():
+    """Of its slope, on boxes across its time: a tenth of the width, a tenth of the range."""
+    t, P, _ = riccati_path(400)
+    curve = SmoothCurve(4.0, [2, 2])
+    curve.take(t, P)
+
+    def slope(t, x):
+        (V_t, _) = gradients(lambda t, x: ((curve(t) @ x[..., None])[..., 0] * x).sum(-1), t, x)
+        return (V_t,)
+
+    def widest(width):
+        lower = torch.cat([torch.linspace(0, 4 - width, 40)[:, None], torch.ones(40, 2)], 1)
+        upper = lower + torch.tensor([width, 0.0, 0.0])
+        ((low, high),) = BoundedFunction(slope, (lower[0], upper[-1])).bounds(lower, upper)
+        return float((high - low).max())
+
+    assert widest(0.001) < 0.2 * widest(0.01) < 1.0

@@ -36,6 +36,7 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         "hidden": options.hidden,
         "activation": options.activation,
         "epsilon": options.epsilon,
+        "smooth": options.smooth,
         "embedded_angles": angles if options.embed_angles else None,
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}

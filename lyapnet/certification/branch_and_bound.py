@@ -29,7 +29,7 @@ class Budget:
         seconds, boxes: the work.
         chunk: boxes that are bounded at once by each worker.
         frontier: undecided boxes that are kept; beyond, those of highest key are given up.
-        workers: threads.
+        workers: processes.
     """
 
     seconds: float = 60.0
@@ -86,7 +86,7 @@ class Question(ABC):
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         """(the boxes that must be cut, by the key under which their halves wait; the axis to cut each across).
 
-        Calls may run in threads, side by side.
+        Calls may run in copies of this process, side by side: what they learn is lost but for what they return.
         """
 
     def look_at(self, boxes: Boxes) -> None:  # noqa: B027  (most questions learn from bounds alone)
@@ -121,7 +121,7 @@ class Search:
         """Bound a chunk for each worker, again and again, until all is decided, settled or the budget is spent.
 
         Args:
-            run: maps a function over chunks, as `map` does or a pool of threads.
+            run: maps a function over chunks, as `map` does or lyapnet.certification.workers.
         """
         budget.stop.searching = True
         while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):

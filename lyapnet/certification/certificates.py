@@ -76,5 +76,6 @@ class Certificate(ABC):
             user: `system`, `network` and so on, where they are the user's own.
         """
         named = {name: value for name, value in {**self.options, **user}.items() if value is not None}
-        options = [*(f"--{name}={value}" for name, value in named.items()), *(f"--at={each}" for each in at)]
+        options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in named.items()]
+        options += [f"--at={each}" for each in at]
         return shlex.join(["lyapnet", "certify", self.kind, checkpoint, *options])

@@ -98,7 +98,7 @@ def own_constraints(constraints: Constraints, domain: tuple[Corner, Corner]) -> 
     return constraints if isinstance(constraints, OwnConstraints) else OwnConstraints(constraints, domain)
 
 
-def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> BoundedFunction:
+def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int = 2) -> BoundedFunction:
     """(c, W, Ẇ), and h where there are constraints, with bounds on boxes; V̇ is that of V's own operations.
 
     So c ≤ 0 proves that V falls, whatever gradient V declares; the control law is the one that runs.
@@ -107,7 +107,7 @@ def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner
     try:
         condition.V = own_operations(declared, domain)
         h = None if condition.constraints is None else own_constraints(condition.constraints, domain)
-        return BoundedFunction(lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain)
+        return BoundedFunction(lambda t, x: (*condition.parts(t, x), *([] if h is None else [h(x)])), domain, degree)
     finally:
         condition.V = declared
 

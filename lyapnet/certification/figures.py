@@ -1,4 +1,4 @@
-"""Certificates drawn as matplotlib figures: sampled states, and slices of funnels and regions."""
+"""Certificates drawn as matplotlib figures: sampled states, two bounds, and slices of funnels and regions."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -193,6 +193,37 @@ def _levels_of_region(claim: RegionClaim) -> list["Level"]:
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
     wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
     return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+# Two sides
+
+
+def two_sided(value: Tensor, guaranteed: Tensor, least: Tensor, optimum: Tensor | None, headline: str) -> Figure:
+    """Both bounds over V(0, x₀), relative to it, with the optima between them.
+
+    Args:
+        value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,).
+        optimum: of the first few of them.
+    """
+    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    panel = figure.subplots()
+    order = value.argsort()
+    V, upper, lower = (numpy_of(y[order]) for y in (value, guaranteed, least))
+    panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
+    panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
+    panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label="least: any control costs at least")
+    if optimum is not None:
+        some = numpy_of(value[: len(optimum)])
+        panel.plot(some, numpy_of(optimum) / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
+    panel.axhline(1, color=GREY, linewidth=0.6)
+    middle = len(V) // 4  # cheaper states, where δT and κ weigh most, may leave the picture
+    if len(V):
+        panel.set_ylim(min(0.9, lower[middle] / V[middle]), max(1.1, upper[middle] / V[middle]))
+        panel.set_xlim(0, V[-1])
+    panel.set(xlabel="V(0, x₀)", ylabel="cost / V(0, x₀)")
+    panel.set_title(headline, fontsize=8)
+    legend_below(figure, panel, columns=2)
+    return figure
 
 
 # Slices

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
-from lyapnet.types import Corner, PerState, Points, State, Value
+from lyapnet.types import Corner, Corners, PerState, Points, State, Value
 
 LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, and at constraints, at the most …
 LEAST, SHARE_OF_LEVELS = 1.0, 0.3  # … in seconds at the least, and of the budget
@@ -126,6 +126,7 @@ def sound_claim(
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
     replay: bool = False,
+    degree: int = 2,
 ) -> SoundClaim:
     """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
@@ -133,7 +134,7 @@ def sound_claim(
         closed_loop: with the law of a V; its float64 copy is what the claim is about.
         problem: whose X₀, T and goal are meant.
         states: D; by default a box around where samples of V are low enough.
-        report, keep, replay: of prove.
+        report, keep, replay, degree: of prove.
 
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
@@ -141,40 +142,70 @@ def sound_claim(
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints)
-    duration, goal = problem.horizon.duration, problem.goal.double()
-    freeze(condition, over_time(problem.initial_states, duration))
-    left_out = ignorable_states(condition.closed_loop, problem.constraints)
-    initial_states = without(problem.initial_states, left_out)
-    x_low, x_high = initial_states.lower, initial_states.upper
-    require_continuous(condition.V, x_low, x_high)
+    duration = problem.horizon.duration
     levels = for_levels(budget)
-    wanted = -minimum(lambda t, x: -condition.V(t, x), *at_time(0.0, x_low, x_high), levels)
-    constants = condition.closed_loop.system.constants
-    states = states or enclosing_box(condition.height, initial_states, goal, duration, wanted, constants)
-    states = without(states, left_out)
-    domain = domain_around(states, initial_states, duration, left_out, constants)
-    require_own_gradient(condition.V, domain)
-    check_states(condition, domain)
+    left_out, initial_states, wanted, D, domain, sides = setting_of(condition, problem, duration, states, levels)
+    x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
-    axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
-    rim = minimum(condition.height, *faces(*domain, axes), levels, enough=just_above(needed))
+    rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
     begin = beginning_level(condition, at_time(0.0, x_low, x_high), for_levels(budget), just_above(needed))
     crossing = min(begin, crossing_level(condition, domain, for_levels(budget), just_above(needed)))
     set_up = time.monotonic() - started
     level = min(needed, just_below(min(rim, crossing)))
-    proof = proof_within(condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay)
+    proof = proof_within(
+        condition, domain, level, budget,
+        generator=generator, report=report, keep=keep, replay=replay, degree=degree,
+    )  # fmt: skip
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
     if found is None and rim <= needed and budget.left:  # proved, and so searched, was less than what X₀ needs
         found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
     share = 1.0 if rho >= wanted else share_of(condition.V, x_low, x_high, rho, budget)
-    excess = _terminal_excess(condition, states, duration, rho, budget)
+    excess = _terminal_excess(condition, D, duration, rho, budget)
     return SoundClaim(
-        alpha, delta, duration, states, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
+        alpha, delta, duration, D, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
         proof.fingerprint, proof.seconds, names, crossing, violation,
     )  # fmt: skip
+
+
+class Setting(NamedTuple):
+    """Where a claim is about, without the states that nothing depends on."""
+
+    left_out: list[int]
+    initial_states: Box  # X₀
+    wanted: float  # max W(0, ·) on X₀, or up to 0.1 % more
+    states: Box  # D
+    domain: tuple[Corner, Corner]  # [0, T] × D
+    sides: tuple[Corners, Corners]  # [0, T] × the boundary of D
+
+
+def setting_of(
+    condition: DecreaseCondition, problem: Problem, duration: float, states: Box | None, levels: Budget
+) -> Setting:
+    """The setting of a claim about a condition, whose V and h are traced for it, once.
+
+    Args:
+        duration: T, or 0 for what holds at t = 0 alone.
+        states: D; by default a box around where samples of W are low enough.
+        levels: for the level of X₀.
+
+    Raises:
+        UsageError: D does not fit; or the condition is none that bounds can speak of.
+    """
+    freeze(condition, over_time(problem.initial_states, duration))
+    constants, goal = condition.closed_loop.system.constants, problem.goal.double()
+    left_out = ignorable_states(condition.closed_loop, problem.constraints)
+    X0 = without(problem.initial_states, left_out)
+    require_continuous(condition.V, X0.lower, X0.upper)
+    wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
+    states = without(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
+    domain = domain_around(states, X0, duration, left_out, constants)
+    require_own_gradient(condition.V, domain)
+    check_states(condition, domain)
+    axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
+    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes))
 
 
 def for_levels(budget: Budget) -> Budget:

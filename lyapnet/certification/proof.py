@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +15,7 @@ from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
 from lyapnet.certification.kept_proofs import KeptProof, Standing, about
 from lyapnet.certification.verdict import Verdict
+from lyapnet.certification.workers import bounding
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner, Points
 
@@ -67,6 +67,7 @@ def prove(
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
     replay: bool = False,
+    degree: int = 2,
 ) -> Proof:
     """Prove c ≤ 0 and Ẇ ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
@@ -75,7 +76,7 @@ def prove(
     two. A counterexample that turns up among their centres lowers the level, and the search goes on under it.
 
     Args:
-        condition: in float64.
+        condition, degree: in float64, and of the forms that bound it.
         domain: (lower, upper) of (t, x).
         stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
         report: is told how far it is, after every few thousand boxes.
@@ -88,7 +89,7 @@ def prove(
     """
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
-    bounded = bounded_condition(condition, (lower, upper))
+    bounded = bounded_condition(condition, (lower, upper), degree)
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample)
     kept = None if keep is None else KeptProof(keep, about(bounded, condition, lower, upper), wanted)
     if kept is not None and replay:
@@ -96,15 +97,14 @@ def prove(
         leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
         budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
     else:
-        begun = None if kept is None else kept.read((lower, upper), question.again)
-        begun = begun or question.begin(lower, upper, generator)
+        begun = (kept.read((lower, upper), question.again) if kept else None) or question.begin(lower, upper, generator)
     search, earlier, saved = begun.search, begun.seconds, budget.elapsed
 
     def standing() -> Standing:
         return Standing(search, question.level, question.worst, earlier + budget.elapsed)
 
-    with ThreadPoolExecutor(budget.workers) as pool:
-        for _ in search.rounds(question, budget, pool.map):
+    with bounding(question, budget.workers) as run:
+        for _ in search.rounds(question, budget, run):
             if kept is not None and budget.elapsed > saved + KEEP_EVERY:
                 kept.write(standing())
                 saved = budget.elapsed

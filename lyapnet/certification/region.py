@@ -11,20 +11,11 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
-from lyapnet.certification.condition import DecreaseCondition, own_constraints, require_own_gradient
+from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
-from lyapnet.certification.funnel import enclosing_box, for_levels, largest_seen, proof_within, share_of
-from lyapnet.certification.ignorable_states import ignorable_states
-from lyapnet.certification.preconditions import (
-    at_time,
-    check_states,
-    domain_around,
-    freeze,
-    over_time,
-    require_continuous,
-    without,
-)
+from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of, share_of
+from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress, Proof
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import Constraints, names_of
@@ -33,7 +24,7 @@ from lyapnet.errors import UsageError
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
-from lyapnet.types import Corner, PerState, Points, State, Time, Value
+from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
 STOPPED = "Stopped while certifying: nothing is kept."
@@ -189,19 +180,12 @@ def region_claim(
         raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
     condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
-    goal, X0 = problem.goal.double(), problem.initial_states
-    freeze(condition, over_time(X0, 0.0))
-    left_out = ignorable_states(condition.closed_loop, problem.constraints)
-    X0, seen = without(X0, left_out), [i for i in range(X0.dimension) if i not in left_out]
-    require_continuous(condition.V, X0.lower, X0.upper)
-    wanted = -minimum(lambda t, x: -condition.V(t, x), *at_time(0.0, X0.lower, X0.upper), for_levels(budget))
-    states = without(states or enclosing_box(condition.height, X0, goal, 0.0, wanted), left_out)
-    _require_inside(states, goal, seen)
-    domain = domain_around(states, X0, 0.0, left_out, [])
-    require_own_gradient(condition.V, domain)
-    check_states(condition, domain)
-    rim = _rim(condition.V, problem.constraints, domain, seen, for_levels(budget))
-    contraction, slowest = contraction_around(condition.closed_loop, goal, states, seen, for_levels(budget).seconds)
+    goal, levels = problem.goal.double(), for_levels(budget)
+    left_out, X0, wanted, D, domain, sides = setting_of(condition, problem, 0.0, states, levels)
+    seen = [i for i in range(X0.dimension) if i not in left_out]
+    _require_inside(D, goal, seen)
+    rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
+    contraction, slowest = contraction_around(condition.closed_loop, goal, D, seen, for_levels(budget).seconds)
     proof, rho = None, -math.inf
     if contraction is not None:
         level = just_below(rim)
@@ -210,8 +194,8 @@ def region_claim(
         rho = proof.level if proof.level >= condition.hole > 0 else rho
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
-        decay, states, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
-        share, share_of(condition.V, states.lower, states.upper, rho, budget), proof, time.monotonic() - started,
+        decay, D, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
+        share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
         left_out, names_of(problem.constraints),
     )  # fmt: skip
 
@@ -232,10 +216,14 @@ def _require_inside(states: Box, goal: State, seen: Sequence[int]) -> None:
 
 
 def _rim(
-    V: Value, constraints: Constraints | None, domain: tuple[Corner, Corner], seen: Sequence[int], budget: Budget
+    V: Value,
+    constraints: Constraints | None,
+    domain: tuple[Corner, Corner],
+    sides: tuple[Corners, Corners],
+    budget: Budget,
 ) -> float:
     """A lower bound of V on the boundary of D, and where some h_j ≥ 0 in it."""
-    rim = minimum(V, *faces(*domain, [1 + i for i in seen]), budget)
+    rim = minimum(V, *sides, budget)
     if constraints is None:
         return rim
     h, (lower, upper) = own_constraints(constraints, domain), (side[None] for side in domain)

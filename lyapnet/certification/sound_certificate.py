@@ -3,8 +3,9 @@
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 
@@ -20,6 +21,7 @@ from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.sets import Box
+from lyapnet.types import PerState
 
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
 SEARCHED = 64  # of them, where each optimum is a search
@@ -53,8 +55,12 @@ class SoundCertificate(Certificate):
     claim: SoundClaim
 
     def numbers(self) -> dict[str, Any]:
-        seconds = max(1.0, 0.1 * self.options["seconds"])  # for the optima, which are beside the claim
-        return {**self.proved(), "guaranteed_cost_ratio": guaranteed_cost_ratio(self.controller, self.claim, seconds)}
+        return {**self.proved(), "guaranteed_cost_ratio": self.compared.ratio}
+
+    @cached_property
+    def compared(self) -> "Compared":
+        """The guaranteed cost against the optimum, which is beside the claim."""
+        return compared_to_optima(self.controller, self.claim, max(1.0, 0.1 * self.options["seconds"]))
 
     def proved(self) -> dict[str, Any]:
         """The numbers of the claim, without the optimum, which takes an oracle."""
@@ -196,11 +202,25 @@ def _pairs(text: str) -> Sequence[Sequence[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
-def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim, seconds: float = math.inf) -> float | None:
-    """Mean guaranteed cost over the mean optimum of the discretised task, on states of X₀ inside the funnel.
+class Compared(NamedTuple):
+    """States of X₀ inside a funnel: V(0, x₀), the guaranteed cost, and the optimum of the first of them."""
 
-    None where there is no funnel or no oracle, or it takes longer. A search by IPOPT takes fewer states, and the
-    controller's help.
+    value: PerState
+    guaranteed: PerState
+    optimum: PerState | None  # of the discretised task; None where there is no oracle, or it takes longer
+
+    @property
+    def ratio(self) -> float | None:
+        """Mean guaranteed cost over the mean optimum."""
+        if self.optimum is None:
+            return None
+        return ratio_of_means(self.guaranteed[: len(self.optimum)], self.optimum)
+
+
+def compared_to_optima(controller: Controller, claim: SoundClaim, seconds: float = math.inf) -> Compared:
+    """The guaranteed cost of states of X₀ inside a funnel, held against their optima.
+
+    A search by IPOPT takes fewer states, and the controller's help.
     """
     end = time.monotonic() + seconds
 
@@ -209,15 +229,16 @@ def guaranteed_cost_ratio(controller: Controller, claim: SoundClaim, seconds: fl
             raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
 
     x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
-    guaranteed = claim.guaranteed_cost(controller.value(0.0, x0).double())
-    x0, guaranteed = x0[guaranteed.isfinite()], guaranteed[guaranteed.isfinite()]
+    value = controller.value(0.0, x0).double()
+    guaranteed = claim.guaranteed_cost(value)
+    x0, value, guaranteed = (y[guaranteed.isfinite()] for y in (x0, value, guaranteed))
     if not len(x0):
-        return None
+        return Compared(value, guaranteed, None)
     try:
         oracle = oracle_of(controller.problem, controller.method)
         if not isinstance(oracle, RiccatiOracle):
-            x0, guaranteed = x0[:SEARCHED], guaranteed[:SEARCHED]
-        optima = oracle.solve(x0, controller.rollout(x0).u, in_time)
+            x0 = x0[:SEARCHED]
+        optimum = oracle.solve(x0, controller.rollout(x0).u, in_time).cost.double()
     except OracleError:
-        return None
-    return ratio_of_means(guaranteed, optima.cost)
+        optimum = None
+    return Compared(value, guaranteed, optimum)

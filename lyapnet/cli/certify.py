@@ -7,6 +7,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,7 +95,7 @@ States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:u
 Seconds = Annotated[
     float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
 ]  # fmt: skip
-Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Threads.")]
+Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
@@ -192,6 +193,9 @@ def sound(
     refine: Annotated[
         int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
     ] = 0,
+    two_sided: Annotated[
+        bool, typer.Option("--two-sided", help="Bound the optimum from below, too: no control is cheaper.")
+    ] = False,
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
@@ -206,9 +210,12 @@ def sound(
         raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
+    if two_sided and (refine or keep is not None):
+        raise UsageError("Expected --two-sided or --keep or --refine, got two of them; these are about one side.")
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set, sound_certificate
     from lyapnet.certification.tables import proof_progress
+    from lyapnet.certification.two_sided_certificate import two_sided_certificate
 
     if states is not None:
         parse_set(states)
@@ -219,9 +226,10 @@ def sound(
         started = started or time.monotonic()
         found = given.of(path)
         controller = found.load()
+        made = two_sided_certificate if two_sided else partial(sound_certificate, keep=keep)
         with proof_progress(notes, "sound") as progress:
-            certificate = sound_certificate(
-                controller, alpha, delta, states, seconds, workers, keep, seed, progress, started=started
+            certificate = made(
+                controller, alpha, delta, states, seconds, workers, seed=seed, report=progress, started=started
             )
         _show(certificate, found, as_json)
         return certificate
@@ -278,7 +286,7 @@ def region(
 def check(
     proof: Annotated[Path, typer.Argument(help="The file of --keep.", metavar="PROOF")],
     given: Given,
-    workers: Annotated[int, typer.Option(min=1, help="Threads.")] = 1,
+    workers: Workers = 1,
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:

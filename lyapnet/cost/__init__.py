@@ -8,6 +8,7 @@ from lyapnet.cost.made_of_another import (
     PseudoHuberCost,
     TargetCost,
     innermost,
+    is_quadratic_about_target,
 )
 from lyapnet.cost.penalty import PenaltyCost
 from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
@@ -26,4 +27,5 @@ __all__ = [
     "TargetCost",
     "innermost",
     "is_quadratic",
+    "is_quadratic_about_target",
 ]

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lyapnet.cost.base import Cost
+from lyapnet.cost.quadratic import is_quadratic
 from lyapnet.types import ControlMatrix, PerState, State
 
 
@@ -73,6 +74,13 @@ class TargetCost(MadeOfAnother):
 
     def terminal_gradient(self, x: State) -> State:
         return self.cost.terminal_gradient(x - self.shift)
+
+
+def is_quadratic_about_target(cost: Cost) -> bool:
+    """Whether q and φ are quadratic forms of x − x*, by matrices alone, or of x."""
+    while type(cost) is TargetCost:
+        cost = cost.cost
+    return is_quadratic(cost)
 
 
 class PeriodicCost(MadeOfAnother):

@@ -240,11 +240,12 @@ def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) 
         )
         return function(*arguments, **keywords)
 
-    terms = vmap(vmap(call))(*(form.terms for form in forms))
+    counts = forms[0].terms.shape[:2]
+    terms = vmap(call)(*(form.terms.flatten(0, 1) for form in forms))
     radius = vmap(call)(*(form.radius for form in forms))
     if isinstance(terms, Tensor):
-        return forms[0].with_parts(terms, radius)
-    return [forms[0].with_parts(*pair) for pair in zip(terms, radius, strict=True)]
+        return forms[0].with_parts(terms.unflatten(0, counts), radius)
+    return [forms[0].with_parts(y.unflatten(0, counts), r) for y, r in zip(terms, radius, strict=True)]
 
 
 def _joining(function: Callable[..., Any]) -> Rule:

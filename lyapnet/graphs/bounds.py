@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.fx import Node
-from torch.utils._pytree import tree_map
+from torch.fx.node import map_arg
 
 from lyapnet.errors import LyapnetError, UsageError, one_line
 from lyapnet.graphs import taylor
@@ -83,7 +83,7 @@ class BoundedFunction:
             if node.op == "placeholder":
                 values[node] = next(inputs)
             elif node.op == "output":
-                results = tree_map(values.__getitem__, node.args[0], is_leaf=lambda leaf: isinstance(leaf, Node))
+                results: Any = map_arg(node.args[0], values.__getitem__)
                 return [y if isinstance(y, TaylorForm) else taylor.constant_form(y, box) for y in results]
             elif node not in values:
                 values[node] = _apply(node, values)
@@ -169,11 +169,7 @@ def _compares_as_it_is(node: Node, values: dict[Node, Any]) -> bool:
 
 
 def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
-    return tree_map(
-        lambda leaf: values[leaf] if isinstance(leaf, Node) else leaf,
-        (tuple(node.args), dict(node.kwargs)),
-        is_leaf=lambda leaf: isinstance(leaf, Node),
-    )
+    return map_arg(node.args, values.__getitem__), map_arg(node.kwargs, values.__getitem__)
 
 
 def _rows(form: TaylorForm, rows: int | slice) -> TaylorForm:

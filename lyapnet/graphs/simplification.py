@@ -1,5 +1,6 @@
 """Operator graphs made ready for bounds: the same function, written so that less is lost."""
 
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -15,10 +16,10 @@ COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view
 
 def without_copies(graph: Graph) -> Graph:
     """The graph without nodes that hand on what they get, and without what is then computed twice."""
-    constants: dict[str, Node] = {}
+    constants: dict[Any, Node] = {}
     for node in list(graph.nodes):
         if node.op == "get_attr":  # which CSE leaves apart
-            node.replace_all_uses_with(constants.setdefault(str(node.target), node))
+            node.replace_all_uses_with(constants.setdefault(_content(graph, node), node))
         elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
             node.replace_all_uses_with(node.args[0])
             graph.erase_node(node)
@@ -68,6 +69,15 @@ def _between(start: Node, end: Any) -> list[Node]:
         if node in above:
             above.update(node.all_input_nodes)
     return [node for node in nodes if node in below & above and node is not start]
+
+
+def _content(graph: Graph, node: Node) -> Any:
+    """What tells a constant apart: its numbers, to the last bit, or its name where it is no tensor of a module."""
+    value = attrgetter(str(node.target))(graph.owning_module) if graph.owning_module is not None else None
+    if not isinstance(value, Tensor):
+        return str(node.target)
+    numbers = value.detach().cpu().contiguous()
+    return numbers.dtype, tuple(numbers.shape), numbers.numpy().tobytes()
 
 
 def _shape(node: Any) -> Any:

@@ -12,7 +12,7 @@ number for each entry, instead of a new noise symbol for each operation.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations_with_replacement
 
 import torch
@@ -26,15 +26,17 @@ TINY = 1e-300
 
 @dataclass(frozen=True, eq=False)
 class TaylorForm:
-    """The set {c + Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k + η : |ε_k| ≤ 1, |η| ≤ r} for each box and entry.
+    """The set {c + Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k + Σ_{i≤j≤k} C_ijk ε_i ε_j ε_k + η : |ε_k| ≤ 1, |η| ≤ r} for each
+    box and entry.
 
     ε_1 … ε_d run over the box and are shared by all its forms; η is anything, another one in each form and entry. A
-    form of first degree has no B: what is of second order in the size of the box is in r. With B, r is of third order,
-    and what cancels in a sum of products (as V_xᵀf + q does against ¼ V_xᵀ g R⁻¹ gᵀ V_x) cancels in the bounds too.
-    With d = 0 forms are intervals, and what is computed with them is interval arithmetic.
+    form of first degree has no B and no C: what is of second order in the size of the box is in r. With B, r is of
+    third order, and with C of fourth; and what cancels in a sum of products (as V_xᵀf + q does against
+    ¼ V_xᵀ g R⁻¹ gᵀ V_x) cancels in the bounds too. With d = 0 forms are intervals, and what is computed with them is
+    interval arithmetic.
 
     Args:
-        terms: c, A_1, …, A_d and, in the order of `pairs`, B_jk; (1 + d or 1 + d + d(d + 1)/2, boxes, *shape).
+        terms: c, A, B and C in the order of `monomials`, as many as the degree asks for; (terms, boxes, *shape).
         radius: r ≥ 0, (boxes, *shape); infinite or nan where nothing is known.
         dimension: d.
     """
@@ -61,16 +63,21 @@ class TaylorForm:
     @property
     def products(self) -> Terms:
         """B, (d(d + 1)/2 or 0, boxes, *shape)."""
-        return self.terms[1 + self.dimension :]
+        return self.of_degree(2)
 
     @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """(j, k) of each B_jk; none in a form of first degree."""
-        return list(combinations_with_replacement(range(self.dimension), 2))[: len(self.products)]
+    def degree(self) -> int:
+        """That of the polynomial; an interval counts as one of first degree."""
+        return next(k for k in (1, 2, 3) if len(monomials(self.dimension, k)) == len(self.terms))
+
+    def of_degree(self, k: int) -> Terms:
+        """The terms of degree k."""
+        start = len(monomials(self.dimension, k - 1)) if k else 0
+        return self.terms[start : len(monomials(self.dimension, k))]
 
     @cached_property
     def spread(self) -> OnBoxes:
-        """Σ_k |A_k| + Σ_{j≤k} |B_jk|."""
+        """Σ |A| + Σ |B| + Σ |C|."""
         return _absolute_sum(self.terms[1:])
 
     @cached_property
@@ -86,14 +93,15 @@ class TaylorForm:
         return lower.where(known, -torch.inf), upper.where(known, torch.inf)
 
     def _reach(self, sign: int) -> OnBoxes:
-        """An upper bound of ±(Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k), which is exact where B is diagonal.
+        """An upper bound of ±(Σ A_k ε_k + Σ B_jk ε_j ε_k + Σ C_ijk ε_i ε_j ε_k), exact for a diagonal B without C.
 
-        With |ε_j ε_k| ≤ ½ (ε_j² + ε_k²) it splits into d parabolas A_k ε + m_k ε², m_k = ±B_kk + ½ Σ_{j≠k} |B_jk|.
+        With |ε_j ε_k| ≤ ½ (ε_j² + ε_k²) it splits into d parabolas A_k ε + m_k ε², m_k = ±B_kk + ½ Σ_{j≠k} |B_jk|, and
+        Σ |C|.
         """
         if not len(self.products):
             return self.spread
         m = torch.zeros_like(self.coefficients)
-        for (j, k), B in zip(self.pairs, self.products, strict=True):
+        for (j, k), B in zip(monomials(self.dimension, 2)[1 + self.dimension :], self.products, strict=True):
             if j == k:
                 m[k] += sign * B
             else:
@@ -101,7 +109,8 @@ class TaylorForm:
                 m[k] += B.abs() / 2
         A = self.coefficients.abs()
         inner = -2 * m > A  # the vertex lies within the box
-        return torch.where(inner, A**2 / torch.where(inner, -4 * m, 1.0), A + m).sum(0)
+        parabolas = torch.where(inner, A**2 / torch.where(inner, -4 * m, 1.0), A + m).sum(0)
+        return parabolas + _absolute_sum(self.of_degree(3)) if self.degree == 3 else parabolas
 
     @property
     def excess(self) -> OnBoxes:
@@ -125,19 +134,38 @@ class TaylorForm:
         return self.with_parts(terms, self.radius.reshape(*boxes, *ones, *self.shape))
 
 
+@cache
+def monomials(dimension: int, degree: int) -> list[tuple[int, ...]]:
+    """The axes of each monomial of ε_1 … ε_d up to a degree, by degree: (), (0,), …, (0, 0), (0, 1), …"""
+    return [axes for k in range(degree + 1) for axes in combinations_with_replacement(range(dimension), k)]
+
+
+@cache
+def _places(dimension: int, degree: int) -> list[tuple[int, Tensor]]:
+    """(i, where the products of monomial i with the first few of degree 1 and more stand), but for constants."""
+    every = monomials(dimension, degree)
+    number = {axes: k for k, axes in enumerate(every)}
+    places = []
+    for i, axes in enumerate(every):
+        if 0 < len(axes) < degree:
+            others = [other for other in every[1:] if len(axes) + len(other) <= degree]
+            places.append((i, torch.tensor([number[tuple(sorted(axes + other))] for other in others])))
+    return places
+
+
 def box_form(lower: Corners, upper: Corners, degree: int = 1) -> TaylorForm:
     """The boxes {lower ≤ y ≤ upper} themselves, one number an axis: y_k = middle_k + ½ width_k · ε_k.
 
     Args:
         lower, upper: in float64. An axis along which no box has a width has no ε.
-        degree: of this form and of all that are computed from it, 1 or 2.
+        degree: of this form and of all that are computed from it, 1, 2 or 3.
     """
     center, half = (lower + upper) / 2, (upper - lower) / 2
     wide = wide_axes(lower, upper)
     d = len(wide)
     coefficients = (half.T[..., None] * torch.eye(lower.shape[-1], dtype=half.dtype)[:, None])[wide]
-    products = center.new_zeros(d * (d + 1) // 2 if degree == 2 else 0, *center.shape)
-    return TaylorForm(torch.cat([center[None], coefficients, products]), torch.zeros_like(center), d).rounded(2)
+    higher = center.new_zeros(len(monomials(d, degree)) - 1 - d, *center.shape)
+    return TaylorForm(torch.cat([center[None], coefficients, higher]), torch.zeros_like(center), d).rounded(2)
 
 
 def wide_axes(lower: Corners, upper: Corners) -> Tensor:
@@ -207,27 +235,43 @@ def multiply(x: TaylorForm, y: TaylorForm) -> TaylorForm:
 
         xy = cc' + (cL' + c'L) + (cQ' + c'Q + LL') + (LQ' + QL' + QQ') + (c + L + Q)η' + (c' + L' + Q')η + ηη'.
 
-    The last four go into the remainder, by Σ|A| and Σ|B| of each. In forms of first degree LL' does as well: since
-    ε_k² ∈ [0, 1], it lies within ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k.
-    Intervals have the products of their ends.
+    The last four go into the remainder, by Σ|A| and Σ|B| of each; in forms of third degree LQ' + QL' does not, but what
+    C makes with all but constants. In forms of first degree LL' does as well: since ε_k² ∈ [0, 1], it lies within
+    ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k. Intervals have the products of their ends.
     """
     x, y = aligned(x, y)
     if not x.dimension:
         return interval_product(x, y)
-    (c, A, B, r), (d, E, F, s) = ((z.center, z.coefficients, z.products, z.radius) for z in (x, y))
-    remainder = (c.abs() + x.spread) * s + (d.abs() + y.spread) * r + r * s
+    remainder = (x.center.abs() + x.spread) * y.radius + (y.center.abs() + y.spread) * x.radius + x.radius * y.radius
     rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
-    pairs = list(combinations_with_replacement(range(x.dimension), 2))
-    LL = [A[j] * E[k] + (A[k] * E[j] if j != k else 0) for j, k in pairs]
-    if len(B):
-        terms = torch.cat([(c * d)[None], c * E + d * A, c * F + d * B + torch.stack(LL)])
-        L, M, Q, P = (_absolute_sum(z) for z in (A, E, B, F))
-        third = L * P + Q * M + Q * P
-        return x.with_parts(terms, third + remainder + rounding)
-    middle = sum((ll / 2 for (j, k), ll in zip(pairs, LL, strict=True) if j == k), torch.zeros_like(c * d))
-    around = sum((ll.abs() / (1 + (j == k)) for (j, k), ll in zip(pairs, LL, strict=True)), torch.zeros_like(r + s))
-    terms = torch.cat([(c * d + middle)[None], c * E + d * A])
-    return x.with_parts(terms, around + remainder + rounding)
+    if x.degree == 1:
+        terms, beyond = _linear_product(x, y)
+    else:
+        terms, beyond = _product(x, y)
+    return x.with_parts(terms, beyond + remainder + rounding)
+
+
+def _linear_product(x: TaylorForm, y: TaylorForm) -> tuple[Terms, OnBoxes]:
+    """(the terms, a bound of what LL' has beyond them) of forms of first degree."""
+    A, E = x.coefficients, y.coefficients
+    middle, around = torch.zeros_like(x.center * y.center), torch.zeros_like(x.radius * y.radius)
+    for j, k in combinations_with_replacement(range(x.dimension), 2):
+        if j == k:
+            middle, around = middle + A[k] * E[k] / 2, around + (A[k] * E[k]).abs() / 2
+        else:
+            around = around + (A[j] * E[k] + A[k] * E[j]).abs()
+    return torch.cat([(x.center * y.center + middle)[None], x.center * E + y.center * A]), around
+
+
+def _product(x: TaylorForm, y: TaylorForm) -> tuple[Terms, OnBoxes]:
+    """(the terms up to the degree of the forms, a bound of those beyond) of the product of two polynomials."""
+    terms = x.center * y.terms
+    terms[1:] += y.center * x.terms[1:]
+    for i, at in _places(x.dimension, x.degree):
+        terms.index_add_(0, at, x.terms[i] * y.terms[1 : 1 + len(at)])
+    sizes = [[_absolute_sum(z.of_degree(k)) for k in range(1, x.degree + 1)] for z in (x, y)]
+    beyond = [a * b for j, a in enumerate(sizes[0], 1) for k, b in enumerate(sizes[1], 1) if j + k > x.degree]
+    return terms, torch.stack(beyond).sum(0)
 
 
 def interval_product(x: TaylorForm, y: TaylorForm) -> TaylorForm:

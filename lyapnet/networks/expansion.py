@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.interpolation import Curve
+from lyapnet.interpolation import Curve, SmoothCurve
 from lyapnet.linear_algebra import apply
 from lyapnet.networks.base import Scaling
 from lyapnet.networks.fcn import FCN
@@ -17,7 +17,7 @@ FEW = 4  # states for which a narrower network is enough
 SINGULAR = 1e-6  # of the greatest curvature, below which there is no valley to follow
 ROUGHLY = 1e-6  # of a state's magnitude, below which it does not spread
 ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
-NODES = 65  # of the curves in time; an expansion with more of them keeps those that matter
+NODES = 65  # of the piecewise linear curves in time; an expansion with more of them keeps those that matter
 
 
 def standard_widths(n: int) -> list[int]:
@@ -42,12 +42,15 @@ class ExpansionNetwork(ValueFunction):
         scaling: of the task, for what starts without an expansion.
         hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
         constants: indices of the states that stay what they are.
+        smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear. Where
+            the expansion is φ at T, N is then multiplied by 1 − t/T, so that V(T, ·) = φ for any weights.
     """
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
     at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
     moves: Float[Tensor, " n"]  # 0 for a constant state, 1 for any other
+    ends: Float[Tensor, ""]  # 1 where the expansion is φ at T, else 0; of what is smooth in time
 
     def __init__(
         self,
@@ -55,6 +58,7 @@ class ExpansionNetwork(ValueFunction):
         hidden: Sequence[int] | None = None,
         activation: str = "tanh",
         constants: Sequence[int] = (),
+        smooth: bool = False,
     ):
         super().__init__()
         self.constants = list(constants)
@@ -69,12 +73,17 @@ class ExpansionNetwork(ValueFunction):
         self.register_buffer(
             "moves", torch.ones(n).index_fill(0, torch.tensor(self.constants, dtype=torch.long), 0.0), persistent=False
         )
-        self.expansion = Curve(torch.linspace(0, scaling.duration, NODES), torch.zeros(NODES, 1 + 2 * n + 2 * n * n))
+        T, parts = scaling.duration, 1 + 2 * n + 2 * n * n
+        nodes = torch.linspace(0, T, NODES)
+        self.expansion = SmoothCurve(T, [parts]) if smooth else Curve(nodes, torch.zeros(NODES, parts))
+        self.duration, self.smooth = T, smooth
+        if smooth:
+            self.register_buffer("ends", torch.tensor(0.0))
 
     def forward(self, t: Time, x: State) -> PerState:
         c, p, H, delta = self._around(t, x)
         xi = delta @ self.coordinates
-        rest = (1 - self.at_goal * self._near(xi)) * self.network(t, xi)
+        rest = self._share(t, self._near(xi)) * self.network(t, xi)
         return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * rest
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
@@ -83,10 +92,20 @@ class ExpansionNetwork(ValueFunction):
         xi = delta @ self.coordinates
         N, N_xi = self.network.value_and_state_gradient(t, xi)
         near, curved = self._near(xi), apply(H, delta)
-        share = 1 - self.at_goal * near
+        share = self._share(t, near)
         value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
-        rest_xi = share[..., None] * N_xi + (2 * self.at_goal * near**2 * N)[..., None] * self._moving(xi)
+        rest_xi = share[..., None] * N_xi + (self._share_slope(t, near) * N)[..., None] * self._moving(xi)
         return value, p + curved + self.scale * (rest_xi @ self.coordinates.mT)
+
+    def _share(self, t: Time, near: PerState) -> PerState:
+        """ρ, of which nothing is left at T where the expansion is φ there."""
+        share = 1 - self.at_goal * near
+        return share * (1 - self.ends * t / self.duration) if self.smooth else share
+
+    def _share_slope(self, t: Time, near: PerState) -> PerState:
+        """∂ρ/∂ξ_y, over ξ_y."""
+        slope = 2 * self.at_goal * near**2
+        return slope * (1 - self.ends * t / self.duration) if self.smooth else slope
 
     def _near(self, xi: State) -> PerState:
         """1 / (1 + ‖ξ_y‖²)."""
@@ -106,6 +125,15 @@ class ExpansionNetwork(ValueFunction):
         H = parts[..., 1 + 2 * n : 1 + 2 * n + n * n].unflatten(-1, (n, n))
         return parts[..., 0], parts[..., 1 : 1 + n], H, x - parts[..., 1 + n : 1 + 2 * n]
 
+    def _take_curves(self, t: Tensor, parts: Tensor, exact_end: bool = False) -> None:
+        """Curves through the nodes; with H symmetric to the last bit, as V_x wants it, where they are fitted."""
+        self.expansion.take(t, parts)
+        if isinstance(self.expansion, SmoothCurve):
+            self.ends.fill_(float(exact_end))
+            for fitted in (self.expansion.end, self.expansion.weights):
+                H = fitted[..., 1 + 2 * self.n :].unflatten(-1, (2, self.n, self.n))
+                H.copy_((H + H.mT) / 2)
+
     @torch.no_grad()
     def take_nothing(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
         """Start a new network from V = 0, with what is known of its size: N is in units of a spread around a centre.
@@ -121,7 +149,7 @@ class ExpansionNetwork(ValueFunction):
         """
         none = torch.zeros(len(t), 1 + self.n).to(centre)
         parts = [none, centre.expand(len(t), -1), torch.zeros_like(curvature).flatten(1), curvature.flatten(1)]
-        self.expansion.take(t, torch.cat(parts, 1))
+        self._take_curves(t, torch.cat(parts, 1))
         self.at_goal.fill_(0)
         self.scale.fill_(value)
         magnitude = 1 / self.coordinates.diagonal()
@@ -129,16 +157,25 @@ class ExpansionNetwork(ValueFunction):
 
     @torch.no_grad()
     def take(
-        self, t: Tensor, x: Tensor, value: Tensor, gradient: Tensor, hessian: Tensor, curvature: Tensor, spread: Tensor
+        self,
+        t: Tensor,
+        x: Tensor,
+        value: Tensor,
+        gradient: Tensor,
+        hessian: Tensor,
+        curvature: Tensor,
+        spread: Tensor,
+        exact_end: bool = False,
     ) -> None:
         """Start from an expansion at the nodes t (K,), whose parts are (K, …), for deviations δ of some spread.
 
         Args:
+            exact_end: whether it is φ at the last node, at any x.
             curvature: what stands for H in control laws, (K, n, n), symmetric positive semidefinite.
             spread: deviations δ from x̄(0), (k, n): their mean ½ δᵀHδ is s, times the number of states.
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
-        self.expansion.take(t, torch.cat(parts, 1))
+        self._take_curves(t, torch.cat(parts, 1), exact_end)
         y, p = [i for i in range(self.n) if i not in self.constants], self.constants
         early = slice(max(1, 3 * len(curvature) // 4))
         values, vectors = torch.linalg.eigh(curvature[early][:, y][..., y].mean(0) / 2)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.cost import is_quadratic_about_target
 from lyapnet.expansions import (
     TRIES,
     Expansion,
@@ -252,7 +253,7 @@ def take(network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept
     expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
     curvature = _curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
-    network.take(*(part.to(network.scale) for part in parts))
+    network.take(*(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost))
 
 
 def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, kept: list[int]) -> None:

@@ -289,8 +289,10 @@ def test_what_is_no_claim_is_refused():
         region_claim(loop_of(stationary(riccati()), problem()), problem(), -1.0, D)
     with pytest.raises(UsageError, match=r"Expected a set around X₀"):
         claimed(states=Box([-0.1, -4.0], [3.0, 4.0]))
+    beside = Box([0.2, -0.2], [0.3, 0.2]).double()
+    away = Problem(problem().system, problem().cost, problem().controls, beside, problem().horizon)
     with pytest.raises(UsageError, match=r"Expected a set around the goal, got \[0\.1, 3\] around 0 at index 0"):
-        claimed(states=Box([0.1, -4.0], [3.0, 4.0]))
+        claimed(about=away, states=Box([0.1, -4.0], [3.0, 4.0]))
 
 
 @pytest.fixture(scope="module")

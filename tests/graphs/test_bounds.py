@@ -31,6 +31,11 @@ def violations(bounded, function, lower, upper):
     return count
 
 
+WITH_REMAINDERS = [
+    (name, degree) for name in SMOOTH for degree in (1, 3) if degree == 1 or name not in ("power", "sin")
+]
+
+
 def several(function):
     return lambda t, x: (function(t, x),)
 
@@ -42,7 +47,7 @@ def unit():
     return tuple(side.double() for side in UNIT)
 
 
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_values_lie_within_bounds(name, degree):
     function = several(FUNCTIONS[name])
@@ -53,17 +58,22 @@ def test_values_lie_within_bounds(name, degree):
     assert all(torch.stack(pair).isfinite().all() for pair in bounded.bounds(*box(0.1)))
 
 
-@pytest.mark.parametrize("name", SMOOTH)
-def test_functions_without_their_remainder_are_caught(name, monkeypatch):
+@pytest.mark.parametrize(
+    ("name", "degree"),
+    [*((name, 1) for name in SMOOTH), *((name, 3) for name in SMOOTH if name not in ("power", "sin"))],
+)
+def test_functions_without_their_remainder_are_caught(name, degree, monkeypatch):
+    """In third degree a power has none, as it is multiplied out, and that of sin is less than what Σ|C| has in hand."""
     monkeypatch.setattr(functions, "linearised", without_remainder(functions.linearised))
     function = several(FUNCTIONS[name])
-    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
+    assert violations(BoundedFunction(function, unit(), degree), function, *box(0.5 * degree)) > 0
 
 
-def test_products_without_their_remainder_are_caught(monkeypatch):
+@pytest.mark.parametrize("degree", [1, 3])
+def test_products_without_their_remainder_are_caught(degree, monkeypatch):
     monkeypatch.setattr(taylor, "multiply", without_remainder(taylor.multiply))
-    function = several(FUNCTIONS["product"])
-    assert violations(BoundedFunction(function, unit(), degree=1), function, *box(0.5)) > 0
+    function = several(lambda t, x: FUNCTIONS["product"](t, x) ** 2)
+    assert violations(BoundedFunction(function, unit(), degree), function, *box(0.5)) > 0
 
 
 @pytest.mark.parametrize("name", ["exp", "sigmoid", "sin", "cos", "sqrt", "log1p", "reciprocal", "square", "softplus"])
@@ -90,43 +100,59 @@ EXPANDED = {
 }  # fmt: skip
 
 
-def distances_from_parabolas(name, width):
-    """(of f from c + A ε + B ε² on [l, l + width], (points, l); r) for many l."""
+def distances_from_polynomials(name, width, degree):
+    """(of f from c + A ε + B ε² + C ε³ on [l, l + width], (points, l); r) for many l."""
     lower = torch.linspace(0.3, 4, 200)[:, None]
     if name in ("sigmoid", "softplus", "sin", "cos", "exp"):
         lower = 2 * lower - 5
-    form = getattr(functions, name)(taylor.box_form(lower, lower + width, degree=2))
+    form = getattr(functions, name)(taylor.box_form(lower, lower + width, degree))
     y = torch.linspace(-1, 1, 2001)[:, None]
     value = EXPANDED[name](lower[:, 0] + width / 2 * (y + 1))
-    parabola = form.center[:, 0] + form.coefficients[0, :, 0] * y + form.products[0, :, 0] * y**2
-    return (value - parabola).abs(), form.radius[:, 0]
+    polynomial = sum(form.terms[k, :, 0] * y**k for k in range(degree + 1))
+    return (value - polynomial).abs(), form.radius[:, 0]
 
 
+@pytest.mark.parametrize("degree", [2, 3])
 @pytest.mark.parametrize("width", [2.5, 0.5, 1e-2, 1e-5])
 @pytest.mark.parametrize("name", EXPANDED)
-def test_functions_lie_within_their_parabolas(name, width):
-    distance, radius = distances_from_parabolas(name, width)
+def test_functions_lie_within_their_polynomials(name, width, degree):
+    distance, radius = distances_from_polynomials(name, width, degree)
     assert (distance <= radius).all()
 
 
+@pytest.mark.parametrize("degree", [2, 3])
 @pytest.mark.parametrize("name", EXPANDED)
-def test_remainders_of_second_degree_are_of_third_order_and_not_idle(name):
-    """At least a half of them is needed somewhere; eight times less on half the width."""
-    distance, radius = distances_from_parabolas(name, 0.1)
-    _, smaller = distances_from_parabolas(name, 0.05)
-    assert (distance.amax(0) / radius).median() > 0.5
-    assert math.log2(radius.median() / smaller.median()) == pytest.approx(3, abs=0.3)
+def test_remainders_are_of_the_next_order_and_not_idle(name, degree):
+    """At least a third of them is needed somewhere; eight or sixteen times less on half the width."""
+    distance, radius = distances_from_polynomials(name, 0.1, degree)
+    _, smaller = distances_from_polynomials(name, 0.05, degree)
+    assert (distance.amax(0) / radius).median() > 1 / 3
+    assert math.log2(radius.median() / smaller.median()) == pytest.approx(degree + 1, abs=0.3 * (degree - 1))
 
 
 def test_a_product_of_second_degree_is_exact_up_to_third_order():
     """(ε₁ + ε₁ε₂)(ε₂ + ε₂²) over a box of points: no cancellation is lost below third order."""
     x, y = (taylor.box_form(*(torch.full((1, 2), side) for side in (-0.1, 0.1)), degree=2) for _ in range(2))
     product = taylor.multiply(x, y)
-    assert product.pairs == [(0, 0), (0, 1), (1, 1)]
+    assert taylor.monomials(2, 2)[3:] == [(0, 0), (0, 1), (1, 1)]
     torch.testing.assert_close(product.products[:, 0], torch.tensor([[0.01, 0.0], [0.0, 0.0], [0.0, 0.01]]))
     assert float(product.radius.max()) < 1e-15
     curved = taylor.multiply(product, taylor.add(x, product))
     assert 0 < float(curved.radius.max()) < 3 * 0.1**3
+
+
+def test_a_product_of_third_degree_is_exact_up_to_fourth_order():
+    """(1 + ε₁)(1 + ε₂)(1 + ε₁ + ε₂), multiplied out; no cancellation is lost below fourth order."""
+    box = taylor.box_form(torch.zeros(1, 2), torch.full((1, 2), 2.0), degree=3)  # 1 + ε
+    x, y = (box.with_parts(box.terms[..., k], box.radius[..., k]) for k in range(2))
+    both = taylor.shift(taylor.add(x, y), torch.tensor(-1.0))
+    product = taylor.multiply(taylor.multiply(x, y), both)
+    names = {(): 1.0, (0,): 2.0, (1,): 2.0, (0, 0): 1.0, (0, 1): 3.0, (1, 1): 1.0, (0, 0, 1): 1.0, (0, 1, 1): 1.0}
+    expected = torch.tensor([names.get(axes, 0.0) for axes in taylor.monomials(2, 3)])
+    torch.testing.assert_close(product.terms[:, 0], expected)
+    assert float(product.radius.max()) < 1e-12
+    fourth = taylor.multiply(product, both)
+    assert 0 < float(fourth.radius.max()) <= 4 + 1e-9  # Σ|C| times Σ|A|
 
 
 def test_bounds_of_a_parabola_know_its_vertex():

@@ -1,0 +1,198 @@
+"""The optimum from below: V that rises no faster than any control can pay for proves what no control goes below."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lyapnet.calculus import drift_lie_derivative, gradients, input_lie_derivative
+from lyapnet.certification.branch_and_bound import Budget, just_above, minimum
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.counterexamples import Counterexample
+from lyapnet.certification.funnel import for_levels, proof_within, setting_of
+from lyapnet.certification.preconditions import at_time
+from lyapnet.certification.proof import Progress
+from lyapnet.certification.verdict import Verdict, verdict_on
+from lyapnet.contracts import copied
+from lyapnet.cost import Cost, is_quadratic_about_target
+from lyapnet.errors import UsageError
+from lyapnet.linear_algebra import apply, solve
+from lyapnet.problem import Problem
+from lyapnet.rollout.closed_loop import ClosedLoop
+from lyapnet.sets import Box, ControlSet
+from lyapnet.types import Control, PerState, Points, State, Time
+
+FINE = 5e-5  # of the level: how close the excess at T is bounded
+DEGREE = 3  # of the forms: what cancels between V_t and the Hamiltonian is of third order, t·x²
+
+
+@dataclass(frozen=True)
+class LowerClaim:
+    """With W(t, x) = β V(t, x) − δ(T − t) and 0 < β ≤ 1: at every (t, x) in [0, T] × D with W ≤ c, in continuous time,
+
+        β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)] ≥ −δ,
+
+    and W(T, x) ≤ φ(x) + e for all x ∈ D. Then m = min(W, c) rises along any trajectory in D, under any control, by no
+    more than ∫ℓ: where W < c by the condition, where W ≥ c since m is constant and ℓ ≥ 0. Hence
+
+        J(x₀) = ∫ℓ dt + φ(x(T)) ≥ min(β V(0, x₀) − δT, c) − e
+
+    for every control that keeps the state in D. Where also W > c on the boundary of D and φ ≥ c outside of D, m goes on
+    as c outside, and it is so for every control (`everywhere`); that is looked at where q and φ are quadratic forms
+    about a target in D, so that φ rises along each ray from it. Outside of D, ℓ ≥ 0 is what a cost has to be.
+
+    State constraints only make the optimum dearer. States that nothing depends on are left out, and D is all of ℝ along
+    them; the parameters of a family stay what they are.
+
+    Source: the verification theorem of Bellman's equation for subsolutions, e.g. Bardi, Capuzzo-Dolcetta, Optimal
+    Control and Viscosity Solutions of Hamilton-Jacobi-Bellman Equations, 1997, § III.3.
+    """
+
+    beta: float
+    delta: float  # in cost per second
+    duration: float  # T in s
+    states: Box  # D
+    level: float  # c: the largest one proved, as far as X₀ needs; −∞ where there is none
+    wanted: float  # max W(0, ·) on X₀, or up to 0.1 % more
+    excess: float  # e ≥ 0; an upper bound
+    everywhere: bool  # whether it is so for every control, not only for those that keep the state in D
+    counterexample: Counterexample | None
+    boxes: int
+    seconds: float
+    remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above c
+    undecided: Points
+    left_out: list[int]
+    fingerprint: str
+
+    @property
+    def verdict(self) -> Verdict:
+        """On the claim that c does for all of X₀."""
+        found = self.counterexample
+        return verdict_on(self.level, self.wanted, None if found is None else found.height, self.wanted)
+
+    def least_cost(self, value: PerState) -> PerState:
+        """The bound of the optimum from V(0, x₀), (*batch,); −∞ where nothing is proved."""
+        return (self.beta * value - self.delta * self.duration).clamp(max=self.level) - self.excess
+
+
+class RiseCondition(DecreaseCondition):
+    """c(t, x) = −(β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)]) − δ; W rises no faster than ℓ where c ≤ 0.
+
+    The third part is minus the least pivot of R(x), so that R is proved positive definite where c is proved: without
+    that the minimum is none.
+    """
+
+    def __init__(self, closed_loop: ClosedLoop, beta: float, delta: float, problem: Problem):
+        super().__init__(closed_loop, beta, delta)
+        cost, limits = closed_loop.cost, problem.controls.limits
+        if any(getattr(getattr(cost, name), "__func__", None) is not getattr(Cost, name) for name in OF_EVERY_COST):
+            raise UsageError(
+                f"Expected ℓ = q + (u − u*)ᵀR(u − u*), got {type(cost).__name__} with another running or control; "
+                "leave them as they are, and put what there is of x into state."
+            )
+        if limits is None or (problem.controls.limited and not all(bool(side.isfinite().all()) for side in limits)):
+            raise UsageError(
+                "Expected controls without limits, or with a lower and an upper one each, for a bound from below, got "
+                f"{type(problem.controls).__name__}{'' if limits is None else ' with ∓∞'}; give both limits."
+            )
+        self.duration, self.controls = problem.horizon.duration, problem.controls
+
+    def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
+        loop, (V_t, V_x) = self.closed_loop, gradients(self.V, t, x)
+        rise = self.alpha * (V_t + drift_lie_derivative(loop.system, x, V_x)) + loop.cost.state(x)
+        b = self.alpha * input_lie_derivative(loop.system, x, V_x)
+        R = loop.cost.R(x)
+        R = (R + R.mT) / 2
+        least = least_over_controls(R, b, loop.cost.rest, self.controls)
+        return -(rise + least) - self.delta, self.height(t, x), -least_pivot(R)
+
+    def height(self, t: Time, x: State) -> PerState:
+        """W(t, x) = β V(t, x) − δ(T − t)."""
+        return self.alpha * self.V(t, x) - self.delta * (self.duration - t)
+
+
+OF_EVERY_COST = ("running", "control")
+
+
+def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: ControlSet) -> PerState:
+    """min over u ∈ U of h(u) = (u − u*)ᵀR(u − u*) + bᵀu for symmetric positive definite R, or less.
+
+    Without limits it is bᵀu* − ¼ bᵀR⁻¹b. With them, h lies above its tangent at any û, the one of the control law here:
+
+        h(u) ≥ h(û) + Σ_i min over lower_i ≤ u_i ≤ upper_i of h_i (u_i − û_i),   h_i = (2R(û − u*) + b)_i,
+
+    which is h(û) where û is the minimiser, and a lower bound whatever it is.
+    """
+    u0 = b.new_zeros(()) if rest is None else rest.to(b)
+    if not controls.limited:
+        return (b * u0).sum(-1) - (b * solve(R, b[..., None])[..., 0]).sum(-1) / 4
+    assert controls.limits is not None
+    lower, upper = controls.limits
+    u = controls.minimise(R, b - 2 * apply(R, u0.expand(b.shape)))
+    slope = 2 * apply(R, u - u0) + b
+    beyond = torch.minimum(slope * (lower - u), slope * (upper - u)).sum(-1)
+    return ((u - u0) * apply(R, u - u0)).sum(-1) + (b * u).sum(-1) + beyond
+
+
+def least_pivot(R: Tensor) -> PerState:
+    """The least pivot of symmetric R (*batch, m, m) in Gauss's elimination; R is positive definite where it is > 0."""
+    least = R[..., 0, 0]
+    for _ in range(R.shape[-1] - 1):
+        R = R[..., 1:, 1:] - R[..., 1:, :1] * R[..., :1, 1:] / R[..., :1, :1]
+        least = torch.minimum(least, R[..., 0, 0])
+    return least
+
+
+def lower_claim(
+    closed_loop: ClosedLoop,
+    problem: Problem,
+    beta: float = 0.95,
+    delta: float = 1e-2,
+    states: Box | None = None,
+    budget: Budget | None = None,
+    generator: torch.Generator | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> LowerClaim:
+    """The bound of the optimum from below that V proves within a budget, for as much of X₀ as it can.
+
+    Args:
+        closed_loop: whose V, system and cost are meant; its control law takes no part.
+        problem: whose X₀, U, T and goal are meant.
+        states: D; by default a box around where samples of W are low enough.
+        report: of prove.
+
+    Raises:
+        UsageError: β, δ or D do not fit, ℓ is not quadratic in u, or V, f, g, q or R have an operator without a rule.
+        Interrupted: Ctrl-C or SIGTERM.
+    """
+    started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
+    condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, delta, problem)
+    cost, duration, levels = condition.closed_loop.cost, condition.duration, for_levels(budget)
+    left_out, _, wanted, D, domain, sides = setting_of(condition, problem, duration, states, levels)
+    needed = just_above(wanted)
+    end = at_time(duration, D.lower, D.upper)
+    unit = max(abs(wanted), 1e-12)
+    excess = -minimum(
+        lambda t, x: cost.terminal(x) - beta * condition.V(t, x), *end, levels, unit=unit, tolerance=FINE, enough=0.0
+    )
+    everywhere = False
+    if rises_along_rays(cost, problem.goal.double(), D, left_out):
+        outside = minimum(lambda t, x: cost.terminal(x), *sides, levels, enough=just_above(needed))
+        rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
+        everywhere = min(outside, rim) >= needed
+    proof = proof_within(condition, domain, needed, budget, generator=generator, report=report, degree=DEGREE)
+    level = wanted if proof.level >= needed else proof.level
+    return LowerClaim(
+        beta, delta, duration, D, level, wanted, max(0.0, excess), everywhere, proof.counterexample, proof.boxes,
+        time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint,
+    )  # fmt: skip
+
+
+def rises_along_rays(cost: Cost, goal: State, states: Box, left_out: list[int]) -> bool:
+    """Whether φ is known to rise along each ray from a target in D: a quadratic form, about it, does."""
+    inside = ((states.lower < goal) & (goal < states.upper)).index_fill(
+        0, torch.tensor(left_out, dtype=torch.long), True
+    )
+    return is_quadratic_about_target(cost) and bool(inside.all())

@@ -1,0 +1,65 @@
+"""Processes that bound boxes side by side: threads of one process wait for each other."""
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.certification.boxes import Boxes
+from lyapnet.errors import UsageError
+
+Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
+
+_own: list[Any] = []  # of a worker: the question that it was begun with
+
+
+@contextmanager
+def bounding(question: Any, workers: int) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
+    """A `map` of question.undecided over chunks of boxes, by so many processes, copies of this one.
+
+    They see the question as it was at the beginning, and its `level` as it is. One worker is this process itself, and
+    so it is where processes cannot be copied.
+
+    Raises:
+        UsageError: a worker was killed, of too little memory perhaps.
+    """
+    if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
+        yield map
+        return
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
+        try:
+            yield partial(_shared_out, pool, question)
+        except BrokenProcessPool as error:
+            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+
+
+def _shared_out(
+    pool: ProcessPoolExecutor, question: Any, _: Bounding, chunks: Iterable[Boxes]
+) -> Iterator[tuple[Boxes, Tensor]]:
+    asked = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
+    for *parts, axis in pool.map(_undecided, asked):
+        yield Boxes(*map(torch.from_numpy, parts)), torch.from_numpy(axis)
+
+
+def _begin(question: Any) -> None:
+    """Become a worker: one thread, and nothing to do with signals, which are for the process that asks."""
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    _own[:] = [question]
+
+
+def _undecided(asked: tuple[Any, ...]) -> tuple[Any, ...]:
+    """What is undecided of boxes, as arrays."""
+    (question,), (level, *parts) = _own, asked
+    question.level = level
+    boxes, axis = question.undecided(Boxes(*map(torch.from_numpy, parts)))
+    return (*(part.numpy() for part in boxes), axis.numpy())

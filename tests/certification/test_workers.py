@@ -1,0 +1,68 @@
+"""Workers: the proof of one process, and one line where they are killed."""
+
+import os
+import signal
+import threading
+
+import pytest
+import torch
+
+from lyapnet.certification import Budget, DecreaseCondition, prove
+from lyapnet.certification.boxes import Boxes, single
+from lyapnet.certification.branch_and_bound import Question
+from lyapnet.certification.workers import bounding
+from lyapnet.errors import UsageError
+from tests.certification.planted import domain, loop, riccati
+
+
+class InHalves(Question):
+    """Cut whatever has a width above the level across its widest axis; a box further right is for the one who asks."""
+
+    level = 0.3
+
+    def undecided(self, boxes):
+        widths = boxes.upper - boxes.lower
+        chosen = widths.amax(-1) > self.level
+        boxes = boxes._replace(key=torch.full_like(boxes.key, float(os.getpid())))
+        return boxes[chosen], widths[chosen].argmax(-1)
+
+
+def chunks():
+    box = single(torch.zeros(2), torch.ones(2))
+    return [box, box.joined(box), Boxes(*(part[:0] for part in box))]
+
+
+def test_workers_are_other_processes_that_see_the_level_as_it_is():
+    question = InHalves()
+    with bounding(question, 2) as run:
+        (one, axes), (two, _), (none, _) = run(question.undecided, chunks())
+        assert [len(boxes.key) for boxes in (one, two, none)] == [1, 2, 0]
+        assert axes.tolist() == [0]
+        assert float(one.key) != os.getpid()
+        question.level = 2.0
+        assert [len(boxes.key) for boxes, _ in run(question.undecided, chunks())] == [0, 0, 0]
+    with bounding(question, 1) as run:
+        assert run is map
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_proof_is_the_same_with_workers(workers):
+    proof = prove(DecreaseCondition(loop(riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, chunk=64, workers=workers))
+    assert proof.verdict == "certified"
+    assert proof.remaining_volume == 0
+
+
+def test_a_violation_is_found_with_workers():
+    proof = prove(DecreaseCondition(loop(0.5 * riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, workers=2))
+    assert proof.verdict == "falsified"
+
+
+def test_a_worker_that_is_killed_is_one_line():
+    class Killed(InHalves):
+        def undecided(self, boxes):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    question = Killed()
+    with pytest.raises(UsageError, match="Expected workers that live on, got one killed"), bounding(question, 2) as run:
+        list(run(question.undecided, chunks()))
+    assert threading.active_count() < 20

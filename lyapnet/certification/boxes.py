@@ -25,6 +25,10 @@ class Boxes(NamedTuple):
         """Both."""
         return Boxes(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
 
+    def to(self, device: torch.device) -> "Boxes":
+        """The boxes on a device."""
+        return Boxes(*(part.to(device) for part in self))
+
     @property
     def center(self) -> Corners:
         """The middle of each."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import Boxes, CutTree, roots, single
 from lyapnet.certification.stopping import Stop
-from lyapnet.errors import UsageError
+from lyapnet.errors import UsageError, one_line
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import TaylorForm, wide_axes
 from lyapnet.types import Corner, Corners, PerBox, Value
@@ -30,6 +30,7 @@ class Budget:
         chunk: boxes that are bounded at once by each worker.
         frontier: undecided boxes that are kept; beyond, those of highest key are given up.
         workers: processes.
+        device: where the boxes of a proof are bounded, "cpu" or "cuda"; on a GPU in chunks that fill it, by one process.
     """
 
     seconds: float = 60.0
@@ -37,6 +38,7 @@ class Budget:
     chunk: int = 512
     frontier: int = 1_000_000
     workers: int = 1
+    device: str = "cpu"
     started: float = field(default_factory=time.monotonic)
     stop: Stop = field(default_factory=Stop)  # asked by the user
 
@@ -45,6 +47,13 @@ class Budget:
             raise UsageError(
                 f"Expected chunk, frontier and workers ≥ 1, got {self.chunk}, {self.frontier} and {self.workers}."
             )
+        if self.device != "cpu":
+            _require_device(self.device, self.workers)
+
+    @property
+    def at_once(self) -> int:
+        """How many boxes are bounded at once."""
+        return self.chunk if self.device == "cpu" else max(self.chunk, ON_DEVICE)
 
     @property
     def elapsed(self) -> float:
@@ -61,6 +70,19 @@ class Budget:
         return max(0.0, self.seconds - self.elapsed)
 
 
+def _require_device(device: str, workers: int) -> None:
+    """Refuse a device that is not there, or that several processes would share."""
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(
+            f"Expected a device that torch has, cpu or cuda, got {device!r}: {one_line(error)}."
+        ) from error
+    if workers > 1:
+        raise UsageError(f"Expected one worker on {device}, got {workers}; leave --workers out.")
+
+
+ON_DEVICE = 65_536  # boxes that fill a GPU
 MARGIN = 1e-9
 """How far "just below" and "just above" are, relative to the number itself.
 
@@ -125,9 +147,9 @@ class Search:
         """
         budget.stop.searching = True
         while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):
-            lowest, rest = self.frontier.first(budget.chunk * budget.workers)
+            lowest, rest = self.frontier.first(budget.at_once * budget.workers)
             self.boxes += len(lowest.key)
-            for undecided, axis in run(question.undecided, lowest.split(budget.chunk)):
+            for undecided, axis in run(question.undecided, lowest.split(budget.at_once)):
                 question.look_at(undecided)
                 rest = rest.joined(self.tree.cut(undecided, axis))
             self.frontier, beyond = rest[rest.key <= question.highest].first(budget.frontier)

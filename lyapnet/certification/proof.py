@@ -52,6 +52,7 @@ class Progress(NamedTuple):
     seconds: float
 
 
+CPU = torch.device("cpu")
 BELOW = 1e-2  # of a counterexample's W: how far under it the level goes on, or ever smaller boxes would follow its edge
 KEEP_EVERY = 30.0  # seconds
 KEPT = 1000  # undecided boxes whose centres a proof names
@@ -90,7 +91,7 @@ def prove(
     budget = budget or Budget()
     lower, upper = (side.double() for side in domain)
     bounded = bounded_condition(condition, (lower, upper), degree)
-    question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample)
+    question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample, torch.device(budget.device))
     kept = None if keep is None else KeptProof(keep, about(bounded, condition, lower, upper), wanted)
     if kept is not None and replay:
         begun, kept = kept.claim((lower, upper)), None
@@ -127,16 +128,25 @@ class WhereItHolds(Question):
     bounded: BoundedFunction  # of (c, W, Ẇ)
     level: float  # it can only fall
     stop_at_counterexample: bool
+    device: torch.device = CPU  # on which boxes are bounded
     worst: Counterexample | None = None
 
+    def __post_init__(self) -> None:
+        self.there = self.bounded.on(self.device)
+
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        c, W, rise, *h = self.bounded.forms(boxes.lower, boxes.upper)
+        with self.device:
+            boxes, axis = self._undecided(boxes.to(self.device))
+        return boxes.to(CPU), axis.to(CPU)
+
+    def _undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        c, W, rise, *h = self.there.forms(boxes.lower, boxes.upper)
         (_, c_high), (W_low, _), (_, rise_high) = c.interval(), W.interval(), rise.interval()
         boxes = boxes._replace(key=torch.maximum(W_low, boxes.key))
         chosen = ~((c_high <= 0) & (rise_high <= 0)) & (boxes.key <= self.level)
         for constraints in h:
             chosen &= ~(constraints.interval()[0] > 0).any(-1)
-        return boxes[chosen], axis_to_cut(self.bounded, c, boxes, chosen)
+        return boxes[chosen], axis_to_cut(self.there, c, boxes, chosen)
 
     def look_at(self, boxes: Boxes) -> None:
         if len(boxes.key):  # code of others need not know batches of none

@@ -144,6 +144,7 @@ def region_certificate(
     set: str | None = None,
     seconds: float = 60.0,
     workers: int = 1,
+    device: str = "cpu",
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
     *,
@@ -158,10 +159,10 @@ def region_certificate(
         report: is told how far the proof is.
         started: time.monotonic() from which the seconds count; now if None.
     """
-    budget = Budget(seconds, workers=workers, started=time.monotonic() if started is None else started)
+    budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
     claim = region_claim(
         controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
         stream(seed, CERTIFICATION), report,
     )  # fmt: skip
-    options = {"decay": decay, "set": set, "seconds": seconds, "workers": workers, "seed": seed}
+    options = {"decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device, "seed": seed}
     return RegionCertificate(controller, claim, options)

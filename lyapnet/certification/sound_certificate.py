@@ -148,6 +148,7 @@ def sound_certificate(
     set: str | None = None,
     seconds: float = 60.0,
     workers: int = 1,
+    device: str = "cpu",
     keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
@@ -161,18 +162,19 @@ def sound_certificate(
         delta: slack in cost per second; default_delta if None.
         set: D, as parse_set reads it; found if None.
         seconds: when to stop undecided, set-up and what follows the proof included.
+        workers, device: of Budget.
         keep: a file in which an unfinished proof is kept.
         report: is told how far the proof is.
         started: time.monotonic() from which the seconds count; now if None.
     """
-    budget = Budget(seconds, workers=workers, started=time.monotonic() if started is None else started)
+    budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
     claim = sound_claim(
         controller.closed_loop, controller.problem, alpha,
         default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
         budget, stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
     )  # fmt: skip
     options = {
-        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "keep": keep, "seed": seed,
+        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device, "keep": keep, "seed": seed,
     }  # fmt: skip
     return SoundCertificate(controller, claim, options)
 

@@ -150,6 +150,7 @@ def two_sided_certificate(
     set: str | None = None,
     seconds: float = 60.0,
     workers: int = 1,
+    device: str = "cpu",
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
     *,
@@ -161,20 +162,20 @@ def two_sided_certificate(
         alpha: the share of ℓ that V pays for from above, and β, the share of V that is the bound from below.
         delta: slack of both in cost per second; default_delta if None.
         set: D of both; each found if None.
-        seconds, workers, seed, report, started: as of sound_certificate; each side has about half of the seconds.
+        seconds, workers, device, seed, report, started: as of sound_certificate; each side has about half of the seconds.
     """
     begun = time.monotonic() if started is None else started
     states = None if set is None else parse_set(set)
     slack = default_delta(controller) if delta is None else delta
     loop, problem = controller.closed_loop, controller.problem
     upper = sound_claim(
-        loop, problem, alpha, slack, states, Budget(FOR_UPPER * seconds, workers=workers, started=begun),
+        loop, problem, alpha, slack, states, Budget(FOR_UPPER * seconds, workers=workers, device=device, started=begun),
         stream(seed, CERTIFICATION), report, degree=DEGREE,
     )  # fmt: skip
-    budget = Budget(seconds, workers=workers, started=begun)
+    budget = Budget(seconds, workers=workers, device=device, started=begun)
     lower = lower_claim(loop, problem, alpha, slack, states, budget, stream(seed, CERTIFICATION), report)
     options = {
-        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "two-sided": True,
+        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device, "two-sided": True,
         "seed": seed,
     }  # fmt: skip
     return TwoSidedCertificate(controller, upper, lower, options)

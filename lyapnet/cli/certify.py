@@ -95,6 +95,7 @@ States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:u
 Seconds = Annotated[
     float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
 ]  # fmt: skip
+Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -187,6 +188,7 @@ def sound(
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
+    device: Device = "cpu",
     keep: Annotated[
         str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
     ] = None,
@@ -229,7 +231,16 @@ def sound(
         made = two_sided_certificate if two_sided else partial(sound_certificate, keep=keep)
         with proof_progress(notes, "sound") as progress:
             certificate = made(
-                controller, alpha, delta, states, seconds, workers, seed=seed, report=progress, started=started
+                controller,
+                alpha,
+                delta,
+                states,
+                seconds,
+                workers,
+                device,
+                seed=seed,
+                report=progress,
+                started=started,
             )
         _show(certificate, found, as_json)
         return certificate
@@ -258,6 +269,7 @@ def region(
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
+    device: Device = "cpu",
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
@@ -276,7 +288,9 @@ def region(
     require_writable(figure, report)
     controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
-        certificate = region_certificate(controller, decay, states, seconds, workers, seed, progress, started=begun)
+        certificate = region_certificate(
+            controller, decay, states, seconds, workers, device, seed, progress, started=begun
+        )
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
 

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 from torch.fx import Node
 from torch.fx.node import map_arg
+from torch.utils._pytree import tree_map_only
 
 from lyapnet.errors import LyapnetError, UsageError, one_line
 from lyapnet.graphs import taylor
@@ -92,6 +93,15 @@ class BoundedFunction:
                     del values[source]
         raise AssertionError("a graph ends with its output")
 
+    def on(self, device: torch.device) -> "BoundedFunction":
+        """The same bounds on another device, of boxes that lie there; what its constants are stays as it is."""
+        other = copy.copy(self)
+        other._constants = {
+            node: tree_map_only(Tensor, lambda value: value.to(device), value)
+            for node, value in self._constants.items()
+        }
+        return other
+
     @property
     def fingerprint(self) -> str:
         """A hash of the function: its operations and every number in them."""
@@ -148,7 +158,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         ) from error
     recorded = node.meta.get("val")
     if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # constant: of the shape of its argument alone
-        return result.to(recorded.dtype)
+        return result.to(torch.get_default_device(), recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
             truth = value.dtype == torch.bool and node.target in OF_TRUTHS and _compares_as_it_is(node, values)

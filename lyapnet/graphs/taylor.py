@@ -141,7 +141,7 @@ def monomials(dimension: int, degree: int) -> list[tuple[int, ...]]:
 
 
 @cache
-def _places(dimension: int, degree: int) -> list[tuple[int, Tensor]]:
+def _places(dimension: int, degree: int, device: torch.device) -> list[tuple[int, Tensor]]:
     """(i, where the products of monomial i with the first few of degree 1 and more stand), but for constants."""
     every = monomials(dimension, degree)
     number = {axes: k for k, axes in enumerate(every)}
@@ -149,7 +149,7 @@ def _places(dimension: int, degree: int) -> list[tuple[int, Tensor]]:
     for i, axes in enumerate(every):
         if 0 < len(axes) < degree:
             others = [other for other in every[1:] if len(axes) + len(other) <= degree]
-            places.append((i, torch.tensor([number[tuple(sorted(axes + other))] for other in others])))
+            places.append((i, torch.tensor([number[tuple(sorted(axes + other))] for other in others], device=device)))
     return places
 
 
@@ -267,7 +267,7 @@ def _product(x: TaylorForm, y: TaylorForm) -> tuple[Terms, OnBoxes]:
     """(the terms up to the degree of the forms, a bound of those beyond) of the product of two polynomials."""
     terms = x.center * y.terms
     terms[1:] += y.center * x.terms[1:]
-    for i, at in _places(x.dimension, x.degree):
+    for i, at in _places(x.dimension, x.degree, terms.device):
         terms.index_add_(0, at, x.terms[i] * y.terms[1 : 1 + len(at)])
     sizes = [[_absolute_sum(z.of_degree(k)) for k in range(1, x.degree + 1)] for z in (x, y)]
     beyond = [a * b for j, a in enumerate(sizes[0], 1) for k, b in enumerate(sizes[1], 1) if j + k > x.degree]

@@ -139,7 +139,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
     for module, name in ((elementary_functions, "linearised"), (taylor, "multiply")):
         monkeypatch.setattr(module, name, without_remainder(getattr(module, name)))
     monkeypatch.setattr(
-        conditions, "BoundedFunction", lambda f, domain, _: BoundedFunction(f, domain, 1)
+        conditions, "BoundedFunction", lambda f, domain, *_: BoundedFunction(f, domain, 1)
     )  # all in remainders
     assert proof_without_search(monkeypatch, P).verdict == "certified"
 

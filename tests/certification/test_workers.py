@@ -10,6 +10,7 @@ import torch
 from lyapnet.certification import Budget, DecreaseCondition, prove
 from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import Question
+from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.workers import bounding
 from lyapnet.errors import UsageError
 from tests.certification.planted import domain, loop, riccati
@@ -66,3 +67,27 @@ def test_a_worker_that_is_killed_is_one_line():
     with pytest.raises(UsageError, match="Expected workers that live on, got one killed"), bounding(question, 2) as run:
         list(run(question.undecided, chunks()))
     assert threading.active_count() < 20
+
+
+def test_a_device_that_is_not_there_is_one_line():
+    with pytest.raises(UsageError, match="Expected a device that torch has, cpu or cuda, got 'xyz'"):
+        Budget(device="xyz")
+    if not torch.cuda.is_available():
+        with pytest.raises(UsageError, match="cpu or cuda, got 'cuda'"):
+            Budget(device="cuda")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+def test_a_gpu_finds_the_same_bounds_and_the_same_proof():
+    condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
+    bounded = bounded_condition(condition, domain(), 3)
+    lower, upper = (side.expand(500, 3) for side in domain())
+    lower = lower + (upper - lower) * 0.9 * torch.rand(500, 3)
+    upper = lower + 0.1
+    with (device := torch.device("cuda")):
+        there = bounded.on(device).bounds(lower.to(device), upper.to(device))
+    for near, far in zip(bounded.bounds(lower, upper), there, strict=True):
+        torch.testing.assert_close(torch.stack(near), torch.stack(far).cpu(), rtol=1e-10, atol=1e-10)
+    assert prove(condition, domain(), 10.0, Budget(60, device="cuda")).verdict == "certified"
+    with pytest.raises(UsageError, match="Expected one worker on cuda, got 2"):
+        Budget(device="cuda", workers=2)

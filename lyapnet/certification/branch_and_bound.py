@@ -30,7 +30,7 @@ class Budget:
         chunk: boxes that are bounded at once by each worker.
         frontier: undecided boxes that are kept; beyond, those of highest key are given up.
         workers: processes.
-        device: where the boxes of a proof are bounded, "cpu" or "cuda"; on a GPU in chunks that fill it, by one process.
+        device: where the boxes of a proof are bounded, "cpu" or "cuda"; a GPU by one process, in chunks that fill it.
     """
 
     seconds: float = 60.0

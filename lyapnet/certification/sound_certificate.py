@@ -174,7 +174,8 @@ def sound_certificate(
         budget, stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
     )  # fmt: skip
     options = {
-        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device, "keep": keep, "seed": seed,
+        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
+        "keep": keep, "seed": seed,
     }  # fmt: skip
     return SoundCertificate(controller, claim, options)
 

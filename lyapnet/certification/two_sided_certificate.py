@@ -162,7 +162,8 @@ def two_sided_certificate(
         alpha: the share of ℓ that V pays for from above, and β, the share of V that is the bound from below.
         delta: slack of both in cost per second; default_delta if None.
         set: D of both; each found if None.
-        seconds, workers, device, seed, report, started: as of sound_certificate; each side has about half of the seconds.
+        seconds: of which each side has about half.
+        workers, device, seed, report, started: as of sound_certificate.
     """
     begun = time.monotonic() if started is None else started
     states = None if set is None else parse_set(set)
@@ -175,7 +176,7 @@ def two_sided_certificate(
     budget = Budget(seconds, workers=workers, device=device, started=begun)
     lower = lower_claim(loop, problem, alpha, slack, states, budget, stream(seed, CERTIFICATION), report)
     options = {
-        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device, "two-sided": True,
-        "seed": seed,
+        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
+        "two-sided": True, "seed": seed,
     }  # fmt: skip
     return TwoSidedCertificate(controller, upper, lower, options)

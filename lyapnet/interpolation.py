@@ -133,7 +133,7 @@ class SmoothCurve(nn.Module):
     end: Float[Tensor, "*shape"]  # y(T)
     weights: Float[Tensor, "K *shape"]  # a
 
-    STEPS = torch.arange(-2, 27) / 24  # τ_k
+    STEPS = torch.arange(-2, 27, dtype=torch.float64) / 24  # τ_k
     WIDTH = 1.5 / 24  # w
     SCALES = (0.025, 0.05, 0.1, 0.2, 0.4)  # of T, that are tried for s
     RIDGE = 1e-9  # of Σ a² beside Σ error², in units of y
@@ -167,7 +167,7 @@ class SmoothCurve(nn.Module):
             gram = rises.mT @ rises + self.RIDGE * torch.eye(rises.shape[-1]).to(rises)
             weights = torch.linalg.solve(gram, rises.mT @ ((y - end) / unit))
             error = float((rises @ weights - (y - end) / unit).square().sum())
-            if error < best:
+            if not error >= best:  # as it is, too, where numbers are none
                 best = error
                 self.scale.copy_(scale)
                 self.weights.copy_((weights * unit).unflatten(-1, self.end.shape))

@@ -76,6 +76,7 @@ class Certificate(ABC):
             user: `system`, `network` and so on, where they are the user's own.
         """
         named = {name: value for name, value in {**self.options, **user}.items() if value is not None}
-        options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in named.items()]
+        each = [(name, one) for name, value in named.items() for one in (value if isinstance(value, list) else [value])]
+        options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in each]
         options += [f"--at={each}" for each in at]
         return shlex.join(["lyapnet", "certify", self.kind, checkpoint, *options])

@@ -20,6 +20,7 @@ from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.files import plain
 from lyapnet.sets import Box
+from lyapnet.types import State
 
 LABELS = {
     **{name: label for name, label in SoundCertificate.labels.items() if name != "guaranteed_cost_ratio"},
@@ -44,6 +45,7 @@ def check(
         claim = sound_claim(
             controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states,
             Budget(UNLIMITED, workers=workers), torch.Generator().manual_seed(0), report, path, True,
+            disturbance=kept.disturbance,
         )  # fmt: skip
         numbers = SoundCertificate(controller, claim, {}).proved()
         verdict = "certified" if claim.verdict == "certified" else "refused"
@@ -61,6 +63,7 @@ class KeptFunnel(NamedTuple):
     alpha: float
     delta: float  # in cost per second
     states: Box  # D; without width along states that nothing depends on
+    disturbance: State | None
     rho: float
     seconds: float  # of the search
 
@@ -75,11 +78,12 @@ def kept_funnel(controller: Controller, path: Path) -> KeptFunnel:
     with refusing(path):
         of = content["of"][0]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
+        w = None if of["disturbance"] is None else torch.tensor(of["disturbance"], dtype=torch.float64)
         kept = KeptFunnel(
-            float(of["alpha"]), float(of["delta"]), Box(lower, upper), float(content["proved"]), content["seconds"]
+            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, float(content["proved"]), content["seconds"]
         )
     loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
-    condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints)
+    condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance)
     times = torch.tensor([[0.0], [controller.horizon.duration]], dtype=torch.float64)
     lower, upper = torch.cat([times[0], lower]), torch.cat([times[1], upper])
     if kept.states.dimension == controller.system.n:  # sound_claim says so else

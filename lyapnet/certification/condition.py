@@ -13,16 +13,27 @@ from lyapnet.types import Corner, PerState, State, Time
 
 
 class DecreaseCondition(nn.Module):
-    """c(t, x) = V_t + V_xᵀ(f + g u) + α ℓ(x, u) − δ with u = policy(t, x): V falls where c ≤ 0, up to δ.
+    """c(t, x) = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| + α ℓ(x, u) − δ with u = policy(t, x): V falls where c ≤ 0, up
+    to δ, whatever else, of at most w_i, pushes each ẋ_i.
 
     Args:
         closed_loop: the system, its cost, and a control law that V defines.
         alpha: α in (0, 1], the share of the running cost that V pays for.
         delta: δ ≥ 0, in cost per second; with δ > 0 there is room around the goal, where all else vanishes.
         constraints: h; c ≤ 0 is asked for where h(x) ≤ 0 alone.
+        disturbance: w ≥ 0, (n,), in the units of ẋ; none if None.
     """
 
-    def __init__(self, closed_loop: ClosedLoop, alpha: float, delta: float, constraints: Constraints | None = None):
+    disturbance: State | None
+
+    def __init__(
+        self,
+        closed_loop: ClosedLoop,
+        alpha: float,
+        delta: float,
+        constraints: Constraints | None = None,
+        disturbance: State | None = None,
+    ):
         super().__init__()
         if not 0 < alpha <= 1:
             raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
@@ -32,6 +43,7 @@ class DecreaseCondition(nn.Module):
             raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
         self.constraints = constraints
+        self.register_buffer("disturbance", disturbance)
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.parts(t, x)[0]
@@ -40,6 +52,8 @@ class DecreaseCondition(nn.Module):
         """(c, W, Ẇ), where Ẇ = V_t + V_xᵀ(f + g u) − δ is below 0 where c is, unless the cost is negative."""
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
         fall = time_derivative(self.V, loop.system, t, x, u)
+        if self.disturbance is not None:
+            fall = fall + (self.disturbance * self.V.value_and_state_gradient(t, x)[1].abs()).sum(-1)
         return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
 
     def excluded(self, x: State) -> Bool[Tensor, "*batch"]:

@@ -198,23 +198,28 @@ def _levels_of_region(claim: RegionClaim) -> list["Level"]:
 # Two sides
 
 
-def two_sided(value: Tensor, guaranteed: Tensor, least: Tensor, optimum: Tensor | None, headline: str) -> Figure:
+def two_sided(
+    value: Tensor, guaranteed: Tensor, least: Tensor, optimum: Tensor | None, headline: str, whose: str = "any control"
+) -> Figure:
     """Both bounds over V(0, x₀), relative to it, with the optima between them.
 
     Args:
         value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,).
         optimum: of the first few of them.
+        whose: of which controls the bound from below is.
     """
     figure = Figure(figsize=(5.6, 4.2), layout="constrained")
     panel = figure.subplots()
     order = value.argsort()
+    order = order[(value > 0)[order] & least.isfinite()[order]]
     V, upper, lower = (numpy_of(y[order]) for y in (value, guaranteed, least))
     panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
     panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
-    panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label="least: any control costs at least")
+    panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label=f"least: {whose} costs at least")
     if optimum is not None:
-        some = numpy_of(value[: len(optimum)])
-        panel.plot(some, numpy_of(optimum) / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
+        first = order[order < len(optimum)]
+        some, best = numpy_of(value[first]), numpy_of(optimum[first])
+        panel.plot(some, best / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
     panel.axhline(1, color=GREY, linewidth=0.6)
     middle = len(V) // 4  # cheaper states, where δT and κ weigh most, may leave the picture
     if len(V):

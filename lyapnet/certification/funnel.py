@@ -32,7 +32,7 @@ from lyapnet.certification.proof import Progress, Proof, prove
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import names_of
 from lyapnet.contracts import copied
-from lyapnet.errors import Interrupted, signals_taken
+from lyapnet.errors import Interrupted, UsageError, signals_taken
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
@@ -87,6 +87,7 @@ class SoundClaim:
     constraints: Sequence[str] = ()  # what h(x) ≤ 0 asks for
     crossing: float = float("inf")  # a lower bound of W where a closed loop could come to violate one
     violation: Violation | None = None  # of a closed loop from X₀
+    disturbance: State | None = None  # w: it is so for ẋ = f + gu + w(t), |w_i(t)| ≤ w_i, then with Ẇ at its worst
 
     @property
     def verdict(self) -> Verdict:
@@ -127,6 +128,7 @@ def sound_claim(
     keep: Path | None = None,
     replay: bool = False,
     degree: int = 2,
+    disturbance: State | None = None,
 ) -> SoundClaim:
     """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
@@ -135,16 +137,22 @@ def sound_claim(
         problem: whose X₀, T and goal are meant.
         states: D; by default a box around where samples of V are low enough.
         report, keep, replay, degree: of prove.
+        disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
 
     Raises:
         UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
-    condition = DecreaseCondition(copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints)
+    if disturbance is not None:
+        _require_disturbance(disturbance, problem)
+    condition = DecreaseCondition(
+        copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance
+    )
     duration = problem.horizon.duration
-    levels = for_levels(budget)
-    left_out, initial_states, wanted, D, domain, sides = setting_of(condition, problem, duration, states, levels)
+    left_out, initial_states, wanted, D, domain, sides, levels = setting_of(
+        condition, problem, duration, states, budget
+    )
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
@@ -166,8 +174,19 @@ def sound_claim(
     return SoundClaim(
         alpha, delta, duration, D, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint, proof.seconds, names, crossing, violation,
+        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance,
     )  # fmt: skip
+
+
+def _require_disturbance(w: State, problem: Problem) -> None:
+    """Refuse a disturbance that is none, or that nothing is proved about."""
+    if not bool(((w >= 0) & w.isfinite()).all()):
+        raise UsageError(f"Expected disturbances ≥ 0, got {w.tolist()}; give the largest |w| in units of ẋ.")
+    if problem.constraints is not None:
+        raise UsageError("Expected no state constraints beside disturbances, got some; their crossing is not bounded.")
+    moved = [problem.system.state_names[i] for i in problem.system.constants if w[i] > 0]
+    if moved:
+        raise UsageError(f"Expected parameters of a family that stay what they are, got pushes on {', '.join(moved)}.")
 
 
 class Setting(NamedTuple):
@@ -179,17 +198,18 @@ class Setting(NamedTuple):
     states: Box  # D
     domain: tuple[Corner, Corner]  # [0, T] × D
     sides: tuple[Corners, Corners]  # [0, T] × the boundary of D
+    levels: Budget  # what is left of the one for levels
 
 
 def setting_of(
-    condition: DecreaseCondition, problem: Problem, duration: float, states: Box | None, levels: Budget
+    condition: DecreaseCondition, problem: Problem, duration: float, states: Box | None, budget: Budget
 ) -> Setting:
     """The setting of a claim about a condition, whose V and h are traced for it, once.
 
     Args:
         duration: T, or 0 for what holds at t = 0 alone.
         states: D; by default a box around where samples of W are low enough.
-        levels: for the level of X₀.
+        budget: of the claim; a share of it is for levels.
 
     Raises:
         UsageError: D does not fit; or the condition is none that bounds can speak of.
@@ -199,13 +219,14 @@ def setting_of(
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
     X0 = without(problem.initial_states, left_out)
     require_continuous(condition.V, X0.lower, X0.upper)
+    levels = for_levels(budget)
     wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
     states = without(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
-    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes))
+    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels)
 
 
 def for_levels(budget: Budget) -> Budget:

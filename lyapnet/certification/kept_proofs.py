@@ -69,7 +69,9 @@ class Standing(NamedTuple):
 def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
     """What a proof is about, as plain data."""
     box = {"lower": lower.tolist(), "upper": upper.tolist()}
-    return {"fingerprint": bounded.fingerprint, **box, "alpha": condition.alpha, "delta": condition.delta}
+    w = None if condition.disturbance is None else condition.disturbance.tolist()
+    slack = {"degree": bounded.degree, "alpha": condition.alpha, "delta": condition.delta, "disturbance": w}
+    return {"fingerprint": bounded.fingerprint, **box, **slack}
 
 
 FORMAT = b"lyapnet proof 2\n"

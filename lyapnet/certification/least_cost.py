@@ -11,18 +11,19 @@ from lyapnet.calculus import drift_lie_derivative, gradients, input_lie_derivati
 from lyapnet.certification.branch_and_bound import Budget, just_above, minimum
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
-from lyapnet.certification.funnel import for_levels, proof_within, setting_of
-from lyapnet.certification.preconditions import at_time
+from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of
+from lyapnet.certification.preconditions import NOTHING, at_time
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.contracts import copied
 from lyapnet.cost import Cost, is_quadratic_about_target
 from lyapnet.errors import UsageError
+from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.linear_algebra import apply, solve
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box, ControlSet
-from lyapnet.types import Control, PerState, Points, State, Time
+from lyapnet.types import Control, Corner, PerState, Points, State, Time, Value
 
 FINE = 5e-5  # of the level: how close the excess at T is bounded
 DEGREE = 3  # of the forms: what cancels between V_t and the Hamiltonian is of third order, t·x²
@@ -34,8 +35,9 @@ class LowerClaim:
 
         β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)] ≥ −δ,
 
-    and W(T, x) ≤ φ(x) + e for all x ∈ D. Then m = min(W, c) rises along any trajectory in D, under any control, by no
-    more than ∫ℓ: where W < c by the condition, where W ≥ c since m is constant and ℓ ≥ 0. Hence
+    and min(W, c) ≤ φ + e' at T on D. Then m = min(W, c) falls along any trajectory in D, under any control, by no more
+    than ∫ℓ + e'': where W < c by the condition, where W ≥ c since m is constant and ℓ ≥ −e''/T, as q is bounded from
+    below and R is positive definite on all of D. Hence, with e = e' + e'',
 
         J(x₀) = ∫ℓ dt + φ(x(T)) ≥ min(β V(0, x₀) − δT, c) − e
 
@@ -56,6 +58,7 @@ class LowerClaim:
     states: Box  # D
     level: float  # c: the largest one proved, as far as X₀ needs; −∞ where there is none
     wanted: float  # max W(0, ·) on X₀, or up to 0.1 % more
+    least: float  # the largest W(0, ·) that was seen on X₀: no lower c does
     excess: float  # e ≥ 0; an upper bound
     everywhere: bool  # whether it is so for every control, not only for those that keep the state in D
     counterexample: Counterexample | None
@@ -68,9 +71,10 @@ class LowerClaim:
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that c does for all of X₀."""
+        """On the claim that c does for all of X₀, and that e leaves something of it."""
         found = self.counterexample
-        return verdict_on(self.level, self.wanted, None if found is None else found.height, self.wanted)
+        verdict = verdict_on(self.level, self.wanted, None if found is None else found.height, self.least)
+        return "unknown" if verdict == "certified" and not self.excess < self.wanted < float("inf") else verdict
 
     def least_cost(self, value: PerState) -> PerState:
         """The bound of the optimum from V(0, x₀), (*batch,); −∞ where nothing is proved."""
@@ -103,8 +107,7 @@ class RiseCondition(DecreaseCondition):
         loop, (V_t, V_x) = self.closed_loop, gradients(self.V, t, x)
         rise = self.alpha * (V_t + drift_lie_derivative(loop.system, x, V_x)) + loop.cost.state(x)
         b = self.alpha * input_lie_derivative(loop.system, x, V_x)
-        R = loop.cost.R(x)
-        R = (R + R.mT) / 2
+        R = symmetric(loop.cost.R(x))
         least = least_over_controls(R, b, loop.cost.rest, self.controls)
         return -(rise + least) - self.delta, self.height(t, x), -least_pivot(R)
 
@@ -134,6 +137,11 @@ def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: Co
     slope = 2 * apply(R, u - u0) + b
     beyond = torch.minimum(slope * (lower - u), slope * (upper - u)).sum(-1)
     return ((u - u0) * apply(R, u - u0)).sum(-1) + (b * u).sum(-1) + beyond
+
+
+def symmetric(R: Tensor) -> Tensor:
+    """What counts of R in uᵀRu."""
+    return (R + R.mT) / 2
 
 
 def least_pivot(R: Tensor) -> PerState:
@@ -169,25 +177,53 @@ def lower_claim(
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, delta, problem)
-    cost, duration, levels = condition.closed_loop.cost, condition.duration, for_levels(budget)
-    left_out, _, wanted, D, domain, sides = setting_of(condition, problem, duration, states, levels)
+    cost, duration = condition.closed_loop.cost, condition.duration
+    left_out, X0, wanted, D, domain, sides, _ = setting_of(condition, problem, duration, states, budget)
+    _require_still(condition, domain)
     needed = just_above(wanted)
-    end = at_time(duration, D.lower, D.upper)
-    unit = max(abs(wanted), 1e-12)
-    excess = -minimum(
-        lambda t, x: cost.terminal(x) - beta * condition.V(t, x), *end, levels, unit=unit, tolerance=FINE, enough=0.0
-    )
-    everywhere = False
+    excess = _excess(condition, D, needed, budget)
+    everywhere, levels = False, for_levels(budget)
     if rises_along_rays(cost, problem.goal.double(), D, left_out):
         outside = minimum(lambda t, x: cost.terminal(x), *sides, levels, enough=just_above(needed))
         rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
         everywhere = min(outside, rim) >= needed
     proof = proof_within(condition, domain, needed, budget, generator=generator, report=report, degree=DEGREE)
     level = wanted if proof.level >= needed else proof.level
+    seen = beta * largest_seen(condition.V, X0) - delta * duration
     return LowerClaim(
-        beta, delta, duration, D, level, wanted, max(0.0, excess), everywhere, proof.counterexample, proof.boxes,
+        beta, delta, duration, D, level, wanted, seen, excess, everywhere, proof.counterexample, proof.boxes,
         time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint,
     )  # fmt: skip
+
+
+def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget) -> float:
+    """An upper bound of e; infinite where R is not seen to be positive definite on all of D.
+
+    Where q is a quadratic form by its matrix, it is not below 0.
+    """
+    cost, T, beta = condition.closed_loop.cost, condition.duration, condition.alpha
+    end, unit = at_time(T, states.lower, states.upper), max(abs(level), 1e-12)
+
+    def least(function: Value) -> float:
+        return minimum(function, *end, for_levels(budget), unit=unit, tolerance=FINE, enough=0.0)
+
+    excess = -least(lambda t, x: cost.terminal(x) - (beta * condition.V(t, x)).clamp(max=level))
+    below = 0.0 if is_quadratic_about_target(cost) else -least(lambda t, x: T * cost.state(x))
+    definite = minimum(lambda t, x: least_pivot(symmetric(cost.R(x))), *end, for_levels(budget), enough=0.0) >= 0
+    return max(0.0, excess) + max(0.0, below) if definite else float("inf")
+
+
+def _require_still(condition: RiseCondition, domain: tuple[Corner, Corner]) -> None:
+    """Refuse constants that some control moves: D has no faces along them."""
+    system = condition.closed_loop.system
+    constants = list(system.constants)
+    if constants:
+        parts = lambda t, x: (system.f(x)[constants], system.g(x)[constants])  # noqa: E731
+        moved = BoundedFunction(parts, domain).bounds(*(end[None] for end in domain))
+        if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in moved):
+            raise UsageError(
+                "Expected ẋ = 0 for the constants of a system under any control, got others; leave them out."
+            )
 
 
 def rises_along_rays(cost: Cost, goal: State, states: Box, left_out: list[int]) -> bool:

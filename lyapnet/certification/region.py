@@ -180,8 +180,8 @@ def region_claim(
         raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
     condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
-    goal, levels = problem.goal.double(), for_levels(budget)
-    left_out, X0, wanted, D, domain, sides = setting_of(condition, problem, 0.0, states, levels)
+    goal = problem.goal.double()
+    left_out, X0, wanted, D, domain, sides, _ = setting_of(condition, problem, 0.0, states, budget)
     seen = [i for i in range(X0.dimension) if i not in left_out]
     _require_inside(D, goal, seen)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))

@@ -21,7 +21,7 @@ from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.sets import Box
-from lyapnet.types import PerState
+from lyapnet.types import PerState, State
 
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
 SEARCHED = 64  # of them, where each optimum is a search
@@ -36,6 +36,7 @@ class SoundCertificate(Certificate):
         "reason": "why",
         "alpha": "α",
         "delta": "δ, cost per second",
+        "disturbance": "disturbances, at most",
         "set": "D",
         "states_left_out": "states that nothing depends on",
         "rho_wanted": "ρ for all of X₀",
@@ -70,7 +71,7 @@ class SoundCertificate(Certificate):
             "violation": None if claim.violation is None else claim.violation._asdict(),
         } if claim.constraints else {}  # fmt: skip
         return {
-            "alpha": claim.alpha, "delta": claim.delta, "duration": claim.duration,
+            "alpha": claim.alpha, "delta": claim.delta, "disturbance": self.pushes, "duration": claim.duration,
             "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
             "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
             "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
@@ -80,6 +81,12 @@ class SoundCertificate(Certificate):
             "fingerprint": claim.fingerprint, **kept,
         }  # fmt: skip
 
+    @property
+    def pushes(self) -> dict[str, float]:
+        """The disturbed states and how much their derivatives are pushed at most."""
+        w, names = self.claim.disturbance, self.controller.system.state_names
+        return {} if w is None else {names[i]: float(w[i]) for i in range(len(w)) if w[i] > 0}
+
     def in_words(self) -> str:
         claim = self.claim
         if not claim.volume_share:
@@ -87,10 +94,16 @@ class SoundCertificate(Certificate):
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
             f"model: no closed loop that starts in it leaves the funnel, or D,{self._or_violates} up to "
-            f"T = {claim.duration:g} s, and its cost is bounded as below. It holds at least "
+            f"T = {claim.duration:g} s, {self._however_pushed}and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. It is about the operations that f, g, ℓ, V and u were "
             f"traced to, of this fingerprint; {FROZEN}{self.of_parameters}"
         )
+
+    @property
+    def _however_pushed(self) -> str:
+        """What the claim adds about disturbances."""
+        each = ", ".join(f"of at most {w!r} on d({name})/dt" for name, w in self.pushes.items())
+        return f"whatever pushes there are, {each}, " if each else ""
 
     @property
     def _or_violates(self) -> str:
@@ -104,7 +117,7 @@ class SoundCertificate(Certificate):
         rho, kappa = (repr(claim.rho), repr(claim.terminal_excess)) if claim.volume_share else ("ρ", "κ")
         kept = ("  and  h(x) ≤ 0", "  and  h(x(t)) ≤ 0", "  and  h(x₀) ≤ 0") if self.claim.constraints else [""] * 3
         return [
-            f"V_t + V_xᵀ(f + g u) + {alpha} ℓ(x, u) ≤ {delta}  "
+            f"V_t + V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if self.pushes else ''} + {alpha} ℓ(x, u) ≤ {delta}  "
             f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{kept[0]}",
             f"V(t, x(t)) ≤ {rho} + {delta} t{kept[1]}  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}{kept[2]}",
             f"J(x₀) ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
@@ -149,6 +162,7 @@ def sound_certificate(
     seconds: float = 60.0,
     workers: int = 1,
     device: str = "cpu",
+    disturbance: Sequence[str] | None = None,
     keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
@@ -163,6 +177,7 @@ def sound_certificate(
         set: D, as parse_set reads it; found if None.
         seconds: when to stop undecided, set-up and what follows the proof included.
         workers, device: of Budget.
+        disturbance: STATE=w for each ẋ_i that is pushed by at most w.
         keep: a file in which an unfinished proof is kept.
         report: is told how far the proof is.
         started: time.monotonic() from which the seconds count; now if None.
@@ -172,10 +187,11 @@ def sound_certificate(
         controller.closed_loop, controller.problem, alpha,
         default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
         budget, stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
+        disturbance=parse_disturbance(disturbance or (), controller),
     )  # fmt: skip
     options = {
         "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "keep": keep, "seed": seed,
+        "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
     }  # fmt: skip
     return SoundCertificate(controller, claim, options)
 
@@ -199,6 +215,26 @@ def parse_set(text: str) -> Box:
         raise UsageError(
             f"Expected --set as lower:upper for each state, got {text!r}; for example --set=-1.6:1.6,-2.6:2.6."
         ) from error
+
+
+def parse_disturbance(named: Sequence[str], controller: Controller) -> State | None:
+    """w from "velocity=0.1" for each state that is pushed; None where none is.
+
+    Raises:
+        UsageError: a name that is no state, or no number.
+    """
+    names, w = controller.system.state_names, torch.zeros(controller.system.n, dtype=torch.float64)
+    for text in named:
+        name, _, value = text.partition("=")
+        if name not in names:
+            raise UsageError(f"Expected --disturbance STATE=W of {', '.join(names)}, got {text!r}; name one of them.")
+        try:
+            w[names.index(name)] = float(value)
+        except ValueError as error:
+            raise UsageError(
+                f"Expected --disturbance STATE=W with a number, got {text!r}; for example {name}=0.1."
+            ) from error
+    return w if named else None
 
 
 def _pairs(text: str) -> Sequence[Sequence[str]]:

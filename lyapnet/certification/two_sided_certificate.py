@@ -99,6 +99,8 @@ class TwoSidedCertificate(SoundCertificate):
         lower = self.lower
         if lower.verdict == "certified":
             return None
+        if lower.level >= lower.wanted:
+            return "e, what βV(T, ·) has beyond φ, or q below 0, leaves nothing: allow more seconds, or lower V there"
         if lower.verdict == "falsified" or lower.counterexample is not None:
             return "V rises faster than a control pays for: lower --alpha, allow more --delta, or train its residual"
         return "seconds spent: allow more"
@@ -135,7 +137,8 @@ class TwoSidedCertificate(SoundCertificate):
 
     def figure(self) -> figures.Figure:
         value, guaranteed, optimum = self.compared
-        return figures.two_sided(value, guaranteed, self.lower.least_cost(value), optimum, self._headline())
+        whose = "any control" if self.lower.everywhere else "any control that stays in D"
+        return figures.two_sided(value, guaranteed, self.lower.least_cost(value), optimum, self._headline(), whose)
 
     def _headline(self) -> str:
         ratio = self.result.get("certified_ratio")

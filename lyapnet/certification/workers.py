@@ -1,7 +1,9 @@
 """Processes that bound boxes side by side: threads of one process wait for each other."""
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -50,11 +52,19 @@ def _shared_out(
 
 
 def _begin(question: Any) -> None:
-    """Become a worker: one thread, and nothing to do with signals, which are for the process that asks."""
+    """Become a worker: one thread, and nothing to do with signals, which are for the process that asks; end with it."""
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     _own[:] = [question]
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _undecided(asked: tuple[Any, ...]) -> tuple[Any, ...]:

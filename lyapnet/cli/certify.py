@@ -189,6 +189,10 @@ def sound(
     seconds: Seconds = 60.0,
     workers: Workers = 1,
     device: Device = "cpu",
+    disturbance: Annotated[
+        list[str] | None,
+        typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
+    ] = None,
     keep: Annotated[
         str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
     ] = None,
@@ -212,8 +216,8 @@ def sound(
         raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
-    if two_sided and (refine or keep is not None):
-        raise UsageError("Expected --two-sided or --keep or --refine, got two of them; these are about one side.")
+    if two_sided and (refine or keep is not None or disturbance):
+        raise UsageError("Expected --two-sided alone, got --keep, --refine or --disturbance; these are about one side.")
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set, sound_certificate
     from lyapnet.certification.tables import proof_progress
@@ -228,7 +232,7 @@ def sound(
         started = started or time.monotonic()
         found = given.of(path)
         controller = found.load()
-        made = two_sided_certificate if two_sided else partial(sound_certificate, keep=keep)
+        made = two_sided_certificate if two_sided else partial(sound_certificate, keep=keep, disturbance=disturbance)
         with proof_progress(notes, "sound") as progress:
             certificate = made(
                 controller,

@@ -76,8 +76,10 @@ def _content(graph: Graph, node: Node) -> Any:
     value = attrgetter(str(node.target))(graph.owning_module) if graph.owning_module is not None else None
     if not isinstance(value, Tensor):
         return str(node.target)
-    numbers = value.detach().cpu().contiguous()
-    return numbers.dtype, tuple(numbers.shape), numbers.numpy().tobytes()
+    try:
+        return value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes()
+    except (TypeError, RuntimeError):  # of numbers that NumPy does not know
+        return str(node.target)
 
 
 def _shape(node: Any) -> Any:

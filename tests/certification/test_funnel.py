@@ -255,3 +255,46 @@ def test_what_fails_above_the_least_level_that_X0_needs_falsifies_nothing():
 def test_a_set_that_cuts_the_funnel_is_named(P):
     small = Box(torch.tensor([-1.1, -0.8]), torch.tensor([1.1, 0.8]))
     assert "boundary of D" in certify(loop(P), states=small).reason
+
+
+PUSHED = torch.tensor([0.0, 0.05])
+
+
+@cache
+def pushed_claim():
+    return certify(loop(riccati()), delta=0.1, disturbance=PUSHED)
+
+
+def after_pushes(push):
+    """(the highest V − δt, cost) of closed loops from the funnel's boundary, pushed by as much where V rises."""
+    claim, V, about = pushed_claim(), stationary(riccati()), problem()
+    angle = torch.linspace(0, 2 * math.pi, 60)
+    x = torch.stack([angle.cos(), angle.sin()], -1)
+    x = x * (claim.rho / V(torch.zeros(()), x)).sqrt()[:, None] * (1 - 1e-9)
+    law, P, dt, cost, highest = HJBPolicy(about, V), torch.as_tensor(riccati()), 1e-3, torch.zeros(60), 0.0
+    for k in range(int(DURATION / dt)):
+        t = torch.tensor(k * dt)
+        highest = max(highest, float((V(t, x) - claim.delta * t).max()))
+        u = law(t.expand(60), x).detach()
+        cost = cost + dt * about.cost.running(x, u)
+        x = x + dt * (about.system.dynamics(x, u) + push * (x @ P).sign())
+    return highest, cost.detach() + about.cost.terminal(x).detach()
+
+
+def test_a_funnel_holds_whatever_pushes_there_are_up_to_those_it_is_proved_for():
+    claim = pushed_claim()
+    assert claim.verdict == "certified"
+    highest, cost = after_pushes(PUSHED)
+    assert highest <= claim.rho
+    assert (cost <= claim.guaranteed_cost(torch.full((60,), claim.rho * (1 - 1e-9)))).all()
+
+
+def test_larger_pushes_leave_the_funnel_and_are_not_proved():
+    assert after_pushes(100 * PUSHED)[0] > pushed_claim().rho
+    assert certify(loop(riccati()), delta=0.1, disturbance=100 * PUSHED).verdict != "certified"
+
+
+def test_disturbances_that_are_none_are_refused():
+    for w, expected in ((torch.tensor([0.0, -1.0]), "≥ 0"), (torch.tensor([math.nan, 0.0]), "≥ 0")):
+        with pytest.raises(UsageError, match=f"Expected disturbances {expected}"):
+            certify(loop(riccati()), disturbance=w)

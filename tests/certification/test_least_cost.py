@@ -1,5 +1,7 @@
 """The optimum from below: against Riccati's solution, brute force over controls, and claims that must fail."""
 
+import dataclasses
+import io
 import json
 import math
 from functools import cache
@@ -9,11 +11,12 @@ import torch
 from scipy.linalg import solve_continuous_are
 
 from lyapnet.certification import Budget, prove
+from lyapnet.certification.figures import two_sided
 from lyapnet.certification.least_cost import RiseCondition, least_over_controls, least_pivot, lower_claim
 from lyapnet.certification.two_sided_certificate import two_sided_certificate
 from lyapnet.cli import main
 from lyapnet.controller import Controller
-from lyapnet.cost import QuadraticCost, TargetCost
+from lyapnet.cost import Cost, QuadraticCost, TargetCost, is_quadratic_about_target
 from lyapnet.errors import UsageError
 from lyapnet.policy import HJBPolicy
 from lyapnet.rollout import ClosedLoop
@@ -187,6 +190,71 @@ def test_what_is_no_claim_is_refused():
         claimed(about=problem(ControlBox(0.0, math.inf)))
 
 
+class Costly(Cost):
+    """q = x² but for a pit of some depth and width 0.002 at x = 2, R = 1 and φ = x²; or what a subclass makes of it."""
+
+    def __init__(self, depth=0.0):
+        super().__init__()
+        self.depth = depth
+
+    def state(self, x):
+        return x[..., 0] ** 2 - self.depth * torch.relu(1 - (x[..., 0] - 2).abs() / 0.002)
+
+    def R(self, x):
+        return torch.ones(*x.shape[:-1], 1, 1)
+
+    def terminal(self, x):
+        return x[..., 0] ** 2
+
+
+def of_one_state(cost):
+    about = problem_of(Linear([[0.0]], [[1.0]]), cost, 20, 0.1, Box([-1.0], [1.0]))
+    V = Formula(lambda t, x: x[..., 0] ** 2 + 0 * t)
+    return claimed(V, about, 0.95, 0.02, Box([-3.0], [3.0]).double())
+
+
+def test_a_running_cost_that_falls_below_zero_beyond_the_level_is_part_of_the_excess():
+    """No sample meets the pit, in which a control could rest and earn; where it is shallow, it costs that much."""
+    assert of_one_state(Costly()).verdict == "certified"
+    assert of_one_state(Costly(1e4)).verdict != "certified"
+    assert of_one_state(Costly(4.001)).excess == pytest.approx(0.001 * 2.0, abs=1e-3)
+
+
+def test_a_goal_that_the_terminal_cost_is_not_about_is_none():
+    """Of a target cost with another φ, and of matrices with a goal beside them, nothing is known outside of D."""
+    plain = QuadraticCost(Q, [[1.0]], Q)
+    assert is_quadratic_about_target(TargetCost(plain, [1.0, 0.0], [0.0]))
+    other = TargetCost(plain, [1.0, 0.0], [0.0])
+    object.__setattr__(other, "terminal", lambda x: plain.terminal(x))
+    assert not is_quadratic_about_target(other)
+    named = QuadraticCost(Q, [[1.0]], Q)
+    named.goal = torch.tensor([1.0, 0.0])
+    assert not is_quadratic_about_target(named)
+
+
+def test_constants_that_a_control_moves_are_refused():
+    class Moved(Linear):
+        constants = (1,)
+
+    system = Moved([[0.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]])
+    cost = QuadraticCost([[1.0, 0.0], [0.0, 0.0]], [[1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 0.0]])
+    about = problem_of(system, cost, 20, 0.1, Box([-1.0, 0.5], [1.0, 1.5]))
+    with pytest.raises(UsageError, match="for the constants of a system under any control"):
+        claimed(Formula(lambda t, x: x[..., 0] ** 2 + 0 * t), about)
+
+
+def test_a_certificate_needs_an_excess_that_leaves_something():
+    claim = plain_claim()
+    assert dataclasses.replace(claim, excess=math.inf).verdict == "unknown"
+    assert dataclasses.replace(claim, excess=claim.wanted).verdict == "unknown"
+
+
+def test_where_nothing_is_proved_from_below_the_figure_is_drawn_all_the_same():
+    value = torch.tensor([1.0, 2.0, 0.0])
+    for least in (value - 0.1, torch.full((3,), -math.inf)):
+        two_sided(value, value + 0.1, least, value, "unknown").savefig(io.BytesIO(), format="png")
+
+
 def test_a_small_set_speaks_of_the_controls_that_stay_in_it():
     claim = claimed(states=Box([-1.1, -0.8], [1.1, 0.8]).double())
     assert claim.verdict == "certified"
@@ -247,6 +315,6 @@ def test_the_command_prints_both_sides(checkpoint, capsys, tmp_path):
     assert (tmp_path / "b.png").stat().st_size > 1000
     report = (tmp_path / "r" / "report.md").read_text()
     assert "--two-sided" in report.rsplit("## Again", 1)[1]
-    for other in (["--refine=1"], [f"--keep={tmp_path / 'p'}"]):
-        assert main([*arguments, *other]) == 2
-        assert "Expected --two-sided or" in capsys.readouterr().err
+    for other in ("--refine=1", f"--keep={tmp_path / 'p'}", "--disturbance=velocity=1"):
+        assert main([*arguments, other]) == 2
+        assert "Expected --two-sided alone" in capsys.readouterr().err

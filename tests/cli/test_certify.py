@@ -232,3 +232,13 @@ def test_sets_are_read():
     for text in ("", "1", "2:1", "1:2:3", "a:b"):
         with pytest.raises(UsageError, match="--set"):
             parse_set(text)
+
+
+def test_disturbances_are_named_by_states(checkpoint, capsys, tmp_path):
+    options = ["--seconds", "2", "--delta", "1", "--disturbance", "velocity=0.01"]
+    result = certificate(capsys, "sound", checkpoint, *options, "--report", str(tmp_path))
+    assert result["disturbance"] == {"velocity": 0.01}
+    assert "--disturbance=velocity=0.01" in (tmp_path / "report.md").read_text()
+    for wrong, expected in (("speed=1", "of position, velocity, got 'speed=1'"), ("velocity=a", "with a number")):
+        assert main(["certify", "sound", checkpoint, "--disturbance", wrong]) == 2
+        assert expected in capsys.readouterr().err

@@ -135,6 +135,8 @@ class WhereItHolds(Question):
         self.there = self.bounded.on(self.device)
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        if self.device == CPU:  # where such a context would only cost
+            return self._undecided(boxes)
         with self.device:
             boxes, axis = self._undecided(boxes.to(self.device))
         return boxes.to(CPU), axis.to(CPU)

@@ -12,13 +12,13 @@ from lyapnet.certification.branch_and_bound import Budget, just_above, minimum
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of
-from lyapnet.certification.preconditions import NOTHING, at_time
+from lyapnet.certification.preconditions import at_time, require_still
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.contracts import copied
 from lyapnet.cost import Cost, is_quadratic_about_target
+from lyapnet.cost.base import quadratic_form
 from lyapnet.errors import UsageError
-from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.linear_algebra import apply, solve
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -136,7 +136,7 @@ def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: Co
     u = controls.minimise(R, b - 2 * apply(R, u0.expand(b.shape)))
     slope = 2 * apply(R, u - u0) + b
     beyond = torch.minimum(slope * (lower - u), slope * (upper - u)).sum(-1)
-    return ((u - u0) * apply(R, u - u0)).sum(-1) + (b * u).sum(-1) + beyond
+    return quadratic_form(R, u - u0) + (b * u).sum(-1) + beyond
 
 
 def symmetric(R: Tensor) -> Tensor:
@@ -214,16 +214,11 @@ def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget)
 
 
 def _require_still(condition: RiseCondition, domain: tuple[Corner, Corner]) -> None:
-    """Refuse constants that some control moves: D has no faces along them."""
+    """Refuse constants that some control moves."""
     system = condition.closed_loop.system
     constants = list(system.constants)
     if constants:
-        parts = lambda t, x: (system.f(x)[constants], system.g(x)[constants])  # noqa: E731
-        moved = BoundedFunction(parts, domain).bounds(*(end[None] for end in domain))
-        if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in moved):
-            raise UsageError(
-                "Expected ẋ = 0 for the constants of a system under any control, got others; leave them out."
-            )
+        require_still(lambda t, x: (system.f(x)[constants], system.g(x)[constants]), domain, " under any control")
 
 
 def rises_along_rays(cost: Cost, goal: State, states: Box, left_out: list[int]) -> bool:

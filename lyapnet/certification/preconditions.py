@@ -1,6 +1,6 @@
 """What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from lyapnet.linear_algebra import apply
 from lyapnet.problem import TRIED
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
-from lyapnet.types import Corner, Corners, State, Value
+from lyapnet.types import Corner, Corners, State, Time, Value
 
 NOTHING = 1e-200  # bounds of zero have the least room for rounding
 
@@ -100,13 +100,23 @@ def without(states: Box, left_out: Sequence[int]) -> Box:
 
 
 def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
-    """Refuse constants that move: D has no faces along them."""
+    """Refuse constants that move under the control law."""
     constants = list(loop.system.constants)
     if constants:
-        moved = BoundedFunction(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
-        ((low, high),) = moved.bounds(*(end[None] for end in domain))
-        if not bool(torch.maximum(-low, high).max() <= NOTHING):
-            raise UsageError("Expected ẋ = 0 for the constants of a system, got others; leave them out.")
+        require_still(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
+
+
+def require_still(
+    moving: Callable[[Time, State], tuple[Tensor, ...]], domain: tuple[Corner, Corner], under: str = ""
+) -> None:
+    """Refuse constants of a system that move, by what would move them: D has no faces along them.
+
+    Args:
+        under: which controls may move them, in words.
+    """
+    bounds = BoundedFunction(moving, domain).bounds(*(end[None] for end in domain))
+    if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in bounds):
+        raise UsageError(f"Expected ẋ = 0 for the constants of a system{under}, got others; leave them out.")
 
 
 def domain_around(

@@ -11,12 +11,7 @@ from lyapnet.certification.certificates import FROZEN
 from lyapnet.certification.funnel import SoundClaim, sound_claim
 from lyapnet.certification.least_cost import DEGREE, LowerClaim, lower_claim
 from lyapnet.certification.proof import Progress
-from lyapnet.certification.sound_certificate import (
-    SoundCertificate,
-    default_delta,
-    listed,
-    parse_set,
-)
+from lyapnet.certification.sound_certificate import SoundCertificate, default_delta, listed, parse_set
 from lyapnet.certification.verdict import Verdict
 from lyapnet.controller import Controller
 from lyapnet.evaluation.optimality import ratio_of_means

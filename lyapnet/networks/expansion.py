@@ -83,7 +83,7 @@ class ExpansionNetwork(ValueFunction):
     def forward(self, t: Time, x: State) -> PerState:
         c, p, H, delta = self._around(t, x)
         xi = delta @ self.coordinates
-        rest = self._share(t, self._near(xi)) * self.network(t, xi)
+        rest = self._fading(t, 1 - self.at_goal * self._near(xi)) * self.network(t, xi)
         return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * rest
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
@@ -92,20 +92,15 @@ class ExpansionNetwork(ValueFunction):
         xi = delta @ self.coordinates
         N, N_xi = self.network.value_and_state_gradient(t, xi)
         near, curved = self._near(xi), apply(H, delta)
-        share = self._share(t, near)
+        share = self._fading(t, 1 - self.at_goal * near)
         value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
-        rest_xi = share[..., None] * N_xi + (self._share_slope(t, near) * N)[..., None] * self._moving(xi)
+        slope = self._fading(t, 2 * self.at_goal * near**2)
+        rest_xi = share[..., None] * N_xi + (slope * N)[..., None] * self._moving(xi)
         return value, p + curved + self.scale * (rest_xi @ self.coordinates.mT)
 
-    def _share(self, t: Time, near: PerState) -> PerState:
-        """ρ, of which nothing is left at T where the expansion is φ there."""
-        share = 1 - self.at_goal * near
-        return share * (1 - self.ends * t / self.duration) if self.smooth else share
-
-    def _share_slope(self, t: Time, near: PerState) -> PerState:
-        """∂ρ/∂ξ_y, over ξ_y."""
-        slope = 2 * self.at_goal * near**2
-        return slope * (1 - self.ends * t / self.duration) if self.smooth else slope
+    def _fading(self, t: Time, rho: PerState) -> PerState:
+        """ρ, or its slope, of which nothing is left at T where the expansion is φ there."""
+        return rho * (1 - self.ends * t / self.duration) if self.smooth else rho
 
     def _near(self, xi: State) -> PerState:
         """1 / (1 + ‖ξ_y‖²)."""

@@ -30,6 +30,7 @@ class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
     held: bool = False  # whether u is made to be held for Δt from t on
+    origin: str = ""  # where V and u come from, in words, if they were made elsewhere
     system: ControlAffineSystem
     cost: Cost
     controls: ControlSet

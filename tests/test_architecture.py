@@ -30,7 +30,7 @@ LEVELS = (
     {"config"},
     {"build"},
     {"controller"},
-    {"evaluation", "export", "loading"},
+    {"evaluation", "export", "importing", "loading"},
     {"certification"},
     {"bench", "training", "view", "zoo"},
     {"comparison"},

@@ -16,6 +16,7 @@ from lyapnet.certification.region import RegionClaim, region_claim
 from lyapnet.certification.sound_certificate import listed, parse_set
 from lyapnet.certification.tables import floored
 from lyapnet.controller import Controller
+from lyapnet.policy import ValuePolicy
 from lyapnet.random_streams import CERTIFICATION, stream
 
 PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the region they begin
@@ -85,9 +86,14 @@ class RegionCertificate(Certificate):
             f"to one equilibrium exponentially, for ever, which is within {claim.contraction.offset:.3g} of the goal "
             f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
-            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} It is about the operations that "
-            f"f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
+            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} {self._origin()}"
+            f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
         )
+
+    def _origin(self) -> str:
+        """Where V and u were made elsewhere, what they are."""
+        policy = self.controller.closed_loop.policy
+        return f"{policy.origin} " if isinstance(policy, ValuePolicy) and policy.origin else ""
 
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction

@@ -270,6 +270,11 @@ def region(
             "λ, at which V(0, ·) has to fall, in 1/s; 1 % of 1/T if none.",
         ),
     ] = None,
+    value: Annotated[
+        Path | None,
+        typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
+    ] = None,
+    law: Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")] = None,
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
@@ -290,6 +295,7 @@ def region(
     if states is not None:
         parse_set(states)
     require_writable(figure, report)
+    given = given.with_functions(value, law)
     controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
         certificate = region_certificate(
@@ -345,6 +351,6 @@ def _write(certificate: Any, given: Given, as_json: bool, figure: Path | None, r
 
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))
-    command = certificate.command(str(given.checkpoint), given.at or [], **given.own)
+    command = certificate.command(str(given.checkpoint), given.at or [], **given.again)
     for path in write_outputs(certificate, given.checkpoint, command, figure, report):
         Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

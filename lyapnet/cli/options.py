@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +38,7 @@ class Given:
     checkpoint: Path
     own: dict[str, str | None]  # the user's own parts, as module:Class, each by its option's name
     at: list[str] | None
+    functions: tuple[Path, Path] | None = None  # ONNX files of V and u made elsewhere; the checkpoint is a config then
 
     @property
     def title(self) -> str:
@@ -45,7 +46,23 @@ class Given:
         from lyapnet.checkpoint import ZOO
 
         name = f"zoo:{self.checkpoint.stem}" if self.checkpoint.parent == ZOO else str(self.checkpoint)
-        return f"{name}, {', '.join(self.at)}" if self.at else name
+        return ", ".join([name, *(self.at or []), *(path.name for path in self.functions or ())])
+
+    @property
+    def again(self) -> dict[str, str | None]:
+        """The options that give the same controller again, but for --at."""
+        return {**self.own, **dict(zip(("value", "law"), map(str, self.functions or ()), strict=False))}
+
+    def with_functions(self, value: Path | None, law: Path | None) -> "Given":
+        """The same with V and u of their own files, where there are both; a config in the place of a checkpoint."""
+        from lyapnet.errors import UsageError
+
+        if value is None and law is None:
+            return self
+        if value is None or law is None or self.at:
+            got = "--at" if self.at else "one"
+            raise UsageError(f"Expected --value and --law, both and without --at, got {got}; a proof is about V and u.")
+        return replace(self, functions=(value, law))
 
     def of(self, checkpoint: Path) -> "Given":
         """The same of another checkpoint."""
@@ -64,8 +81,12 @@ class Given:
         """The controller."""
         import torch
 
+        from lyapnet.importing import controller_of_files
         from lyapnet.loading import load
 
+        if self.functions is not None:
+            named = {part: name for part, name in self.own.items() if name is not None}
+            return controller_of_files(self.checkpoint, *self.functions, named)
         controller = load(self.checkpoint, **vars(self.parts()))
         torch.set_num_threads(controller.config.training.threads)
         return member_of(controller, self.at) if self.at else controller

@@ -1,0 +1,137 @@
+"""A V(x) and a law u(x) that were made elsewhere, as a controller."""
+
+import copy
+import logging
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.calculus import ValueFunction
+from lyapnet.config import Config
+from lyapnet.contracts import called, copied
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from lyapnet.policy import ValuePolicy
+from lyapnet.problem import Problem
+from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Rollout
+from lyapnet.types import Control, PerState, State, Time
+
+STATES = 1000  # at which functions of others are tried
+LEAVES = 1e-6  # of the largest |u|, by which it may be outside of U: rounding in float32
+
+
+class GivenValue(ValueFunction):
+    """V(t, x) = v(x) − v(x*), the same at every t.
+
+    Args:
+        function: v, (k, n) ↦ (k,) or (k, 1).
+        goal: x*.
+    """
+
+    at_goal: Tensor
+
+    def __init__(self, function: nn.Module, goal: State):
+        super().__init__()
+        self.function = function
+        with torch.no_grad():
+            self.register_buffer("at_goal", self._of(goal))
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self._of(x) - self.at_goal
+
+    def _of(self, x: State) -> PerState:
+        return self.function(x.reshape(-1, x.shape[-1])).reshape(x.shape[:-1])
+
+
+class GivenLaw(ValuePolicy):
+    """u(t, x) = the point of U closest to k(x), at every t; V stands beside it, and does not define it.
+
+    Args:
+        function: k, (k, n) ↦ (k, m).
+        origin: where v and k come from, in words.
+    """
+
+    def __init__(self, problem: Problem, V: GivenValue, function: nn.Module, origin: str = "functions from Python"):
+        super().__init__(problem, V)
+        self.function = function
+        limits = ", clamped to U," if self.controls.limited else ""
+        self.origin = (
+            f"V(0, x) is V(x) − V(x*) with V(x*) = {float(V.at_goal)!r}, and u(0, x) is u(x){limits} of {origin}."
+        )
+
+    def forward(self, t: Time, x: State) -> Control:
+        return self.controls.project(self.unlimited(x))
+
+    def unlimited(self, x: State) -> Control:
+        """k(x), (*batch, m)."""
+        return self.function(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.system.m)
+
+
+def controller_of(
+    problem: Problem,
+    value: nn.Module,
+    law: nn.Module,
+    origin: str = "functions from Python",
+    config: Config | None = None,
+) -> Controller:
+    """A controller of V(x) and u(x) that were made elsewhere, for `certify region` and its like.
+
+    Copies in float64 are taken, of the weights as they are: later training does not change them.
+
+    Args:
+        problem: of which system, X₀, goal and controls count; u(x) is clamped to U, and V is counted from V(x*).
+        value: (k, n) ↦ (k,) or (k, 1).
+        law: (k, n) ↦ (k, m).
+        origin: where both come from, as a certificate says it.
+        config: that the problem comes from, for reports.
+
+    Raises:
+        UsageError: it is about a family, or V or u has another shape.
+    """
+    if problem.system.constants:
+        raise UsageError("Expected one system, got a family; V(x) and u(x) are of a single one.")
+    problem = copied(problem)
+    v, k = (copy.deepcopy(each).double().cpu().eval().requires_grad_(False) for each in (value, law))
+    for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):
+        _require_size(name, function, problem.goal, size)
+    V = GivenValue(v, problem.goal)
+    policy = GivenLaw(problem, V, k, origin)
+    _note_where_it_leaves(policy, problem)
+    return Controller(problem, V, Rollout(problem, policy, gradient="backprop"), config=config)
+
+
+def states_around(problem: Problem) -> State:
+    """States at which functions of others are tried: half of them of X₀, half of a box three times as wide."""
+    box, generator = problem.initial_states, stream(0, TEST, 2)
+    near, wide = (box.sample(STATES // 2, generator).double() for _ in range(2))
+    return torch.cat([near, box.center + 3 * (wide - box.center)])
+
+
+def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
+    """Log a note where u(x) is not in U."""
+    x = states_around(problem)
+    with torch.no_grad():
+        u = policy.unlimited(x)
+    apart = (u - policy.controls.project(u)).abs().amax(-1) > LEAVES * u.abs().amax()
+    if bool(apart.any()):
+        first = int(apart.int().argmax())
+        logging.getLogger(__name__).warning(
+            "note: u(x) leaves U, as at x = %s with u = %s: what is certified is u(x) clamped to U.",
+            [round(each, 6) for each in x[first].tolist()], [round(each, 6) for each in u[first].tolist()],
+        )  # fmt: skip
+
+
+def _require_size(name: str, function: nn.Module, goal: State, size: int) -> None:
+    """Refuse a function that does not give so many finite numbers at x*."""
+    with torch.no_grad():
+        found = called(name, function, [goal[None]])
+    if not isinstance(found, Tensor) or found.numel() != size:
+        got = f"{found.numel()}" if isinstance(found, Tensor) else type(found).__name__
+        raise UsageError(
+            f"Expected {name} with {size} number{'s' * (size != 1)} for a state, got {got}; look whether V and u are "
+            "swapped, and whether they are about this system."
+        )
+    if not bool(cast(Tensor, found).isfinite().all()):
+        raise UsageError(f"Expected finite {name} at the goal, got {found.flatten().tolist()}; correct it.")

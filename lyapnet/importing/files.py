@@ -36,7 +36,7 @@ def controller_of_files(
     if problem.system.constants:
         raise UsageError("Expected a config of one system, got a family; V(x) and u(x) are of a single one.")
     (v, told_v), (k, told_k) = (_function(Path(path), problem) for path in (value, law))
-    origin = f"{told_v} and {told_k}, of one state at a time, in real numbers with the files' own weights"
+    origin = f"those of {told_v}, and of {told_k}, read as functions of one state in real numbers"
     about = replace(
         resolved,
         network=replace(resolved.network, name=Path(value).name),
@@ -51,7 +51,7 @@ def _function(path: Path, problem: Problem) -> tuple[OnnxFunction, str]:
     function = OnnxFunction(model.proto, problem.system.n, path.name)
     apart = require_same(function, model.proto, states_around(problem))
     files = " with ".join(f"{name} (SHA-256 {digest})" for name, digest in model.digests.items())
-    return function, f"{files}, within {apart:.1e} of onnxruntime's on {STATES} states"
+    return function, f"{files}, which onnxruntime evaluates within {apart:.1e} of it on {STATES} states"
 
 
 def _config_of(path: Path) -> Config:

@@ -56,9 +56,10 @@ class GivenLaw(ValuePolicy):
     def __init__(self, problem: Problem, V: GivenValue, function: nn.Module, origin: str = "functions from Python"):
         super().__init__(problem, V)
         self.function = function
-        limits = ", clamped to U," if self.controls.limited else ""
+        limits = " clamped to U" if self.controls.limited else ""
         self.origin = (
-            f"V(0, x) is V(x) − V(x*) with V(x*) = {float(V.at_goal)!r}, and u(0, x) is u(x){limits} of {origin}."
+            f"V(0, x) is V(x) − V(x*) with V(x*) = {float(V.at_goal)!r}, u(0, x) is u(x){limits}, and V and u are "
+            f"{origin}."
         )
 
     def forward(self, t: Time, x: State) -> Control:

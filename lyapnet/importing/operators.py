@@ -13,8 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-FLOATS = {1, 10, 11, 16}  # onnx.TensorProto: float, float16, double, bfloat16; real numbers here, each taken as float64
-TRUTH = 9
+KINDS = {  # onnx.TensorProto: float and double, which are real numbers here; truths; integers
+    **dict.fromkeys((1, 11), torch.float64),
+    9: torch.bool,
+    **dict.fromkeys((2, 3, 4, 5, 6, 7, 12, 13), torch.int64),
+}
 
 
 class Operator(NamedTuple):
@@ -55,7 +58,10 @@ def _divide(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _cast(x: Tensor, to: int, saturate: int = 1) -> Tensor:
-    return x.to(torch.float64 if to in FLOATS else torch.bool if to == TRUTH else torch.int64)
+    """x as another kind of number; less than float32 is none, as that would round."""
+    if to not in KINDS:
+        raise ValueError(f"type {to} of onnx.TensorProto in the place of float or double")
+    return x.to(KINDS[to])
 
 
 def _constant_of_shape(shape: list[int], value: Tensor | None = None) -> Tensor:
@@ -113,7 +119,11 @@ def _gather(x: Tensor, indices: Any, axis: int = 0) -> Tensor:
 def _split(
     x: Tensor, split: list[int] | None = None, axis: int = 0, num_outputs: int | None = None
 ) -> Sequence[Tensor]:
-    return x.split(split if split is not None else math.ceil(x.shape[axis] / (num_outputs or 1)), axis)
+    size = x.shape[axis]
+    if split is None:
+        part = math.ceil(size / (num_outputs or 1))
+        split = [min(part, size - start) for start in range(0, size, part)]
+    return [x.narrow(axis, sum(split[:k]), each) for k, each in enumerate(split)]
 
 
 def _reducing(function: Callable[..., Tensor]) -> Operator:
@@ -155,7 +165,7 @@ OPERATORS: dict[str, Operator] = {
             "Flatten": _flatten, "Transpose": _transpose, "Cast": _cast, "Constant": _constant,
             "Concat": lambda *tensors, axis: torch.cat(tensors, axis),
             "LeakyRelu": lambda x, alpha=0.01: functional.leaky_relu(x, alpha),
-            "Elu": lambda x, alpha=1.0: functional.elu(x, alpha),
+            "Elu": lambda x, alpha=1.0: x.relu() + alpha * (torch.exp(x.clamp(max=0)) - 1),
             "Shape": lambda x, start=0, end=None: torch.tensor(x.shape[start:end]),
         }.items()
     },

@@ -81,12 +81,12 @@ class Given:
         """The controller."""
         import torch
 
-        from lyapnet.importing import controller_of_files
+        from lyapnet.importing import imported_controller
         from lyapnet.loading import load
 
         if self.functions is not None:
             named = {part: name for part, name in self.own.items() if name is not None}
-            return controller_of_files(self.checkpoint, *self.functions, named)
+            return imported_controller(self.checkpoint, *self.functions, named)
         controller = load(self.checkpoint, **vars(self.parts()))
         torch.set_num_threads(controller.config.training.threads)
         return member_of(controller, self.at) if self.at else controller

@@ -1,6 +1,6 @@
 """V(x) and u(x) that were made elsewhere, as functions in Python or ONNX files, for the certificates."""
 
-from lyapnet.importing.files import controller_of_files
+from lyapnet.importing.files import imported_controller
 from lyapnet.importing.law import GivenLaw, GivenValue, controller_of
 
-__all__ = ["GivenLaw", "GivenValue", "controller_of", "controller_of_files"]
+__all__ = ["GivenLaw", "GivenValue", "controller_of", "imported_controller"]

@@ -91,8 +91,7 @@ def controller_of(
     Raises:
         UsageError: it is about a family, or V or u has another shape.
     """
-    if problem.system.constants:
-        raise UsageError("Expected one system, got a family; V(x) and u(x) are of a single one.")
+    require_one_system(problem)
     problem = copied(problem)
     v, k = (copy.deepcopy(each).double().cpu().eval().requires_grad_(False) for each in (value, law))
     for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):
@@ -101,6 +100,12 @@ def controller_of(
     policy = GivenLaw(problem, V, k, origin)
     _note_where_it_leaves(policy, problem)
     return Controller(problem, V, Rollout(problem, policy, gradient="backprop"), config=config)
+
+
+def require_one_system(problem: Problem) -> None:
+    """Refuse a family."""
+    if problem.system.constants:
+        raise UsageError("Expected one system, got a family; V(x) and u(x) are of a single one.")
 
 
 def states_around(problem: Problem) -> State:

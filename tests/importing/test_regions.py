@@ -13,7 +13,7 @@ from lyapnet.certification import Budget, region_claim
 from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.cli import main
 from lyapnet.errors import UsageError
-from lyapnet.importing import controller_of, controller_of_files
+from lyapnet.importing import controller_of, imported_controller
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator, Linear
 from tests.certification.planted import cost, riccati
@@ -96,7 +96,7 @@ def test_files_and_functions_from_python_are_one_claim(tmp_path):
     with torch.no_grad():
         u.weight.copy_(torch.from_numpy(-K))
     about = problem_of(DoubleIntegrator(), cost(), 100, 0.1, X0)
-    mine, theirs = claimed(controller_of(about, V(), u)), claimed(controller_of_files(*files(tmp_path)))
+    mine, theirs = claimed(controller_of(about, V(), u)), claimed(imported_controller(*files(tmp_path)))
     assert mine.verdict == theirs.verdict == "certified"
     assert mine.rho == pytest.approx(theirs.rho, rel=1e-9)
 
@@ -129,9 +129,9 @@ def test_a_copy_is_certified_that_later_training_does_not_change():
 
 
 def test_limits_clamp_the_law_and_it_is_said(tmp_path, caplog):
-    free = claimed(controller_of_files(*files(tmp_path)))
+    free = claimed(imported_controller(*files(tmp_path)))
     with caplog.at_level(logging.WARNING):
-        controller = controller_of_files(*files(tmp_path, config=LIMITED))
+        controller = imported_controller(*files(tmp_path, config=LIMITED))
     assert "note: u(x) leaves U, as at x = [" in caplog.text
     claim = claimed(controller)
     assert 0 < claim.rho < 0.9 * free.rho, "limits cost something here"
@@ -143,7 +143,7 @@ def test_limits_clamp_the_law_and_it_is_said(tmp_path, caplog):
 
 
 def test_between_limits_the_region_is_what_a_grid_says(tmp_path):
-    claim = claimed(controller_of_files(*files(tmp_path, config=LIMITED)))
+    claim = claimed(imported_controller(*files(tmp_path, config=LIMITED)))
     x = torch.cartesian_prod(*(torch.linspace(-float(side), float(side), 400, dtype=torch.float64) for side in D.upper))
     slope, u = 2 * x @ torch.from_numpy(P), (-x @ torch.from_numpy(K).mT).clamp(-1.5, 1.5)
     fall = slope[:, 0] * x[:, 1] + slope[:, 1] * u[:, 0]
@@ -155,7 +155,7 @@ def test_a_law_within_its_limits_makes_no_note(tmp_path, caplog):
     saturated = [("Div", ["u", "most"], ["s"], {}), ("Tanh", ["s"], ["z"], {}), ("Mul", ["z", "most"], ["y"], {})]
     with caplog.at_level(logging.WARNING):
         model = linear(K, saturated, {"most": 1.5}, kind=FLOAT)
-        controller = controller_of_files(*files(tmp_path, u=model, config=LIMITED))
+        controller = imported_controller(*files(tmp_path, u=model, config=LIMITED))
     assert not caplog.text
     assert claimed(controller).verdict == "certified"
 
@@ -270,7 +270,7 @@ def rise(controller, point, side):
 @pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 20))])
 def test_no_region_is_certified_over_a_planted_bump(kind, seed, tmp_path):
     V, u, point, side = planted(kind, seed)
-    controller = controller_of_files(*files(tmp_path, V, u))
+    controller = imported_controller(*files(tmp_path, V, u))
     lowest = rise(controller, point, side)
     assert lowest < math.inf, "the bump counts"
     claim = claimed(controller, 3000, 20.0)
@@ -280,7 +280,7 @@ def test_no_region_is_certified_over_a_planted_bump(kind, seed, tmp_path):
 def test_without_a_bump_it_is_certified(tmp_path):
     """The twin, of height 0."""
     nodes, constants = bump("v", 0.0, [0.5, 0.5], 0.1)
-    controller = controller_of_files(*files(tmp_path, quadratic(P, nodes, constants)))
+    controller = imported_controller(*files(tmp_path, quadratic(P, nodes, constants)))
     assert rise(controller, [0.5, 0.5], 0.1) == math.inf
     assert claimed(controller).verdict == "certified"
 
@@ -307,7 +307,7 @@ def test_a_family_is_refused(tmp_path, capsys):
         CONFIG.replace("double_integrator", "cartpole").replace("[-0.2, -0.2]", "[-0.2]").replace("[0.2, 0.2]", "[0.2]")
     )
     error = refused(tmp_path, capsys, config=config + "family: {pole_mass: [0.1, 0.2]}\n")
-    assert "Expected a config of one system, got a family" in error
+    assert "Expected one system, got a family" in error
     assert "Expected one system, got a family" in family_from_python()
 
 
@@ -343,5 +343,5 @@ class Norm(nn.Module):
 
 
 def test_a_model_written_for_float32_is_certified(tmp_path):
-    controller = controller_of_files(*files(tmp_path, quadratic(P, kind=FLOAT), linear(K, kind=FLOAT)))
+    controller = imported_controller(*files(tmp_path, quadratic(P, kind=FLOAT), linear(K, kind=FLOAT)))
     assert claimed(controller).verdict == "certified"

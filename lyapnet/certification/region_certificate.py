@@ -48,6 +48,7 @@ class RegionCertificate(Certificate):
         "boxes": "boxes",
         "seconds": "seconds",
         "fingerprint": "fingerprint of what was bounded",
+        "origin": "V and u",
     }
     claim: RegionClaim
 
@@ -69,7 +70,7 @@ class RegionCertificate(Certificate):
             "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
             "constraints": list(claim.constraints) if proved else [],
             "counterexample": found and {"x": found.x, "condition": found.condition, "V": found.height},
-            "seconds": claim.seconds, **around, **searched,
+            "seconds": claim.seconds, **around, **searched, **({"origin": self._origin} if self._origin else {}),
         }  # fmt: skip
 
     def in_words(self) -> str:
@@ -79,6 +80,7 @@ class RegionCertificate(Certificate):
         names = self.controller.system.state_names
         left_out = ", ".join(names[i] for i in claim.left_out)
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
+        origin = f" {self._origin}" * bool(self._origin)
         assert claim.contraction is not None
         return (
             f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} is a region of attraction of the receding law u(0, x), "
@@ -86,14 +88,15 @@ class RegionCertificate(Certificate):
             f"to one equilibrium exponentially, for ever, which is within {claim.contraction.offset:.3g} of the goal "
             f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
-            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''} {self._origin()}"
-            f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
+            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} It is about the operations "
+            f"that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
         )
 
+    @property
     def _origin(self) -> str:
         """Where V and u were made elsewhere, what they are."""
         policy = self.controller.closed_loop.policy
-        return f"{policy.origin} " if isinstance(policy, ValuePolicy) and policy.origin else ""
+        return policy.origin if isinstance(policy, ValuePolicy) else ""
 
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction

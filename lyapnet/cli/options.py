@@ -81,13 +81,15 @@ class Given:
         """The controller."""
         import torch
 
-        from lyapnet.importing import imported_controller
         from lyapnet.loading import load
 
-        if self.functions is not None:
+        if self.functions is None:
+            controller = load(self.checkpoint, **vars(self.parts()))
+        else:
+            from lyapnet.importing import imported_controller
+
             named = {part: name for part, name in self.own.items() if name is not None}
-            return imported_controller(self.checkpoint, *self.functions, named)
-        controller = load(self.checkpoint, **vars(self.parts()))
+            controller = imported_controller(self.checkpoint, *self.functions, named)
         torch.set_num_threads(controller.config.training.threads)
         return member_of(controller, self.at) if self.at else controller
 

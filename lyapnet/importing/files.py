@@ -15,7 +15,7 @@ from lyapnet.importing.onnx_function import OnnxFunction, read_onnx, require_sam
 from lyapnet.problem import Problem
 from lyapnet.schema import read_yaml
 
-COUNTS_NOT = {"cost": {"Q": 1, "R": 1, "Q_T": 1}, "horizon": {"steps": 1000, "dt": 0.01}}  # in a config for this
+COUNTS_NOT = {"cost": {"Q": 0, "R": 1, "Q_T": 0}, "horizon": {"steps": 1000, "dt": 0.01}}  # in a config for this
 
 
 def imported_controller(

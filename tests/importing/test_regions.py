@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from lyapnet.importing import controller_of, imported_controller
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator, Linear
 from tests.certification.planted import cost, riccati
-from tests.importing.models import FLOAT, linear, quadratic, saved
+from tests.importing.models import FLOAT, helper, linear, model_of, quadratic, saved
 from tests.problems import problem_of
 
 pytest.importorskip("onnxruntime")
@@ -123,6 +124,55 @@ def test_a_copy_is_certified_that_later_training_does_not_change():
         V.weight.neg_()
     torch.testing.assert_close(controller.policy(0.0, torch.ones(2)), -torch.from_numpy(K).sum().reshape(1))
     assert controller.value(0.0, torch.ones(2)) == pytest.approx(P.sum())
+
+
+BRAKE = """
+import torch
+from lyapnet import ControlAffineSystem
+
+class Brake(ControlAffineSystem):
+    state_names, state_units = ("position", "velocity"), ("m", "m/s")
+    control_names, control_units = ("force",), ("N",)
+
+    def f(self, x):
+        return torch.stack([x[..., 1], 0 * x[..., 1]], -1)
+
+    def g(self, x):
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
+"""
+
+
+def test_a_state_that_nothing_depends_on_is_left_out(tmp_path, capsys, monkeypatch):
+    """A brake of the user's own: V = v², u = −v, wherever it is."""
+    (tmp_path / "brake_of_mine.py").write_text(BRAKE, encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    velocity, second = ("Gather", ["x", "second"], ["v"], {"axis": 1}), {"second": np.array([1])}
+    V = model_of([velocity, ("Mul", ["v", "v"], ["y"], {})], second)
+    u = model_of([velocity, ("Neg", ["v"], ["y"], {})], second)
+    try:
+        result = certified(tmp_path, capsys, "--system=brake_of_mine:Brake", V=V, u=u)
+    finally:
+        sys.modules.pop("brake_of_mine", None)
+    assert result["verdict"] == "certified"
+    assert result["states_left_out"] == ["position"]
+    assert result["rho"] == pytest.approx(16.0, rel=1e-6)
+
+
+def test_the_goal_is_that_of_the_config(tmp_path, capsys):
+    """V and u about x* = (0.1, 0), where V is not 0."""
+    config = CONFIG + "target: [0.1, 0.0]\n"
+    goal = {"goal": np.array([[0.1, 0.0]])}
+    V = quadratic(P, [("Add", ["v", "shift"], ["y"], {})], {"shift": 3.0, **goal})
+    u = linear(K, constants=goal)
+    for model in (V, u):
+        for node in model.graph.node:
+            node.input[:] = ["e" if each == "x" else each for each in node.input]
+        model.graph.node.insert(0, helper.make_node("Sub", ["x", "goal"], ["e"]))
+    result = certified(tmp_path, capsys, V=V, u=u, config=config)
+    assert result["verdict"] == "certified"
+    assert result["equilibrium_offset"] < 1e-12
+    elsewhere = certified(tmp_path, capsys, "--seconds=5", V=V, u=u)
+    assert elsewhere["equilibrium_offset"] >= 0.1, "0 is none"
 
 
 # What limits do
@@ -329,6 +379,7 @@ def test_the_report_says_what_it_is_about_and_repeats_it(tmp_path, capsys):
     for name in ("value", "law"):
         assert f"--{name}={tmp_path}" in report["command"]
     assert "SHA-256" in report["claim"]["words"]
+    assert "u(x) clamped to U" in report["certificate"]["origin"]
 
 
 def test_limits_of_the_problem_are_those_of_the_law():

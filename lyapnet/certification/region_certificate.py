@@ -88,8 +88,8 @@ class RegionCertificate(Certificate):
             f"to one equilibrium exponentially, for ever, which is within {claim.contraction.offset:.3g} of the goal "
             f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
-            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} It is about the operations "
-            f"that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
+            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
+            f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
         )
 
     @property

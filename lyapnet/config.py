@@ -63,6 +63,8 @@ class ProgramConfig:
     )
     margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
     bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
+    share: float | None = option(None, "Share of ℓ by which V falls at least (region only).", above=0)
+    growth: float | None = option(None, "Weight of the share of D outside the region (region only).", at_least=0)
     parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
 
 
@@ -70,7 +72,9 @@ class ProgramConfig:
 class PointwiseConfig:
     """The program's condition off the closed loops, as a certificate asks for it; see PointwiseCondition."""
 
-    weight: float = option(0.0, "Weight of the condition at points of [0, T] × D.", at_least=0)
+    weight: float | None = option(
+        None, "Weight of the condition at points of [0, T] × D; null: 0, with the region program 5.", at_least=0
+    )
     points: int = option(512, "Points in each step.", at_least=2)
     region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
     counterexamples: str | None = option(
@@ -145,6 +149,7 @@ class HorizonConfig:
 
     steps: int = option(MISSING, "N, the number of time steps.", at_least=1)
     dt: float = option(0.01, "Δt in seconds.", above=0)
+    stationary: bool = option(False, "A task without end: V(x), and the regulator's cost as φ.")
 
 
 @dataclass

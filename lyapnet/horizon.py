@@ -33,6 +33,8 @@ class Horizon:
 
     Args:
         method: of a step with u held over it, a key of TABLEAUX.
+        stationary: whether the task has no end, so that V is a function of the state alone, and φ stands for what comes
+            after T.
 
     Raises:
         ValueError: no step, Δt not positive, or an unknown method.
@@ -41,6 +43,7 @@ class Horizon:
     steps: int
     dt: float
     method: str = "euler"
+    stationary: bool = False
 
     def __post_init__(self) -> None:
         if self.steps < 1:

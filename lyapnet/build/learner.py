@@ -12,7 +12,15 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
-from lyapnet.networks import CentredNetwork, ExpansionNetwork, IgnoringStates, Scaling, TerminalAnchor
+from lyapnet.networks import (
+    CentredNetwork,
+    ExpansionNetwork,
+    IgnoringStates,
+    Scaling,
+    StationaryNetwork,
+    TerminalAnchor,
+    Timeless,
+)
 from lyapnet.policy import POLICIES
 from lyapnet.problem import Problem
 from lyapnet.programs import Program
@@ -31,6 +39,8 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
     """
     options, n = config.network, problem.system.n
     cls, kept = network or class_of(config, "network"), _kept_states(config, problem.system)
+    if problem.horizon.stationary and cls is ExpansionNetwork:  # the standard one
+        cls = StationaryNetwork
     angles = [kept.index(angle) for angle in problem.system.angles if angle in kept]
     chosen: dict[str, Any] = {
         "hidden": options.hidden,
@@ -54,10 +64,12 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         torch.manual_seed(config.seed)
         V = cls(scaling=_scaling(config, problem, kept), **chosen)
         goal = problem.goal.double().cpu()[kept]
-        if goal.any() and not isinstance(V, ExpansionNetwork):  # which has its own centre
+        if goal.any() and not isinstance(V, ExpansionNetwork | StationaryNetwork):  # which have their own centre
             V = CentredNetwork(V, goal)
         if options.terminal == "exact":
             V = TerminalAnchor(V, _terminal_cost(problem, kept), problem.horizon.duration)
+        if problem.horizon.stationary and not isinstance(V, StationaryNetwork):
+            V = Timeless(V)
         if len(kept) < n:
             V = IgnoringStates(V, kept, n)
     return V.to(DTYPES[config.training.precision])

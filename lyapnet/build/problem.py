@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,10 +13,20 @@ from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
 from lyapnet.build.constraints import ball_of, build_constraints
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
+from lyapnet.build.stationary import without_end
 from lyapnet.build.target import about_target
 from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
 from lyapnet.contracts import initialised
-from lyapnet.cost import COSTS, Cost, MadeOfAnother, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost
+from lyapnet.cost import (
+    COSTS,
+    Cost,
+    MadeOfAnother,
+    ObstacleCost,
+    PeriodicCost,
+    PseudoHuberCost,
+    QuadraticCost,
+    RegulatorTail,
+)
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.problem import Problem
@@ -49,9 +60,9 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         with section("horizon"):
             method = config.rollout.method
             held = method if method in TABLEAUX else "rk4"  # of an adaptive method
-            horizon = Horizon(config.horizon.steps, config.horizon.dt, held)
+            horizon = Horizon(config.horizon.steps, config.horizon.dt, held, config.horizon.stationary)
         with section("cost"):
-            cost = build_cost(config.cost, system) if cost is None else cost.double()
+            cost = build_cost(_weights(config), system) if cost is None else cost.double()
             if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
                 cost = PseudoHuberCost(cost, config.cost.huber)
         with section("controls"):
@@ -63,9 +74,22 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
+        if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
+            problem = without_end(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         return problem.to(dtype)
+
+
+def _weights(config: Config) -> CostConfig:
+    """The cost section; with stationary V, of which no Q_T is asked, Q in its place until φ is known."""
+    if not config.horizon.stationary:
+        return config.cost
+    if config.family:
+        raise UsageError("Expected one system with horizon.stationary, got a family; train one V for each member.")
+    if config.cost.Q_T is not None:
+        raise UsageError("Expected no cost.Q_T with horizon.stationary, got one; φ is the regulator's: remove it.")
+    return replace(config.cost, Q_T=config.cost.Q)
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:

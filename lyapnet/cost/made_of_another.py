@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lyapnet.cost.base import Cost
+from lyapnet.cost.base import Cost, quadratic_form
 from lyapnet.cost.quadratic import is_quadratic
+from lyapnet.linear_algebra import apply
 from lyapnet.types import ControlMatrix, PerState, State
 
 
@@ -149,6 +150,34 @@ class PseudoHuberCost(MadeOfAnother):
     def _less(self, q: PerState) -> PerState:
         """h(q) as 2q/(√(1 + q/δ²) + 1), without cancellation near 0."""
         return 2 * q / (torch.sqrt(1 + q / self.delta**2) + 1)
+
+
+class RegulatorTail(MadeOfAnother):
+    """Another cost whose φ is (x − x*)ᵀP(x − x*), what a linear-quadratic regulator goes on to pay from x for ever.
+
+    Args:
+        cost: q and R.
+        P: (n, n), symmetric positive semidefinite, in units of cost.
+    """
+
+    P: Float[Tensor, "n n"]
+
+    def __init__(self, cost: Cost, P: Tensor):
+        super().__init__(cost)
+        self.register_buffer("P", P, persistent=False)
+        self.words: str = "with what a regulator goes on to pay as φ"
+
+    def terminal(self, x: State) -> PerState:
+        return quadratic_form(self.P, self.from_goal(x))
+
+    def terminal_gradient(self, x: State) -> State:
+        return 2 * apply(self.P, self.from_goal(x))
+
+    def ignores(self, i: int, n: int) -> bool:
+        return self.ignores_at_end(i, n) and self.cost.ignores(i, n)
+
+    def ignores_at_end(self, i: int, n: int) -> bool:
+        return not any(self.P[i])
 
 
 class ObstacleCost(MadeOfAnother):

@@ -12,6 +12,7 @@ from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.networks.ignoring import IgnoringStates
 from lyapnet.networks.quadratic import QuadraticForm
+from lyapnet.networks.stationary import StationaryNetwork, Timeless
 
 NETWORKS: dict[str, type[ValueFunction]] = {
     "fcn": FCN,
@@ -19,6 +20,7 @@ NETWORKS: dict[str, type[ValueFunction]] = {
     "anchored": AnchoredNetwork,
     "quadratic": QuadraticForm,
     "expansion": ExpansionNetwork,
+    "stationary": StationaryNetwork,
 }
 
 __all__ = [
@@ -34,5 +36,7 @@ __all__ = [
     "PartiallyConvexNetwork",
     "QuadraticForm",
     "Scaling",
+    "StationaryNetwork",
     "TerminalAnchor",
+    "Timeless",
 ]

@@ -40,6 +40,7 @@ class Program(ABC):
     degree: ClassVar[int]  # all terms but J are of this degree in units of cost
     weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
     recommended: ClassVar[Mapping[str, float | bool]] = {}  # arguments in the standard recipe
+    pointwise: ClassVar[float] = 0.0  # the weight of its condition at points off the closed loops, unless it is given
 
     constraint: float = 1.0
     terminal: float = 0.0

@@ -11,6 +11,8 @@ from lyapnet.sets import Box
 from lyapnet.types import PerState, State, Time
 
 FLOOR = 0.01  # of the mean running cost (and of the mean cost, at T): violations below it count as absolute ones
+LEAST = 1e-4  # the same of a stationary V, which is right at the goal by construction
+NEAREST = 1 / 300  # of the distance from the goal, to which points are drawn towards it where V is stationary
 SURPLUS = 4  # candidates drawn for each point that is used
 CEILING = 1.2  # times the largest V(0, x₀) of the batch: a funnel of X₀ has no points above
 
@@ -22,11 +24,13 @@ class PointwiseCondition:
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
     with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ one per cent of the batch's mean running and whole cost (denominators are
-    detached). Points with V above what a funnel of X₀ can hold do not count.
+    detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V there is no end, and ℓ₀
+    is 10⁻⁴ of the mean.
 
     The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
     half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
-    ever denser towards T, where V moves fastest; another half is drawn towards the goal, by a factor that is uniform.
+    ever denser towards T, where V moves fastest; another half is drawn towards the goal, by a factor that is uniform,
+    or where V is stationary by one whose logarithm is.
 
     Args:
         rollout: of the law that V defines.
@@ -43,6 +47,7 @@ class PointwiseCondition:
     program: Program
     region: Box
     duration: float
+    stationary: bool
     weight: float
     points: int
     further: Float[Tensor, "k columns"] | None
@@ -60,7 +65,8 @@ class PointwiseCondition:
         if V is None:
             raise ValueError("Expected a control law that a V defines, got another one; use a ValuePolicy.")
         self.closed_loop, self.V, self.goal = rollout.closed_loop, V, rollout.problem.goal
-        self.program, self.region, self.duration = program, region, rollout.problem.horizon.duration
+        self.duration, self.stationary = rollout.problem.horizon.duration, rollout.problem.horizon.stationary
+        self.program, self.region = program, region
         self.weight, self.points, self.further = weight, points, further
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
@@ -71,22 +77,28 @@ class PointwiseCondition:
             mean_cost: J̄ of the closed loops of the step.
             largest_value: the largest V(0, x₀) among them.
         """
-        floor, ceiling = FLOOR * mean_cost.detach(), CEILING * largest_value.detach()
-        t, x = (y.to(mean_cost) for y in self.draw(generator))
+        floor = (LEAST if self.stationary else FLOOR) * mean_cost.detach()
+        return self.condition(generator, floor, CEILING * largest_value.detach())
+
+    def condition(self, generator: torch.Generator, floor: Tensor, ceiling: Tensor) -> Float[Tensor, ""]:
+        """The condition at the points of one step, of which those with V above a ceiling do not count."""
+        t, x = (y.to(floor) for y in self.draw(generator))
         with torch.no_grad():
             worst = self._violation(t, x, floor, ceiling).topk(self.points // 2).indices
         t, x = (torch.cat([y[worst], y[: self.points - len(worst)]]) for y in (t, x))
         if self.further is not None:
-            further = self.further.to(mean_cost)
+            further = self.further.to(floor)
             t, x = torch.cat([t, further[:, 0]]), torch.cat([x, further[:, 1:]])
-        return self._violation(t, x, floor, ceiling).mean() + self._end_violation(x, floor, ceiling).mean()
+        violation = self._violation(t, x, floor, ceiling).mean()
+        return violation if self.stationary else violation + self._end_violation(x, floor, ceiling).mean()
 
     def draw(self, generator: torch.Generator) -> tuple[Time, State]:
         """The points of a step before the worst are chosen: SURPLUS times as many as it uses."""
         x = self.region.sample(SURPLUS * self.points, generator)
         share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64)
         goal = self.goal.to(x)
-        x = goal + (x - goal) * torch.where(late < 0.5, 1.0, near)[:, None].to(x)
+        nearer = NEAREST**near if self.stationary else near
+        x = goal + (x - goal) * torch.where(late < 0.5, 1.0, nearer)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)
         return self.duration * (1 - before_end), x
 

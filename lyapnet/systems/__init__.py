@@ -4,11 +4,13 @@ from lyapnet.systems.acrobot import Acrobot
 from lyapnet.systems.base import ControlAffineSystem, MechanicalSystem
 from lyapnet.systems.cartpole import Cartpole
 from lyapnet.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
+from lyapnet.systems.path_tracking import PathTracking
 from lyapnet.systems.pendulum import Pendulum
 from lyapnet.systems.planar_quadrotor import PlanarQuadrotor
 from lyapnet.systems.reacher import Reacher
 from lyapnet.systems.rigid_body import BodyFrameQuadrotor, Quadrotor, Satellite
 from lyapnet.systems.three_link_arm import ThreeLinkArm
+from lyapnet.systems.van_der_pol import VanDerPol
 
 SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "double_integrator": DoubleIntegrator,
@@ -23,6 +25,8 @@ SYSTEMS: dict[str, type[ControlAffineSystem]] = {
     "quadrotor": Quadrotor,
     "body_frame_quadrotor": BodyFrameQuadrotor,
     "satellite": Satellite,
+    "van_der_pol": VanDerPol,
+    "path_tracking": PathTracking,
 }
 
 __all__ = [
@@ -35,11 +39,13 @@ __all__ = [
     "IntegratorChain",
     "Linear",
     "MechanicalSystem",
+    "PathTracking",
     "Pendulum",
     "PlanarQuadrotor",
     "Quadrotor",
     "Reacher",
     "Satellite",
     "ThreeLinkArm",
+    "VanDerPol",
     "is_linear",
 ]

@@ -20,7 +20,7 @@ from lyapnet.build import (
 from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
 from lyapnet.errors import UsageError
 from lyapnet.problem import Problem
-from lyapnet.programs import PointwiseCondition, Program
+from lyapnet.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
@@ -74,7 +74,14 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
         UsageError: a region or a file of counterexamples that does not fit the system.
     """
     options, problem = config.pointwise, rollout.problem
-    if not options.weight:
+    weight = program.pointwise if options.weight is None else options.weight
+    made = RegionCondition if isinstance(program, RegionProgram) else PointwiseCondition
+    if made is RegionCondition and not (problem.horizon.stationary and weight):
+        raise UsageError(
+            "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got none; its V has "
+            "no time, and points of D are what it is about."
+        )
+    if not weight:
         return None
     n, goal, initial_states = problem.system.n, problem.goal, problem.initial_states
     furthest = initial_states.reach_from(goal)
@@ -84,7 +91,7 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
     reach = torch.tensor(extent, dtype=torch.float64).to(goal)
     region = Box(goal - reach, goal + reach)
     further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(goal)
-    return PointwiseCondition(rollout, program, region, options.weight, options.points, further)
+    return made(rollout, program, region, weight, options.points, further)
 
 
 def _points_of(path: Path, n: int) -> Tensor:

@@ -12,7 +12,7 @@ from lyapnet.cost import PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.problem import Problem
-from lyapnet.programs import PointwiseCondition, Program, ProgramOutput
+from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
 from lyapnet.random_streams import POINTS, VALIDATION, stream
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.types import PerState
@@ -68,6 +68,7 @@ class Learner(nn.Module):
         self.output: ProgramOutput | None = None
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
+        self.region_share: Tensor | None = None  # of D, with the region program
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
 
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
@@ -84,9 +85,15 @@ class Learner(nn.Module):
         return output.loss
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
-        """The loss of the validation states and points, kept in `validation_loss`, and their table in `validation`."""
+        """The loss of the validation states and points, kept in `validation_loss`, and their table in `validation`.
+
+        With the region program it is the share of D that is not in the region yet, as far as samples tell.
+        """
         self.validation = measure(self.problem, self.program, trajectory, self.validation_optimum)
         loss = self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+        if isinstance(self.pointwise, RegionCondition):
+            self.region_share = self.pointwise.sampled_share(stream(self.seed, VALIDATION, POINTS))
+            loss = 1 - self.region_share
         self.validation_loss = float(loss)
         return loss
 
@@ -120,6 +127,7 @@ class Learner(nn.Module):
             "constraint_loss/val": summary["constraint_loss"],
             "trajectory_cost/val": summary["cost_mean"],
             "optimality_gap/val": None if ratio is None else ratio - 1,
+            "region_share/val": None if self.region_share is None else float(self.region_share),
             "violated_fraction/val": None if violated is None else float(violated.double().mean()),
             **{
                 f"{name}/val": summary[name]

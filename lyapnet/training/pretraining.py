@@ -21,6 +21,7 @@ STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the f
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
 ROUNDS, GOOD = 4, 1.02  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
+LEAST = 1e-4  # of the cost of its trajectory, against which an error of a stationary V counts where V is less
 TRUSTED, TRUSTED_NEAR = 0.01, 1.0  # ½ δᵀ|H|δ, as a share of J, up to which an expansion is believed
 
 
@@ -34,22 +35,16 @@ class Examples(NamedTuple):
     drifted: State  # F(x_n, u*), where the control that costs nothing leads
     gradient: State  # V_x(t_{n+1}, drifted)
     weight: Tensor  # L⁻¹Bᵀ (k, m, n), LLᵀ = ℓ_uu + Δt BᵀHB, B = F_u/Δt: for what a wrong V_x costs
-    cost: PerState  # J of the trajectory, or the median of all if that is more
-    duration: float  # T
-
-    @property
-    def columns(self) -> list[Tensor]:
-        """All but T."""
-        return list(self[:-1])
+    cost: PerState  # what errors of V are held against: J of the trajectory, or the median of all if that is more
+    rate: PerState  # what excess cost per second is held against: the same per second of T
 
     def with_further(self, others: "Examples") -> "Examples":
         """These and others of the same problem."""
-        columns = (torch.cat(both) for both in zip(self.columns, others.columns, strict=True))
-        return Examples(*columns, self.duration)  # pyright: ignore[reportCallIssue]
+        return Examples(*(torch.cat(both) for both in zip(self, others, strict=True)))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Examples":
         """The same with every column changed alike."""
-        return Examples(*map(change, self.columns), self.duration)  # pyright: ignore[reportCallIssue]
+        return Examples(*map(change, self))
 
     def to(self, like: Tensor) -> "Examples":
         """The same in the precision and on the device of a tensor."""
@@ -93,7 +88,7 @@ def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor]) 
     """The rows at some deviations (N, b, n) from the finite trajectories."""
     problem, optimum = in_float64(problem), _finite(optimum)
     parts = zip(*(_columns(problem, optimum, each) for each in deviations), strict=True)
-    return Examples(*(torch.cat(columns) for columns in parts), problem.horizon.duration)  # pyright: ignore
+    return Examples(*(torch.cat(columns) for columns in parts))
 
 
 def _finite(optimum: Optimum) -> Optimum:
@@ -135,18 +130,22 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tens
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ B.mT
     target = gradient[1:] + apply(H, free.x - x[1:])
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(optimum).expand(here.shape)
-    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], free.x, target, weight, cost)]
+    rate = cost / problem.horizon.duration
+    if problem.horizon.stationary:  # right in relation to what it is at that state, near the goal too
+        rate = (-value.diff(dim=0) / dt).maximum(LEAST * rate)
+        cost = here.maximum(LEAST * cost)
+    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], free.x, target, weight, cost, rate)]
 
 
 def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
     """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹Bᵀ(V_x − V_x*)‖².
 
     The second is what the held controls of V cost beyond the optimum, to second order, as a share of J: a step with
-    controls u + e costs ½ Δt eᵀ(ℓ_uu + Δt BᵀHB)e more.
+    controls u + e costs ½ Δt eᵀ(ℓ_uu + Δt BᵀHB)e more. Of a stationary V, J stands for V* and J/T for ℓ at each state.
     """
-    t, x, value, after, drifted, gradient, weight, cost = (column[rows] for column in examples.columns)
+    t, x, value, after, drifted, gradient, weight, cost, rate = (column[rows] for column in examples)
     wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]
-    excess = examples.duration / 2 * ((wrong**2).sum((-2, -1)) / cost).mean()
+    excess = ((wrong**2).sum((-2, -1)) / (2 * rate)).mean()
     return (((V(t, x) - value) / cost) ** 2).mean(), excess
 
 
@@ -157,6 +156,15 @@ def misfit(V: ValueFunction, examples: Examples) -> float:
     with torch.no_grad():
         value_error, excess = errors(V, some.to(next(V.parameters())))
     return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
+
+
+def relative_misfit(V: ValueFunction, examples: Examples) -> float:
+    """The mean of (log V − log V*)², of a V that is positive but at the goal."""
+    like = next(V.parameters())
+    with torch.no_grad():
+        own, known = V(examples.t.to(like), examples.x.to(like)), examples.value.to(like)
+        least = LEAST * examples.cost.to(like).min()
+        return float((own.maximum(least).log() - known.maximum(least).log()).square().mean().nan_to_num(torch.inf))
 
 
 def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:

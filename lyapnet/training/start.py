@@ -22,12 +22,12 @@ from lyapnet.expansions import (
     path_under,
     riccati,
 )
-from lyapnet.networks import ExpansionNetwork, IgnoringStates
+from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
-from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, typical
+from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, relative_misfit, typical
 from lyapnet.types import Control, PerState, State
 
 STATES = 64  # of X₀, on which a start is tried
@@ -36,6 +36,7 @@ CLOSE, FEW = 1e-5, 16  # share of the cost by which nothing may improve on a law
 SPREAD = 0.35  # of the distances from the goal along optima, in units of which a network begins without an expansion
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 CALM = "V = 0"
+LEVELS = tuple(4.0**-k for k in range(9))  # of the regulator's mean value on X₀, up to which it may be taken for right
 REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 SUBSTEPS = 4  # of fourth order within Δt, for continuous time
 
@@ -109,9 +110,10 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
         take(networks[0], problem, expansion, kept, x0)
         tried.append(_tried(name, learners[0], x0, began))
         networks[0].load_state_dict(calm[0])
-    tried.insert(0, _tried(CALM, learners[0], x0, began))
+    if not problem.horizon.stationary or not expansions:
+        tried.insert(0, _tried(CALM, learners[0], x0, began))
     if expansions:
-        base = _best(tried[1:])
+        base = _best([each for each in tried if each.name != CALM])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
         if _can_be_improved(problem, expansions[base.name], x0[:FEW]):
@@ -165,14 +167,19 @@ def _fitted(
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
     _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
+    found_here = list[Candidate]()
+    if problem.horizon.stationary:
+        found_here.append(_tried("the regulator, up to where it is right", learners[0], x0, began))
+        if _best([base, *found_here]) != base:
+            before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"fitting V to {found} optima")
     for learner in learners:
         fit(learner, optimum, examples)
     fitted = _tried(f"{found} optima from states of X₀", learners[0], x0, began)
-    if _best([base, fitted]) == base:
+    if _best([base, *found_here, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
-    return [fitted]
+    return [*found_here, fitted]
 
 
 def _take_least_wrong(
@@ -183,25 +190,29 @@ def _take_least_wrong(
     examples: Examples,
     x0: State,
 ) -> None:
-    """Put into the networks what a fit to examples begins with: of several expansions, and none, the least wrong one.
+    """Put into the networks what a fit to examples begins with: of several expansions, and none, or of several levels
+    up to which the regulator is taken for right, the least wrong one.
 
     An expansion says much near its own path, and away from it, in a task with limits or several ways to the goal, worse
     than nothing.
     """
     problem, kept, first = learners[0].problem, _kept(learners[0].V), learners[0]
 
-    def put(choice: Expansion | None, learner: Learner, own: dict[str, Tensor]) -> None:
-        network = _network_of(learner.V)
+    def put(choice: tuple[Expansion | None, float], learner: Learner, own: dict[str, Tensor]) -> None:
+        network, (expansion, level) = _network_of(learner.V), choice
         network.load_state_dict(own)
-        if choice is None:
+        if expansion is None:
             take_nothing(network, problem, optimum, kept)
         else:
-            take(network, problem, choice, kept, x0)
+            take(network, problem, expansion, kept, x0, level)
 
-    choices, wrong = [*expansions, None], list[float]()
+    wrong = list[float]()
+    choices: list[tuple[Expansion | None, float]] = [(each, 1.0) for each in (*expansions, None)]
+    if problem.horizon.stationary:
+        choices = [(expansions[0], level) for level in LEVELS]
     for choice in choices:
         put(choice, first, calm[0])
-        wrong.append(misfit(first.V, examples))
+        wrong.append((relative_misfit if problem.horizon.stationary else misfit)(first.V, examples))
     best = choices[wrong.index(min(wrong))]
     for learner, own in zip(learners, calm, strict=True):
         put(best, learner, own)
@@ -239,6 +250,8 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
     if has_rest and all(part.isfinite().all() for part in at_goal):
         yield "the Riccati solution at the goal", at_goal
     centre = problem.initial_states.center.double().cpu()
+    if problem.horizon.stationary:
+        return
     if has_rest and torch.equal(centre, problem.goal.double().cpu()):
         return
     guesses = _guesses(problem, centre, at_goal)
@@ -248,9 +261,26 @@ def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
         yield "the optimum from the centre of X₀", best
 
 
-def take(network: ExpansionNetwork, problem: Problem, expansion: Expansion, kept: list[int], x0: State) -> None:
-    """Start a network from an expansion."""
+def take(
+    network: ExpansionNetwork | StationaryNetwork,
+    problem: Problem,
+    expansion: Expansion,
+    kept: list[int],
+    x0: State,
+    level: float = 1.0,
+) -> None:
+    """Start a network from an expansion.
+
+    Args:
+        level: up to which share of its mean value on X₀ a stationary V takes the regulator for right.
+    """
     expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
+    if isinstance(network, StationaryNetwork):
+        own = network.scale
+        network.take(
+            expansion.x[0].to(own), expansion.hessian[0].to(own), level * float(expansion.initially(x0).mean())
+        )
+        return
     curvature = _curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
     network.take(*(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost))
@@ -297,7 +327,7 @@ def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:
 def _network_of(V: ValueFunction) -> Any:
     """The network that an expansion can be put into, if there is one."""
     inner = V.network if isinstance(V, IgnoringStates) else V
-    return inner if isinstance(inner, ExpansionNetwork) else None
+    return inner if isinstance(inner, ExpansionNetwork | StationaryNetwork) else None
 
 
 def _kept(V: ValueFunction) -> list[int]:

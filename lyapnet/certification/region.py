@@ -30,7 +30,7 @@ from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
-NEW_FILE = "take a new file"
+NEW_FILE = "take another file"
 
 
 @dataclass(frozen=True)

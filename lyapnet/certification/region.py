@@ -16,7 +16,7 @@ from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
-from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of, share_of
+from lyapnet.certification.funnel import LEVELS, for_levels, largest_seen, proof_within, setting_of, share_of
 from lyapnet.certification.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress, Proof
@@ -31,6 +31,7 @@ from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
 NEW_FILE = "take another file"
+REMEDY = f"allow more seconds, or {NEW_FILE}"
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ class RecedingDecrease(DecreaseCondition):
         rim = minimum(self.V, *faces(*over_time(around.box, 0.0), [1 + i for i in seen]), budget)
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
         if proposed is not None and not self.hole < rim:
-            raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got ≥ {rim:g}; {NEW_FILE}.")
+            raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
         self.constraints = OutsideTheHole(self.V, around.box, self.hole)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
@@ -210,15 +211,9 @@ def region_claim(
     if kept is not None:
         kept.require(decay, D)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
-    contraction, slowest = contraction_around(
-        condition.closed_loop, goal, D, seen, for_levels(budget).seconds, kept and (kept.box, kept.coordinates)
-    )
-    proof, rho, level = None, -math.inf, just_below(rim)
-    if kept is not None:
-        level = kept.wanted
-        if contraction is None or not level < rim:
-            what = "a law that contracts on B" if contraction is None else f"V > ρ = {level!r} on the boundary of D"
-            raise UsageError(f"Expected {what} of {str(keep)!r}, got no bounds that say so; {NEW_FILE}.")
+    seconds, proposed = (for_levels(budget).seconds, None) if kept is None else (LEVELS, (kept.box, kept.coordinates))
+    contraction, slowest = contraction_around(condition.closed_loop, goal, D, seen, seconds, proposed)
+    proof, rho, level = None, -math.inf, just_below(rim) if kept is None else kept.level(contraction, rim)
     if contraction is not None:
         condition.open_hole(contraction, seen, level, for_levels(budget), kept and kept.hole)
     if condition.hole > 0:
@@ -252,6 +247,13 @@ class KeptRegion(NamedTuple):
         same = self.states.lower.equal(states.lower) and self.states.upper.equal(states.upper)
         if self.decay != decay or not same:
             raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
+
+    def level(self, contraction: Contraction | None, rim: float) -> float:
+        """The level that was tried, where V is above it on the boundary of D and the law contracts on B."""
+        where = "F that contracts on B" if contraction is None else f"V > ρ = {self.wanted!r} on the boundary of D"
+        if contraction is None or not self.wanted < rim:
+            raise UsageError(f"Expected {where} of {str(self.path)!r}, got no bounds that say so; {REMEDY}.")
+        return self.wanted
 
 
 def kept_region(path: Path) -> KeptRegion:

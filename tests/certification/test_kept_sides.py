@@ -1,6 +1,8 @@
 """Kept proofs of two sides, in one file: they go on, are checked without a search, and are not believed."""
 
+import os
 import shutil
+import signal
 
 import pytest
 import torch
@@ -10,7 +12,7 @@ from lyapnet.certification.checking import check, kept_funnel
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.certification.two_sided_certificate import two_sided_certificate
 from lyapnet.controller import Controller
-from lyapnet.errors import UsageError
+from lyapnet.errors import Interrupted, UsageError
 from tests.certification.planted import riccati, stationary
 from tests.certification.test_least_cost import problem
 from tests.problems import Formula
@@ -24,8 +26,8 @@ def controller(factor=1.0):
     return Controller(problem(), Formula(lambda t, x: optimum(t, x) * (1 + 0.002 * torch.sin(4 * t + 3 * x[..., 0]))))
 
 
-def both(path, alpha=0.95, delta=0.02, seconds=60.0, states=SET, factor=1.0):
-    return two_sided_certificate(controller(factor), alpha, delta, states, seconds, keep=str(path))
+def both(path, alpha=0.95, delta=0.02, seconds=60.0, states=SET, factor=1.0, report=None):
+    return two_sided_certificate(controller(factor), alpha, delta, states, seconds, keep=str(path), report=report)
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +77,24 @@ def test_stopped_on_either_side_it_goes_on(whole, kept, monkeypatch):
         name: found[name] for name in ("verdict", "rho", "lower_level")
     }
     assert check(controller(), kept)["of"] == "two-sided"
+
+
+def test_ctrl_c_in_the_middle_of_the_second_side_keeps_both(whole, tmp_path):
+    path = tmp_path / "stopped.proof"
+
+    def stop(_):
+        if path.exists():  # the first side ended
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(Interrupted, match=r"the proof so far is kept in .*stopped\.proof"):
+        both(path, report=stop)
+    proofs = kept_proofs.read_proofs(path)
+    assert (len(proofs["above"]["frontier"]), len(proofs["below"]["frontier"]) > 0) == (0, True)
+    result = check(controller(), path)
+    assert result["verdict"] == "refused"
+    assert "got an unfinished one" in result["reason"]
+    assert both(path).result["lower_level"] == whole[0].result["lower_level"]
+    assert check(controller(), path)["verdict"] == "certified"
 
 
 def test_another_question_does_not_go_on(kept):

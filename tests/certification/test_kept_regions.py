@@ -214,6 +214,19 @@ def test_an_edited_file_is_refused(name, kept):
     assert "\n" not in result["reason"]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CHANGES if not name.startswith(("λ", "D ", "a V"))])
+def test_nothing_more_is_proved_from_an_edited_file(name, whole, kept):
+    """A search that goes on from it refuses it, or comes to what is true."""
+    rewritten(kept, CHANGES[name])
+    rewritten(kept, of_itself)
+    try:
+        rho = claimed(kept).rho
+    except UsageError:
+        rho = -math.inf
+    assert rho < 1.05 * whole[0].rho
+
+
 def test_the_old_fingerprint_is_that_of_another_condition(kept):
     """Whatever is true of the numbers: a smaller hole and a slower rate are, by a fingerprint of their own."""
     before = kept.read_bytes()

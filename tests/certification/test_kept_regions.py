@@ -10,7 +10,7 @@ from lyapnet.certification import Budget, kept_proofs, region_claim
 from lyapnet.certification.checking import check, kept_funnel
 from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.funnel import setting_of
-from lyapnet.certification.region import OutsideTheHole, RecedingDecrease
+from lyapnet.certification.region import KeptRegion, OutsideTheHole, RecedingDecrease
 from lyapnet.certification.region_certificate import region_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.certification.two_sided_certificate import two_sided_certificate
@@ -167,6 +167,11 @@ def no_number(content):
     content["proved"] = content["of"][1] = math.nan
 
 
+def narrow(content):
+    """Of the hole, only a line would be in B, on which the law contracts; V is above c at both of its ends."""
+    content["of"][0].update(box=[[0.0, -0.1], [0.0, 0.1]], hole=0.001)
+
+
 CHANGES = {
     "fewer cuts": without_cuts,
     "a higher ρ, not proved": closed,
@@ -188,6 +193,7 @@ CHANGES = {
     "B beside the goal": set_of("box", [[0.1, -0.1], [0.2, 0.1]]),
     "B that the goal is on the boundary of": set_of("box", [[0.0, -0.1], [0.2, 0.1]]),
     "B without width": set_of("box", [[0.0, -0.1], [0.0, 0.1]]),
+    "B without width, around a hole as small": narrow,
     "B of one state": set_of("box", [[-0.1], [0.1]]),
     "Y singular": set_of("Y", [[1.0, 1.0], [1.0, 1.0]]),
     "Y all but singular": set_of("Y", [[1.0, 1.0], [1.0, 1.0 + 1e-12]]),
@@ -298,3 +304,24 @@ def test_a_funnel_is_no_region(kept, tmp_path):
         kept_funnel(about, kept)
     assert before == (kept.read_bytes(), funnel.read_bytes())
     assert check(about, funnel)["of"] == "sound"
+
+
+def believing_c(self, around, seen, level, budget, proposed=None):
+    self.around, self.hole = around, proposed
+    self.constraints = OutsideTheHole(self.V, around.box, proposed)
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "method", "believing"),
+    [
+        ("a hole wider than B", RecedingDecrease, "open_hole", believing_c),
+        ("a smaller D", KeptRegion, "level", lambda self, *_: self.wanted),
+    ],
+)
+def test_without_that_check_it_would_certify_what_is_not_proved(name, of, method, believing, kept, monkeypatch):
+    """The twins: closed loops would leave the hole, or D."""
+    rewritten(kept, CHANGES[name])
+    rewritten(kept, of_itself)
+    assert checked(kept)["verdict"] == "refused"
+    monkeypatch.setattr(of, method, believing)
+    assert checked(kept)["verdict"] == "certified"

@@ -140,7 +140,8 @@ PROOFS = {
 @pytest.mark.parametrize("kind", PROOFS)
 def test_kept_proofs(kind, trained, marker, capsys):
     evil = PROOFS[kind](Malice(marker))
-    for arguments in (["check", "evil.proof", str(trained)], ["sound", str(trained), "--keep", "evil.proof"]):
+    kept = [[kind, str(trained), "--keep", "evil.proof"] for kind in ("sound", "region")]
+    for arguments in (["check", "evil.proof", str(trained)], [*kept[0], "--two-sided"], *kept):
         Path("evil.proof").write_bytes(evil)
         assert innocent_after(["certify", *arguments], marker, capsys)[0]
     if kind == "pickle":

@@ -1,5 +1,7 @@
 """The condition that a sound certificate proves, as a function of (t, x)."""
 
+from typing import Any, ClassVar
+
 import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
@@ -24,6 +26,8 @@ class DecreaseCondition(nn.Module):
         disturbance: w ≥ 0, (n,), in the units of ẋ; none if None.
     """
 
+    proves: ClassVar[str] = "above"  # what a kept proof of it is called
+    partial: ClassVar[bool] = False  # whether each level that is proved is a claim, not only the one that is wanted
     disturbance: State | None
 
     def __init__(
@@ -44,6 +48,12 @@ class DecreaseCondition(nn.Module):
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
         self.constraints = constraints
         self.register_buffer("disturbance", disturbance)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """By what numbers it can be built again for the same closed loop; plain data."""
+        w = None if self.disturbance is None else self.disturbance.tolist()
+        return {"alpha": self.alpha, "delta": self.delta, "disturbance": w}
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.parts(t, x)[0]

@@ -72,8 +72,49 @@ class _Law:
         return torch.stack(rows, -2)
 
 
+class _Coordinates:
+    """Coordinates Y in which a law is asked to contract at a rate, and bounds of the rate at which it does.
+
+    Raises:
+        LinAlgError: as _inverse.
+    """
+
+    def __init__(self, law: _Law, goal: State, seen: Sequence[int], Y: Tensor, least: float):
+        self.law, self.goal, self.seen, self.Y, self.least = law, goal, seen, Y, least
+        self.Z = _inverse(Y, len(seen))
+        self.bounded = BoundedFunction(lambda t, x: (self.rate(t, x),) * 2, law.domain)
+
+    def rate(self, t: Time, x: State) -> PerState:
+        """A lower bound of the least eigenvalue of −½ZᵀPJZ and its transpose, by Gershgorin's discs; Z is near Y⁻¹."""
+        M = self.Z.mT @ (self.Y.mT @ (self.Y @ (self.law.jacobian(t, x, self.seen) @ self.Z)))
+        S, rows = -(M + M.mT) / 2, range(len(self.seen))
+        discs = [S[..., i, i] - sum((S[..., i, j].abs() for j in rows if j != i), 0 * S[..., i, i]) for i in rows]
+        return reduce(torch.minimum, discs)
+
+    def on(self, box: Box, seconds: float) -> Contraction | None:
+        """The contraction on a box around the goal; None where it is not seen within the time."""
+        x = torch.cat([box.sample(SAMPLES, torch.Generator().manual_seed(0)), box.corners()])
+        with torch.no_grad():
+            hopeless = bool((self.rate(x.new_zeros(()), x) < self.least).any())
+        if hopeless or not seconds or not self.law.is_continuous_on(box):
+            return None
+        ends, tried = at_time(0.0, box.lower, box.upper), Budget(seconds, boxes=BOXES)
+        rate = minimum(self.rate, *ends, tried, enough=self.least, bounded=self.bounded)
+        if not rate >= self.least * (1 - 1e-6):
+            return None
+        rate /= 1 + NEAR  # ZᵀPZ is 1 but for as much
+        corner = torch.maximum(box.upper - self.goal, self.goal - box.lower)  # the equilibrium lies in B
+        offset = min(_offset(self.law, self.goal, self.seen, self.Y, rate), float(torch.linalg.vector_norm(corner)))
+        return Contraction(box, rate, self.Y, offset, self.bounded.fingerprint)
+
+
 def contraction_around(
-    loop: ClosedLoop, goal: State, states: Box, seen: Sequence[int], seconds: float = 60.0
+    loop: ClosedLoop,
+    goal: State,
+    states: Box,
+    seen: Sequence[int],
+    seconds: float = 60.0,
+    proposed: tuple[Box, Tensor] | None = None,
 ) -> tuple[Contraction | None, float]:
     """(contraction, slowest): on the largest box around the goal on which the law contracts, of sizes that grow in the
     shape of D; and the largest real part among the eigenvalues of the linearised law, in 1/s.
@@ -82,64 +123,71 @@ def contraction_around(
         states: D; no box is larger than half of it.
         seen: the indices of the states that the law depends on.
         seconds: when to stop.
+        proposed: the (B, Y) that alone are tried; nothing of them is believed.
 
     Returns:
         None for the contraction where the linearised law is not stable, or contracts on no box that was tried.
     """
-    law, reach = _Law(loop, states), torch.minimum(goal - states.lower, states.upper - goal)
+    law, reach, budget = _Law(loop, states), torch.minimum(goal - states.lower, states.upper - goal), Budget(seconds)
     A = law.jacobian(goal.new_zeros(()), goal, seen).detach().numpy()
     slowest = float(np.linalg.eigvals(A).real.max()) if np.isfinite(A).all() else math.nan
-    own = -slowest / 2
-    found = _coordinates(A, reach[list(seen)].numpy(), own) if own > 0 else None
-    if found is None:
+    own, found = -slowest / 2, None
+    if not own > 0:
         return None, slowest
-    Y, inverse = (torch.from_numpy(each) for each in found)
-
-    def contracted(t: Time, x: State) -> PerState:
-        """A lower bound of the least eigenvalue of −½ZᵀPJZ and its transpose, by Gershgorin's discs; Z is near Y⁻¹."""
-        M = inverse.mT @ (Y.mT @ (Y @ (law.jacobian(t, x, seen) @ inverse)))
-        S = -(M + M.mT) / 2
-        rows = range(len(seen))
-        discs = [S[..., i, i] - sum((S[..., i, j].abs() for j in rows if j != i), 0 * S[..., i, i]) for i in rows]
-        return reduce(torch.minimum, discs)
-
-    counts, found = torch.isin(torch.arange(len(goal)), torch.tensor(list(seen))), None
-    bounded = BoundedFunction(lambda t, x: (contracted(t, x),) * 2, law.domain)
-    budget = Budget(seconds)
+    try:
+        Y = _coordinates(A, reach[list(seen)].numpy(), own) if proposed is None else proposed[1]
+        coordinates = _Coordinates(law, goal, seen, Y, LEAST * own)
+    except np.linalg.LinAlgError:
+        return None, slowest
+    radii = reach.where(torch.isin(torch.arange(len(goal)), torch.tensor(list(seen))), 0.0) / 2
+    if proposed is not None:
+        box = proposed[0]
+        fits = _is_around(box, goal, states, radii * GROWTH**-SIZES)
+        return coordinates.on(box, budget.left) if fits else None, slowest
     for k in range(SIZES):
-        radii = torch.where(counts, reach / 2 * GROWTH ** (k + 1 - SIZES), 0.0)
-        box = Box(goal - radii, goal + radii)
-        x = torch.cat([box.sample(SAMPLES, torch.Generator().manual_seed(0)), box.corners()])
-        with torch.no_grad():
-            hopeless = bool((contracted(x.new_zeros(()), x) < LEAST * own).any())
-        if hopeless or not budget.left or not law.is_continuous_on(box):
+        size = radii * GROWTH ** (k + 1 - SIZES)
+        larger = coordinates.on(Box(goal - size, goal + size), budget.left)
+        if larger is None:
             break
-        tried = Budget(budget.left, boxes=BOXES)
-        rate = minimum(contracted, *at_time(0.0, box.lower, box.upper), tried, enough=LEAST * own, bounded=bounded)
-        if rate < LEAST * own * (1 - 1e-6):
-            break
-        rate /= 1 + NEAR  # ZᵀPZ is 1 but for as much
-        offset = min(_offset(law, goal, seen, Y, rate), float(torch.linalg.vector_norm(radii)))  # it lies in B
-        found = Contraction(box, rate, Y, offset, bounded.fingerprint)
+        found = larger
     return found, slowest
 
 
-def _coordinates(A: np.ndarray, reach: np.ndarray, own: float) -> tuple[np.ndarray, np.ndarray] | None:
-    """(Y, Z ≈ Y⁻¹) with ½(M + Mᵀ) diagonal and at most −own for M = Y A Z, where A's eigenvalues have less than that.
+def _is_around(box: Box, goal: State, states: Box, least: State) -> bool:
+    """Whether a box lies in D and reaches at least so far from the goal on each side, and nowhere where that is 0."""
+    if box.lower.shape != goal.shape:
+        return False
+    within, room = (states.lower <= box.lower) & (box.upper <= states.upper), (goal - box.lower, box.upper - goal)
+    return bool(torch.where(least > 0, within & (torch.minimum(*room) >= least), (room[0] == 0) & (room[1] == 0)).all())
 
-    None where rounding leaves none of it.
+
+def _coordinates(A: np.ndarray, reach: np.ndarray, own: float) -> Tensor:
+    """Y with ½(M + Mᵀ) diagonal and at most −own for M = Y A Y⁻¹, where A's eigenvalues have less than that.
+
+    Raises:
+        LinAlgError: rounding leaves none of it.
     """
     scaled, eye = A * reach / reach[:, None], np.eye(len(A))
-    try:
-        P = solve_continuous_lyapunov((scaled + own * eye).T, -eye)
-        L = np.linalg.cholesky((P + P.T) / 2)
-        M = L.T @ scaled @ np.linalg.inv(L.T)
-        _, turn = np.linalg.eigh((M + M.T) / 2)
-        Y = turn.T @ L.T / reach
-        Z = np.linalg.inv(Y)
-    except np.linalg.LinAlgError:
-        return None
-    return (Y, Z) if np.linalg.norm(Y @ Z - eye) < NEAR / 10 else None
+    P = solve_continuous_lyapunov((scaled + own * eye).T, -eye)
+    L = np.linalg.cholesky((P + P.T) / 2)
+    M = L.T @ scaled @ np.linalg.inv(L.T)
+    _, turn = np.linalg.eigh((M + M.T) / 2)
+    return torch.from_numpy(turn.T @ L.T / reach)
+
+
+def _inverse(Y: Tensor, k: int) -> Tensor:
+    """Z with ‖YZ − 1‖ < NEAR/10, whatever Y is: rounding of the product is counted.
+
+    Raises:
+        LinAlgError: there is none.
+    """
+    if Y.shape != (k, k) or not bool(Y.isfinite().all()):
+        raise np.linalg.LinAlgError("Expected coordinates of the states, got others.")
+    Z = torch.from_numpy(np.linalg.inv(Y.numpy()))
+    rounding = (k + 2) * torch.finfo(Z.dtype).eps * Y.abs() @ Z.abs()
+    if not float(torch.linalg.matrix_norm((Y @ Z - torch.eye(k, dtype=Z.dtype)).abs() + rounding)) < NEAR / 10:
+        raise np.linalg.LinAlgError("Expected coordinates that can be inverted, got others.")
+    return Z
 
 
 def _offset(law: _Law, goal: State, seen: Sequence[int], Y: Tensor, rate: float) -> float:

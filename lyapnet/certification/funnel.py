@@ -239,20 +239,19 @@ def proof_within(
     domain: tuple[Corner, Corner],
     level: float,
     budget: Budget,
-    stopped: str = NOT_KEPT,
     **options: Any,
 ) -> Proof:
     """What is proved of the condition, in what a budget leaves but for a share of it, unless someone stops it.
 
     Args:
-        stopped: what is said then, where nothing is kept.
+        options: of prove.
     """
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
     with signals_taken(search.stop.ask):
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options.get("keep")
-        raise Interrupted(KEPT.format(keep) if keep else stopped, 130)
+        raise Interrupted(KEPT.format(keep) if keep else NOT_KEPT, 130)
     return proof
 
 

@@ -1,7 +1,8 @@
 """Proofs in files, finished or not: how the domain was cut, from which they go on, and which others can check.
 
-A file says what it is about, how the domain was cut (5 bytes a cut), which leaves are closed and which wait, and what
-has lowered the level; before all that stands its SHA-256. What is read is believed only as far as this goes:
+A file holds a proof by the name of what it proves (`DecreaseCondition.proves`), or the two of a two-sided claim: what
+it is about, as plain data, how the domain was cut (5 bytes a cut), which leaves are closed and which wait, and what has
+lowered the level; before all that stands its SHA-256. What is read is believed only as far as this goes:
 
 * A flipped bit, a truncated file or one of an earlier format fails the digest or the first line.
 * The leaves are made from the cuts, so that they cover the domain exactly; closed and waiting ones must be all of them.
@@ -68,16 +69,17 @@ class Standing(NamedTuple):
 
 def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner, upper: Corner) -> dict[str, Any]:
     """What a proof is about, as plain data."""
-    box = {"lower": lower.tolist(), "upper": upper.tolist()}
-    w = None if condition.disturbance is None else condition.disturbance.tolist()
-    slack = {"degree": bounded.degree, "alpha": condition.alpha, "delta": condition.delta, "disturbance": w}
-    return {"fingerprint": bounded.fingerprint, **box, **slack}
+    box = {"lower": lower.tolist(), "upper": upper.tolist(), "degree": bounded.degree}
+    return {"proves": condition.proves, "fingerprint": bounded.fingerprint, **box, **condition.facts}
 
 
-FORMAT = b"lyapnet proof 2\n"
+FORMAT = b"lyapnet proof 3\n"
+PROVED = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
+TOGETHER = {"above", "below"}
+"""What stands in one file where it is proved of the same V: the two sides of a two-sided claim."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class KeptProof:
     """The file of a proof of one function on one box up to one level, by the rules of this version.
 
@@ -89,6 +91,9 @@ class KeptProof:
     path: Path
     about: dict[str, Any]
     wanted: float
+
+    def __post_init__(self) -> None:
+        self._proofs = read_proofs(self.path) if self.path.exists() else {}
 
     @property
     def identity(self) -> list[Any]:
@@ -107,13 +112,11 @@ class KeptProof:
             "boxes": search.boxes, "proved": proof.proved, "worst": None if worst is None else worst._asdict(),
             "seconds": proof.seconds,
         }  # fmt: skip
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        payload = buffer.getvalue()
-        write_atomically(self.path, FORMAT + hashlib.sha256(payload).digest() + payload)
+        self._proofs[self.about["proves"]] = content
+        write_proofs(self.path, self._proofs)
 
     def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> Standing | None:
-        """The proof that the file keeps; None where there is no file.
+        """The proof that the file keeps; None where there is none yet.
 
         Args:
             level: of a proof with this counterexample; it may refuse it by a ValueError.
@@ -121,15 +124,16 @@ class KeptProof:
         Raises:
             UsageError: the file holds something else.
         """
-        if not self.path.exists():
+        name = self.about["proves"]
+        if name not in self._proofs and {name, *self._proofs} <= {name} | TOGETHER:
             return None
-        content = read_content(self.path)
-        if content["of"] != self.identity:
-            raise UsageError(
-                f"Expected the proof of this V, α, δ, set and version in {str(self.path)!r}, got another; take a new "
-                "file."
-            )
+        content = part_of(self._proofs, name, self.path, "take a new file")
         with refusing(self.path):
+            if content["of"] != self.identity:
+                raise UsageError(
+                    f"Expected the proof of this V, set and version by the same options in {str(self.path)!r}, got "
+                    "another; take a new file."
+                )
             tree, key = CutTree(content["node"], content["axis"]), content["key"]
             leaves, frontier = tree.leaves(*domain), content["frontier"].long()
             named = torch.cat([content["closed"].long(), frontier])
@@ -148,21 +152,25 @@ class KeptProof:
             search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
             return Standing(search, reached, worst, content["seconds"])
 
-    def claim(self, domain: tuple[Corner, Corner]) -> Standing:
+    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> Standing:
         """The leaves of a proof of the same, none of them decided, and the level that it claims.
+
+        Args:
+            partial: whether what an unfinished proof has reached is a claim, too.
 
         Raises:
             UsageError: the file holds another proof, an unfinished one, or none.
         """
-        content = read_content(self.path)
+        content = part_of(self._proofs, self.about["proves"], self.path)
         with refusing(self.path):
-            leaves, of = CutTree(content["node"], content["axis"]).leaves(*domain), content["of"][:1]
-            claimed, waiting = Standing(Search(leaves), float(content["proved"]), None), len(content["frontier"])
-        if of != [self.about]:
-            raise UsageError(
-                f"Expected the proof of this V, α, δ and set in {str(self.path)!r}, got another; name its checkpoint."
-            )
-        if waiting:
+            if content["of"][:1] != [self.about]:
+                raise UsageError(
+                    f"Expected the proof of this V, by the options that it names, in {str(self.path)!r}, got another; "
+                    "name its checkpoint."
+                )
+            leaves, waiting = CutTree(content["node"], content["axis"]).leaves(*domain), len(content["frontier"])
+            claimed = Standing(Search(leaves), float(content["proved"]), None)
+        if waiting and not partial:
             raise UsageError(
                 f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
                 f"go on with lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the same options."
@@ -170,8 +178,31 @@ class KeptProof:
         return claimed
 
 
-def read_content(path: Path) -> dict[str, Any]:
-    """What a file of a proof holds, as it was written.
+def part_of(proofs: dict[str, Any], name: str, path: Path, remedy: str = "name another") -> dict[str, Any]:
+    """The proof of that name among those of a file.
+
+    Raises:
+        UsageError: there is none; says what there is.
+    """
+    with refusing(path):
+        if name not in proofs:
+            raise UsageError(
+                f"Expected the proof of {PROVED[name]} in {str(path)!r}, got that of "
+                f"{' and of '.join(PROVED[each] for each in sorted(proofs))}; {remedy}."
+            )
+        return proofs[name]
+
+
+def write_proofs(path: Path, proofs: dict[str, Any]) -> None:
+    """Write proofs by their names, all or nothing."""
+    buffer = io.BytesIO()
+    torch.save(proofs, buffer)
+    payload = buffer.getvalue()
+    write_atomically(path, FORMAT + hashlib.sha256(payload).digest() + payload)
+
+
+def read_proofs(path: Path) -> dict[str, Any]:
+    """The proofs that a file holds, by their names, as they were written.
 
     Raises:
         UsageError: there is no such file; or it is another, of an earlier version, or changed since.
@@ -187,7 +218,10 @@ def read_content(path: Path) -> dict[str, Any]:
                 f"Expected the proof that was written, got {str(path)!r}, which was changed or damaged since; name a "
                 "copy of it, or another."
             )
-        return torch.load(io.BytesIO(payload), weights_only=True)
+        proofs = torch.load(io.BytesIO(payload), weights_only=True)
+        if not proofs or not proofs.keys() <= PROVED.keys():
+            raise ValueError("no proofs by their names")
+        return proofs
 
 
 @contextmanager

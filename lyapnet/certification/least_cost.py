@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -68,6 +69,7 @@ class LowerClaim:
     undecided: Points
     left_out: list[int]
     fingerprint: str
+    proof_seconds: float = 0.0  # those of the boxes alone
 
     @property
     def verdict(self) -> Verdict:
@@ -87,6 +89,8 @@ class RiseCondition(DecreaseCondition):
     The third part is minus the least pivot of R(x), so that R is proved positive definite where c is proved: without
     that the minimum is none.
     """
+
+    proves = "below"
 
     def __init__(self, closed_loop: ClosedLoop, beta: float, delta: float, problem: Problem):
         super().__init__(closed_loop, beta, delta)
@@ -162,6 +166,8 @@ def lower_claim(
     budget: Budget | None = None,
     generator: torch.Generator | None = None,
     report: Callable[[Progress], None] | None = None,
+    keep: Path | None = None,
+    replay: bool = False,
 ) -> LowerClaim:
     """The bound of the optimum from below that V proves within a budget, for as much of X₀ as it can.
 
@@ -169,7 +175,7 @@ def lower_claim(
         closed_loop: whose V, system and cost are meant; its control law takes no part.
         problem: whose X₀, U, T and goal are meant.
         states: D; by default a box around where samples of W are low enough.
-        report: of prove.
+        report, keep, replay: of prove.
 
     Raises:
         UsageError: β, δ or D do not fit, ℓ is not quadratic in u, or V, f, g, q or R have an operator without a rule.
@@ -187,12 +193,15 @@ def lower_claim(
         outside = minimum(lambda t, x: cost.terminal(x), *sides, levels, enough=just_above(needed))
         rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
         everywhere = min(outside, rim) >= needed
-    proof = proof_within(condition, domain, needed, budget, generator=generator, report=report, degree=DEGREE)
+    proof = proof_within(
+        condition, domain, needed, budget,
+        generator=generator, report=report, keep=keep, replay=replay, degree=DEGREE,
+    )  # fmt: skip
     level = wanted if proof.level >= needed else proof.level
     seen = beta * largest_seen(condition.V, X0) - delta * duration
     return LowerClaim(
         beta, delta, duration, D, level, wanted, seen, excess, everywhere, proof.counterexample, proof.boxes,
-        time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint,
+        time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint, proof.seconds,
     )  # fmt: skip
 
 

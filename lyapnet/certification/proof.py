@@ -94,7 +94,7 @@ def prove(
     question = WhereItHolds(condition, bounded, wanted, stop_at_counterexample, torch.device(budget.device))
     kept = None if keep is None else KeptProof(keep, about(bounded, condition, lower, upper), wanted)
     if kept is not None and replay:
-        begun, kept = kept.claim((lower, upper)), None
+        begun, kept = kept.claim((lower, upper), condition.partial), None
         leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
         budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
     else:

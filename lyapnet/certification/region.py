@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,7 +16,8 @@ from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
-from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of, share_of
+from lyapnet.certification.funnel import LEVELS, for_levels, largest_seen, proof_within, setting_of, share_of
+from lyapnet.certification.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress, Proof
 from lyapnet.certification.verdict import Verdict, verdict_on
@@ -27,7 +30,8 @@ from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
-STOPPED = "Stopped while certifying: nothing is kept."
+NEW_FILE = "take another file"
+REMEDY = f"allow more seconds, or {NEW_FILE}"
 
 
 @dataclass(frozen=True)
@@ -119,17 +123,33 @@ class RegionClaim:
 class RecedingDecrease(DecreaseCondition):
     """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially."""
 
+    proves, partial = "region", True
+
     def __init__(self, closed_loop: ClosedLoop, decay: float):
         super().__init__(closed_loop, 1.0, 0.0)
         if not 0 < decay < math.inf:
             raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
-        self.decay, self.hole = decay, 0.0
+        self.decay, self.hole, self.around = decay, 0.0, None
 
-    def open_hole(self, box: Box, seen: Sequence[int], level: float, budget: Budget) -> None:
-        """Ask nothing in {x ∈ box: V < c}, with c below V on the boundary of the box, and at most a level."""
-        rim = minimum(self.V, *faces(*over_time(box, 0.0), [1 + i for i in seen]), budget)
-        self.hole = min(level, just_below(rim))
-        self.constraints = OutsideTheHole(self.V, box, self.hole)
+    @property
+    def facts(self) -> dict[str, Any]:
+        B = self.around
+        around = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
+        return {"decay": self.decay, "hole": self.hole, **around}
+
+    def open_hole(
+        self, around: Contraction, seen: Sequence[int], level: float, budget: Budget, proposed: float | None = None
+    ) -> None:
+        """Ask nothing in {x ∈ B: V < c}, with c below V on the boundary of B, and at most a level.
+
+        Args:
+            proposed: the c that alone is tried.
+        """
+        rim = minimum(self.V, *faces(*over_time(around.box, 0.0), [1 + i for i in seen]), budget)
+        self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
+        if proposed is not None and not self.hole < rim:
+            raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
+        self.constraints = OutsideTheHole(self.V, around.box, self.hole)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         value, slope = self.V.value_and_state_gradient(t, x)
@@ -162,6 +182,8 @@ def region_claim(
     budget: Budget | None = None,
     generator: torch.Generator | None = None,
     report: Callable[[Progress], None] | None = None,
+    keep: Path | None = None,
+    replay: bool = False,
 ) -> RegionClaim:
     """The largest region of attraction of the receding law that is a sublevel set of V(0, ·), as the budget allows.
 
@@ -170,34 +192,84 @@ def region_claim(
         problem: whose X₀, constraints and goal are meant.
         decay: λ > 0 in 1/s; 1 % of 1/T if None.
         states: D, around X₀; by default a box around {V(0, ·) ≤ max over X₀}.
-        report: of prove.
+        report, keep, replay: of prove. B, Y, c and ρ are those of the file that goes on, proved anew by bounds.
 
     Raises:
-        UsageError: λ or D do not fit, it is about a family, or the closed loop has an operator without a rule.
+        UsageError: λ or D do not fit, it is about a family, or the closed loop has an operator without a rule; or the
+            file keeps the proof of something else.
+        Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if problem.system.constants:
         raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
     condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
-    goal = problem.goal.double()
+    goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
     left_out, X0, wanted, D, domain, sides, _ = setting_of(condition, problem, 0.0, states, budget)
     seen = [i for i in range(X0.dimension) if i not in left_out]
     _require_inside(D, goal, seen)
+    if kept is not None:
+        kept.require(decay, D)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
-    contraction, slowest = contraction_around(condition.closed_loop, goal, D, seen, for_levels(budget).seconds)
-    proof, rho = None, -math.inf
+    seconds, proposed = (for_levels(budget).seconds, None) if kept is None else (LEVELS, (kept.box, kept.coordinates))
+    contraction, slowest = contraction_around(condition.closed_loop, goal, D, seen, seconds, proposed)
+    proof, rho, level = None, -math.inf, just_below(rim) if kept is None else kept.level(contraction, rim)
     if contraction is not None:
-        level = just_below(rim)
-        condition.open_hole(contraction.box, seen, level, for_levels(budget))
-        proof = proof_within(condition, domain, level, budget, STOPPED, generator=generator, report=report)
-        rho = proof.level if proof.level >= condition.hole > 0 else rho
+        condition.open_hole(contraction, seen, level, for_levels(budget), kept and kept.hole)
+    if condition.hole > 0:
+        proof = proof_within(
+            condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay
+        )
+        rho = proof.level if proof.level >= condition.hole else rho
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
         decay, D, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
         left_out, names_of(problem.constraints),
     )  # fmt: skip
+
+
+class KeptRegion(NamedTuple):
+    """What a file proposes to prove again of a region, and what it says is proved."""
+
+    path: Path
+    decay: float  # λ in 1/s
+    states: Box  # D; without width along states that nothing depends on
+    box: Box  # B
+    coordinates: Tensor  # Y
+    hole: float  # c
+    wanted: float  # the level that was tried
+    rho: float  # the level that is proved, as it says
+    seconds: float  # of the search
+
+    def require(self, decay: float, states: Box) -> None:
+        """Refuse another λ or D than those of the file."""
+        same = self.states.lower.equal(states.lower) and self.states.upper.equal(states.upper)
+        if self.decay != decay or not same:
+            raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
+
+    def level(self, contraction: Contraction | None, rim: float) -> float:
+        """The level that was tried, where V is above it on the boundary of D and the law contracts on B."""
+        where = "F that contracts on B" if contraction is None else f"V > ρ = {self.wanted!r} on the boundary of D"
+        if contraction is None or not self.wanted < rim:
+            raise UsageError(f"Expected {where} of {str(self.path)!r}, got no bounds that say so; {REMEDY}.")
+        return self.wanted
+
+
+def kept_region(path: Path) -> KeptRegion:
+    """What the file of a region's proof says; nothing is bounded.
+
+    Raises:
+        UsageError: it is another file.
+    """
+    content = part_of(read_proofs(path), "region", path, NEW_FILE)
+    with refusing(path):
+        of, wanted, _ = content["of"]
+        lower, upper, *B = (torch.tensor(side, dtype=torch.float64) for side in (of["lower"], of["upper"], *of["box"]))
+        numbers = of["decay"], of["hole"], wanted, content["proved"], content["seconds"]
+        decay, hole, wanted, rho, seconds = (float(number) for number in numbers)
+        Y = torch.tensor(of["Y"], dtype=torch.float64)
+        return KeptRegion(path, decay, Box(lower[1:], upper[1:]), Box(*B), Y, hole, wanted, rho, seconds)
 
 
 def _half(budget: Budget) -> Budget:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -154,6 +155,7 @@ def region_certificate(
     seconds: float = 60.0,
     workers: int = 1,
     device: str = "cpu",
+    keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
     *,
@@ -165,13 +167,17 @@ def region_certificate(
         decay: λ in 1/s; 1 % of 1/T if None.
         set: D, as parse_set reads it; found if None.
         seconds: when to stop undecided.
+        keep: a file in which the proof is kept, and from which it goes on.
         report: is told how far the proof is.
         started: time.monotonic() from which the seconds count; now if None.
     """
     budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
     claim = region_claim(
         controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
-        stream(seed, CERTIFICATION), report,
+        stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
     )  # fmt: skip
-    options = {"decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device, "seed": seed}
+    options = {
+        "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device, "keep": keep,
+        "seed": seed,
+    }  # fmt: skip
     return RegionCertificate(controller, claim, options)

@@ -241,6 +241,22 @@ def _pairs(text: str) -> Sequence[Sequence[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
+class Inside(NamedTuple):
+    """States of X₀ inside a funnel, with V(0, x₀) and the guaranteed cost."""
+
+    x0: State
+    value: PerState
+    guaranteed: PerState
+
+
+def states_inside(controller: Controller, claim: SoundClaim) -> Inside:
+    """As many of some states of X₀ as a funnel holds."""
+    x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
+    value = controller.value(0.0, x0).double()
+    guaranteed = claim.guaranteed_cost(value)
+    return Inside(*(y[guaranteed.isfinite()] for y in (x0, value, guaranteed)))
+
+
 class Compared(NamedTuple):
     """States of X₀ inside a funnel: V(0, x₀), the guaranteed cost, and the optimum of the first of them."""
 
@@ -267,10 +283,7 @@ def compared_to_optima(controller: Controller, claim: SoundClaim, seconds: float
         if done < total and time.monotonic() > end:
             raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
 
-    x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
-    value = controller.value(0.0, x0).double()
-    guaranteed = claim.guaranteed_cost(value)
-    x0, value, guaranteed = (y[guaranteed.isfinite()] for y in (x0, value, guaranteed))
+    x0, value, guaranteed = states_inside(controller, claim)
     if not len(x0):
         return Compared(value, guaranteed, None)
     try:

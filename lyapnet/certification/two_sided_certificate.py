@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar
 
 from lyapnet.certification import figures
@@ -11,7 +12,13 @@ from lyapnet.certification.certificates import FROZEN
 from lyapnet.certification.funnel import SoundClaim, sound_claim
 from lyapnet.certification.least_cost import DEGREE, LowerClaim, lower_claim
 from lyapnet.certification.proof import Progress
-from lyapnet.certification.sound_certificate import SoundCertificate, default_delta, listed, parse_set
+from lyapnet.certification.sound_certificate import (
+    SoundCertificate,
+    default_delta,
+    listed,
+    parse_set,
+    states_inside,
+)
 from lyapnet.certification.verdict import Verdict
 from lyapnet.controller import Controller
 from lyapnet.evaluation.optimality import ratio_of_means
@@ -60,9 +67,12 @@ class TwoSidedCertificate(SoundCertificate):
         return "every control" if self.lower.everywhere else "controls that keep the state in D"
 
     def numbers(self) -> dict[str, Any]:
+        return {**super().numbers(), **self._against_the_optimum()}
+
+    def proved(self) -> dict[str, Any]:
         lower, proved = self.lower, self.lower.level > -math.inf
         return {
-            **super().numbers(),
+            **super().proved(),
             "lower_set": [lower.states.lower.tolist(), lower.states.upper.tolist()],
             "lower_level": lower.level if proved else None, "lower_level_wanted": lower.wanted,
             "lower_excess": lower.excess if proved else None, "holds_for": self.holds_for if proved else None,
@@ -74,21 +84,27 @@ class TwoSidedCertificate(SoundCertificate):
 
     def _against_each_other(self) -> dict[str, Any]:
         """What the two bounds say of states of X₀ inside the funnel; nothing where one of them says nothing."""
+        inside = states_inside(self.controller, self.claim)
+        least = self.lower.least_cost(inside.value)
+        if not len(least) or not bool(least.isfinite().all()) or not (mean := float(least.mean())) > 0:
+            return {}
+        return {
+            "certified_ratio": ratio_of_means(inside.guaranteed, least),
+            "certified_gap": float((inside.guaranteed - least).max()) / mean,
+        }
+
+    def _against_the_optimum(self) -> dict[str, Any]:
+        """How the two bounds lie around the optima of these states, as far as an oracle knows them."""
         value, guaranteed, optimum = self.compared
         least = self.lower.least_cost(value)
-        if not len(value) or not bool(least.isfinite().all()):
+        if optimum is None or not len(value) or not bool(least.isfinite().all()):
             return {}
-        mean = float(least.mean())
-        found: dict[str, Any] = {
-            "certified_ratio": ratio_of_means(guaranteed, least) if mean > 0 else None,
-            "certified_gap": float((guaranteed - least).max()) / mean if mean > 0 else None,
+        some = slice(len(optimum))
+        between = (least[some] <= optimum) & (optimum <= guaranteed[some])
+        return {
+            "optima_between": float(between.double().mean()),
+            "lower_cost_ratio": ratio_of_means(least[some], optimum),
         }
-        if optimum is not None:
-            some = slice(len(optimum))
-            between = (least[some] <= optimum) & (optimum <= guaranteed[some])
-            found["optima_between"] = float(between.double().mean())
-            found["lower_cost_ratio"] = ratio_of_means(least[some], optimum)
-        return found
 
     def _why_not_below(self) -> str | None:
         lower = self.lower
@@ -149,6 +165,7 @@ def two_sided_certificate(
     seconds: float = 60.0,
     workers: int = 1,
     device: str = "cpu",
+    keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
     *,
@@ -161,20 +178,21 @@ def two_sided_certificate(
         delta: slack of both in cost per second; default_delta if None.
         set: D of both; each found if None.
         seconds: of which each side has about half.
+        keep: a file in which both proofs are kept, and from which they go on.
         workers, device, seed, report, started: as of sound_certificate.
     """
     begun = time.monotonic() if started is None else started
     states = None if set is None else parse_set(set)
     slack = default_delta(controller) if delta is None else delta
-    loop, problem = controller.closed_loop, controller.problem
+    loop, problem, file = controller.closed_loop, controller.problem, None if keep is None else Path(keep)
     upper = sound_claim(
         loop, problem, alpha, slack, states, Budget(FOR_UPPER * seconds, workers=workers, device=device, started=begun),
-        stream(seed, CERTIFICATION), report, degree=DEGREE,
+        stream(seed, CERTIFICATION), report, file, degree=DEGREE,
     )  # fmt: skip
     budget = Budget(seconds, workers=workers, device=device, started=begun)
-    lower = lower_claim(loop, problem, alpha, slack, states, budget, stream(seed, CERTIFICATION), report)
+    lower = lower_claim(loop, problem, alpha, slack, states, budget, stream(seed, CERTIFICATION), report, file)
     options = {
         "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "two-sided": True, "seed": seed,
+        "two-sided": True, "keep": keep, "seed": seed,
     }  # fmt: skip
     return TwoSidedCertificate(controller, upper, lower, options)

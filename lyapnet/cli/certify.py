@@ -98,6 +98,7 @@ Seconds = Annotated[
 Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
+Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
 ReportFolder = Annotated[
@@ -193,9 +194,7 @@ def sound(
         list[str] | None,
         typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
     ] = None,
-    keep: Annotated[
-        str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")
-    ] = None,
+    keep: Keep = None,
     refine: Annotated[
         int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
     ] = 0,
@@ -216,8 +215,8 @@ def sound(
         raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
     if overrides and not refine:
         raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
-    if two_sided and (refine or keep is not None or disturbance):
-        raise UsageError("Expected --two-sided alone, got --keep, --refine or --disturbance; these are about one side.")
+    if two_sided and (refine or disturbance):
+        raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set, sound_certificate
     from lyapnet.certification.tables import proof_progress
@@ -232,7 +231,7 @@ def sound(
         started = started or time.monotonic()
         found = given.of(path)
         controller = found.load()
-        made = two_sided_certificate if two_sided else partial(sound_certificate, keep=keep, disturbance=disturbance)
+        made = two_sided_certificate if two_sided else partial(sound_certificate, disturbance=disturbance)
         with proof_progress(notes, "sound") as progress:
             certificate = made(
                 controller,
@@ -242,6 +241,7 @@ def sound(
                 seconds,
                 workers,
                 device,
+                keep=keep,
                 seed=seed,
                 report=progress,
                 started=started,
@@ -279,6 +279,7 @@ def region(
     seconds: Seconds = 60.0,
     workers: Workers = 1,
     device: Device = "cpu",
+    keep: Keep = None,
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
@@ -294,12 +295,12 @@ def region(
 
     if states is not None:
         parse_set(states)
-    require_writable(figure, report)
+    require_writable(figure, report, keep)
     given = given.with_functions(value, law)
     controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
         certificate = region_certificate(
-            controller, decay, states, seconds, workers, device, seed, progress, started=begun
+            controller, decay, states, seconds, workers, device, keep, seed, progress, started=begun
         )
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
@@ -314,9 +315,9 @@ def check(
     as_json: AsJson = False,
     debug: Debug = False,
 ) -> None:
-    """Whether a kept proof proves the sound claim: its leaves are bounded anew, without a search."""
-    from lyapnet.certification.checking import LABELS
+    """Whether a kept proof proves its claim: its leaves are bounded anew, without a search."""
     from lyapnet.certification.checking import check as checked
+    from lyapnet.certification.checking import labels_of
     from lyapnet.certification.tables import certificate_table, proof_progress
 
     controller = given.load()
@@ -325,7 +326,7 @@ def check(
     if as_json:
         print(json.dumps(result, allow_nan=False))
     else:
-        table = certificate_table(f"{proof}, {given.title}", result, LABELS)
+        table = certificate_table(f"{proof}, {given.title}", result, labels_of(result))
         Console(highlight=False, markup=False).print(table)
     raise typer.Exit(result["verdict"] != "certified")
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from lyapnet import __version__
-from lyapnet.certification.checking import KeptFunnel
+from lyapnet.certification.checking import KeptSide
 from lyapnet.constraints import StateLimits, names_of, parts_of
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, UsageError
@@ -26,7 +26,7 @@ MARGIN = 0.08  # of a range, on either side
 ENDINGS = (".html", ".htm")
 
 
-def write_page(controller: Controller, path: Path, title: str, funnel: KeptFunnel | None = None) -> None:
+def write_page(controller: Controller, path: Path, title: str, funnel: KeptSide | None = None) -> None:
     """Write the page of a controller, all or nothing.
 
     Raises:
@@ -38,7 +38,7 @@ def write_page(controller: Controller, path: Path, title: str, funnel: KeptFunne
     write_atomically(path, page_of(controller, title, funnel).encode())
 
 
-def page_of(controller: Controller, title: str, funnel: KeptFunnel | None = None) -> str:
+def page_of(controller: Controller, title: str, funnel: KeptSide | None = None) -> str:
     """The page as HTML.
 
     Args:
@@ -61,7 +61,7 @@ def page_of(controller: Controller, title: str, funnel: KeptFunnel | None = None
     )  # fmt: skip
 
 
-def facts_of(controller: Controller, title: str, funnel: KeptFunnel | None = None) -> dict[str, Any]:
+def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None) -> dict[str, Any]:
     """What the page is told of a controller, as plain data; null stands for what is not finite."""
     problem, system, box = controller.problem, controller.system, controller.initial_states
     center = box.center
@@ -108,7 +108,7 @@ def _axes(controller: Controller) -> list[int]:
     return sorted([*free, *(i for i in range(controller.system.n) if i not in free)][:2])
 
 
-def _extent(controller: Controller, funnel: KeptFunnel | None) -> Box:
+def _extent(controller: Controller, funnel: KeptSide | None) -> Box:
     """How far the axes go: around X₀, closed loops from there, the goal, limits of states and the set of a funnel."""
     box, cost = controller.initial_states, controller.cost
     try:

@@ -1,7 +1,5 @@
 """Proofs that are kept in a file and go on, in several threads, and report how far they are."""
 
-import hashlib
-import io
 import math
 import pickle
 import shutil
@@ -37,6 +35,11 @@ def kept(P, tmp_path):
     path = tmp_path / "proof.pt"
     assert go_on(dipped(P), path, boxes=60).verdict == "unknown"
     return path
+
+
+def read(path):
+    """What a file keeps of the one proof in it."""
+    return kept_proofs.read_proofs(path)["above"]
 
 
 def dipped(P, alpha=0.9, delta=0.05):
@@ -96,7 +99,7 @@ def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
     monkeypatch.setattr(kept_proofs.KeptProof, "identity", [])
     kept.unlink()
     go_on(dipped(P), kept, boxes=200)
-    content = kept_proofs.read_content(kept)
+    content = read(kept)
     leaves = CutTree(content["node"], content["axis"]).leaves(*domain())
     lower, upper, _, _ = leaves[torch.isin(leaves.node, content["frontier"].long())]
     corners = torch.cartesian_prod(*(torch.linspace(0.1, 0.9, 9) for _ in range(3)))
@@ -135,7 +138,7 @@ def test_a_changed_byte_in_any_of_them_is_another_key(tmp_path):
 
 def test_the_proof_of_other_rules_is_refused(P, kept, monkeypatch):
     monkeypatch.setattr(kept_proofs, "hash_of_sources", lambda: "of another version")
-    with pytest.raises(UsageError, match=r"and version in .* got another; take a new file\.$"):
+    with pytest.raises(UsageError, match=r"and version by the same options in .* got another; take a new file\.$"):
         go_on(dipped(P), kept)
 
 
@@ -161,7 +164,7 @@ def test_a_broken_file_is_refused(kind, P, kept):
 
 
 def test_a_kept_proof_is_plain_data(kept):
-    content = kept_proofs.read_content(kept)
+    content = read(kept)
     lists = {"node", "axis", "closed", "frontier", "key"}
     assert content.keys() == {"of", "worst", "proved", "boxes", "seconds", "given_up", *lists}
     assert content["boxes"] >= 60
@@ -173,12 +176,9 @@ def test_a_kept_proof_is_plain_data(kept):
 
 def rewritten(path, change):
     """The file after a change of its content, by someone who computes the digest again."""
-    content = kept_proofs.read_content(path)
-    change(content)
-    buffer = io.BytesIO()
-    torch.save(content, buffer)
-    payload = buffer.getvalue()
-    path.write_bytes(kept_proofs.FORMAT + hashlib.sha256(payload).digest() + payload)
+    proofs = kept_proofs.read_proofs(path)
+    change(proofs["above"])
+    kept_proofs.write_proofs(path, proofs)
 
 
 def checked(condition, path, wanted=2.0):
@@ -200,9 +200,9 @@ def test_no_flipped_bit_is_used(P, finished):
         finished.write_bytes(changed)
         expected = "another file; name another" if bit < 8 * len(kept_proofs.FORMAT) else "changed or damaged since"
         with pytest.raises(UsageError, match=expected):
-            kept_proofs.read_content(finished)
+            read(finished)
     finished.write_bytes(content)
-    assert kept_proofs.read_content(finished)["proved"] == 2.0
+    assert read(finished)["proved"] == 2.0
 
 
 def test_one_of_version_0_1_is_refused(P, kept):
@@ -272,7 +272,7 @@ def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
 def test_a_file_that_says_finished_is_bounded_again(P, kept):
     """All that waits is called closed, as if the proof had ended."""
     rewritten(kept, called_closed)
-    before = kept_proofs.read_content(kept)["boxes"]
+    before = read(kept)["boxes"]
     proof = go_on(dipped(P), kept)
     assert proof.verdict == "certified"
     assert proof.boxes > before + 60, "its leaves, and what was left to cut"
@@ -283,7 +283,7 @@ def test_a_file_that_says_finished_is_bounded_again(P, kept):
 
 def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
     """Each of a tree's K cuts was bounded in the search, and one leaf more than these is in the check."""
-    content = kept_proofs.read_content(finished)
+    content = read(finished)
     confirmed = checked(dipped(P), finished)
     assert (confirmed.verdict, confirmed.level, confirmed.remaining_volume) == ("certified", 2.0, 0.0)
     assert confirmed.boxes == len(content["node"]) + 1
@@ -299,7 +299,7 @@ def test_a_check_believes_neither_lists_nor_levels(change, P, kept):
 
 
 def test_a_check_refuses_an_unfinished_proof_at_once(P, kept, monkeypatch):
-    waiting = len(kept_proofs.read_content(kept)["frontier"])
+    waiting = len(read(kept)["frontier"])
     assert waiting > 0
     monkeypatch.setattr("lyapnet.certification.proof.WhereItHolds.undecided", None)
     with pytest.raises(

@@ -10,6 +10,7 @@ import pytest
 from typer.main import get_command
 
 from lyapnet.certification import checking, funnel
+from lyapnet.certification.region_certificate import region_certificate
 from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
 from lyapnet.certification.sound_certificate import SoundCertificate, parse_set, sound_certificate
 from lyapnet.cli import certify, main
@@ -20,7 +21,12 @@ from tests.certification import planted
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-MAKERS = {"sampled": sampled_certificate, "statistical": statistical_certificate, "sound": sound_certificate}
+MAKERS = {
+    "sampled": sampled_certificate,
+    "statistical": statistical_certificate,
+    "sound": sound_certificate,
+    "region": region_certificate,
+}
 
 pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
@@ -103,6 +109,7 @@ REFUSED = [
     ("certify statistical --refine=1", "No such option: --refine"),
     ("certify sampled --figure=nowhere/claim.png", "make 'nowhere' first"),
     ("certify sound --keep=nowhere/kept", "make 'nowhere' first"),
+    ("certify region --keep=nowhere/kept", "make 'nowhere' first"),
     ("certify sampled --figure=claim.xyz", "got 'claim.xyz'; for example claim.png"),
     ("certify sampled --report=conf/reacher.yaml", "Expected --report as a folder, got 'conf/reacher.yaml'"),
 ]
@@ -162,6 +169,25 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
         assert "check: refused" in capsys.readouterr().out
         assert main(["certify", "check", path, checkpoint, "--json"]) == 1
         assert why in json.loads(capsys.readouterr().out)["reason"]
+
+
+@pytest.mark.parametrize("kind", [["region"], ["sound", "--two-sided", "--alpha=0.9", "--delta=0.05"]])
+def test_kept_proofs_of_other_kinds_are_checked(kind, checkpoint, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(certify.Given, "load", certifiable)
+    monkeypatch.setattr(funnel, "LEVELS", 20.0)
+    path = str(tmp_path / "kept.proof")
+    found = certificate(capsys, *kind, checkpoint, "--keep", path)
+    assert found["rho"] > 0
+    assert main(["certify", "check", path, checkpoint, "--json"]) == (found["verdict"] != "certified")
+    result = json.loads(capsys.readouterr().out)
+    assert result["of"] == ("region" if len(kind) == 1 else "two-sided")
+    same = found.keys() & {"rho", "rho_wanted", "set", "fingerprint", "decay", "hole", "contraction_box", "lower_level"}
+    assert len(same) > 4
+    assert {name: result[name] for name in same} == {name: found[name] for name in same}
+    again = certificate(capsys, *kind, checkpoint, "--keep", path)
+    assert (again["verdict"], again["rho"]) == (found["verdict"], found["rho"])
+    assert main(["certify", "check", path, checkpoint]) == (found["verdict"] != "certified")
+    assert "check: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("kind", "make"), list(MAKERS.items()))

@@ -58,7 +58,7 @@ def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) 
     V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
     """
     optimum = _finite(optimum)
-    near = _trusted(optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)
+    near = _trusted(problem, optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)
     return _examples(problem, optimum, [torch.zeros_like(near), near])
 
 
@@ -73,14 +73,14 @@ def examples_visited(problem: Problem, optimum: Optimum, path: Path) -> Examples
     """
     optimum = _finite(optimum)
     deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    return _examples(problem, optimum, [_trusted(optimum, deviation, TRUSTED)])
+    return _examples(problem, optimum, [_trusted(problem, optimum, deviation, TRUSTED)])
 
 
-def _trusted(optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
+def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
     """Deviations (N, b, n) from trajectories, drawn nearer where ½ δᵀ|H|δ is more than a share of the cost."""
     values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
     quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
-    ratio = share * _cost_of(optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
+    ratio = share * _costs_of(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
     return ratio.sqrt().clamp_max(1)[..., None] * deviation
 
 
@@ -95,9 +95,14 @@ def _finite(optimum: Optimum) -> Optimum:
     return optimum.member(optimum.path.cost.isfinite())
 
 
-def _cost_of(optimum: Optimum) -> PerState:
-    """What errors of V along each trajectory are held against: its cost, or the median of all if that is more."""
-    return optimum.path.cost.clamp_min(typical(optimum.path.cost))
+def _costs_of(problem: Problem, optimum: Optimum) -> Tensor:
+    """What errors of V at each node but the last are held against, (N, b).
+
+    It is the cost of the trajectory, or the median of all if that is more. A stationary V is to be right in relation to
+    what it is at that state, near the goal too, but for LEAST of the same.
+    """
+    costs = optimum.path.cost.clamp_min(typical(optimum.path.cost)).expand(len(optimum.path.u), -1)
+    return optimum.expansion.value[:-1].maximum(LEAST * costs) if problem.horizon.stationary else costs
 
 
 def typical(cost: PerState) -> float:
@@ -129,11 +134,10 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tens
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
     weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ B.mT
     target = gradient[1:] + apply(H, free.x - x[1:])
-    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _cost_of(optimum).expand(here.shape)
+    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _costs_of(problem, optimum)
     rate = cost / problem.horizon.duration
-    if problem.horizon.stationary:  # right in relation to what it is at that state, near the goal too
-        rate = (-value.diff(dim=0) / dt).maximum(LEAST * rate)
-        cost = here.maximum(LEAST * cost)
+    if problem.horizon.stationary:
+        rate = rate.maximum(-value.diff(dim=0) / dt)
     return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], free.x, target, weight, cost, rate)]
 
 

@@ -38,7 +38,7 @@ class RegionProgram(Program):
     degree: ClassVar[int] = 1
     pointwise: ClassVar[float] = 5.0
     recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
-        {"constraint": 0, "trajectory_cost": 0.1, "share": 0.4, "growth": 0.06}
+        {"constraint": 0, "trajectory_cost": 1, "share": 0.4, "growth": 0.06}
     )
 
     share: float = 0.4

@@ -18,6 +18,7 @@ from lyapnet.systems import (
     DoubleIntegrator,
     Linear,
     MechanicalSystem,
+    PathTracking,
     Quadrotor,
     Reacher,
     Satellite,
@@ -68,7 +69,9 @@ def is_differentiable(system):
 
 
 def rests_at_the_origin(system):
-    assert_close(system.f(torch.zeros(system.n)), torch.zeros(system.n))
+    """Without control; on a circle, with the steering that goes round it."""
+    u = torch.tensor([0.1]) if isinstance(system, PathTracking) else torch.zeros(system.m)
+    assert_close(system.dynamics(torch.zeros(system.n), u), torch.zeros(system.n))
 
 
 def names_its_coordinates(system):
@@ -95,7 +98,7 @@ CHECKS = {
     is_affine_in_the_control: {"dynamics": lambda x, u: x + u**2},
     acts_on_each_state_alone: {"f": lambda x: x - x.mean()},
     is_differentiable: {"dynamics": lambda x, u: x.detach() * u},
-    rests_at_the_origin: {"f": torch.ones_like},
+    rests_at_the_origin: {"dynamics": lambda x, u: torch.ones_like(x)},
     names_its_coordinates: {"state_units": ("m",)},
     returns_after_a_turn: {"angles": (1,)},
     keeps_the_precision: {"f": torch.Tensor.double},

@@ -63,6 +63,7 @@ class ContinuedPolicy(ValuePolicy):
     beyond: str | None
     regulator: "Regulator | None"
     duration: float
+    stationary: bool
 
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None = None):
         if beyond not in (None, *BEYOND):
@@ -71,12 +72,13 @@ class ContinuedPolicy(ValuePolicy):
         super().__init__(problem, ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
         self.held: bool = policy.held
+        self.stationary = problem.horizon.stationary  # then nothing changes at T
 
     def forward(self, t: Time, x: State) -> Control:
         late = t >= self.duration - slack(t, self.duration)
         if not late.any():
             return self.policy(t, x)
-        if self.beyond is None and bool((t > self.duration + slack(t, self.duration)).any()):
+        if self.beyond is None and not self.stationary and bool((t > self.duration + slack(t, self.duration)).any()):
             logging.getLogger(__name__).warning(
                 "note: the control law is for %g s; after that it holds the law of t = T. Load with "
                 "beyond=hold, receding, riccati or error to choose.",
@@ -96,6 +98,10 @@ class Regulator(nn.Module):
     """u = u* − K(x − x*), kept to U: optimal for the problem linearised at its goal, over an infinite horizon.
 
     P solves the discrete algebraic Riccati equation of one step with u held; δᵀPδ, δ = x − x*, is what is left to pay.
+    States that neither the rates nor q depend on, such as a cart's position, have no part in it.
+
+    Args:
+        purpose, instead: what asks for it, and what else can be done, for messages.
 
     Raises:
         ValueError: the goal is no equilibrium, or no linear law stabilises it.
@@ -104,36 +110,39 @@ class Regulator(nn.Module):
     P: Matrix
     K: Float[Tensor, "m n"]
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, purpose: str = "beyond=riccati", instead: str = "take hold"):
         super().__init__()
         if problem.system.constants:
-            raise ValueError("Expected a single problem for beyond=riccati, got a family; take hold or receding.")
+            raise ValueError(f"Expected a single problem for {purpose}, got a family; {instead} or receding.")
         exact = in_float64(problem)
         x, u = exact.goal, exact.rest
         if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:
-            raise ValueError("Expected a goal that is an equilibrium for beyond=riccati, got another; take hold.")
+            raise ValueError(f"Expected a goal that is an equilibrium for {purpose}, got another; {instead}.")
         jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian
         A, B = (np.asarray(part) for part in jacobian(lambda *z: exact.step(*z)[0], (x, u)))
         (Q, S), (_, R) = (
             [np.asarray(part) / 2 for part in row] for row in hessian(lambda *z: exact.step(*z)[1], (x, u))
         )
+        counts = (np.eye(len(A)) != A).any(0) | Q.any(0) | S.any(1)
+        A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
         try:
             P = solve_discrete_are(A, B, Q, R, s=S)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(
-                "Expected a goal that a linear law stabilises, and a cost q that sees every mode, for beyond=riccati, "
-                f"got others ({error}); give Q more weights, or take hold."
+                f"Expected a goal that a linear law stabilises, and a cost q that sees every mode, for {purpose}, "
+                f"got others ({error}); give Q more weights, or {instead}."
             ) from error
-        self.problem = problem
-        self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
         slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
         if slowest >= 1 - STILL:
             raise ValueError(
-                "Expected a cost q that sees every mode which does not decay for beyond=riccati, got a regulator "
-                f"with a factor of {slowest:.9g} in each step; give Q more weights, or take hold."
+                f"Expected a cost q that sees every mode which does not decay for {purpose}, got a regulator "
+                f"with a factor of {slowest:.9g} in each step; give Q more weights, or {instead}."
             )
-        self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
+        self.problem = problem
+        among_all = np.eye(len(counts))[counts]
+        self.register_buffer("P", torch.as_tensor(among_all.T @ P @ among_all).to(problem.goal), persistent=False)
+        self.register_buffer("K", torch.as_tensor(K @ among_all).to(problem.goal), persistent=False)
 
     def forward(self, x: State) -> Control:
         return self.problem.controls.project(self.problem.rest - apply(self.K, x - self.problem.goal))

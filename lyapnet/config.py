@@ -43,7 +43,7 @@ STANDARD: dict[str, Any] = {
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},
 }
-COSTATE_LIMIT = 5  # that of the recipe, for the value program between limits of the controls
+COSTATE_LIMIT = 5  # that of the recipe, for the value and region programs between limits of the controls
 
 
 @dataclass
@@ -308,7 +308,7 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
-    if (program, gradient) == ("value", "discrete") and _names(("lower", "upper"), "controls", content, overrides):
+    if program in ("value", "region") and gradient == "discrete" and _names(("lower", "upper"), "controls", content, overrides):
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     known = PROGRAMS.get(program)

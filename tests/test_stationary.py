@@ -98,14 +98,14 @@ def test_what_has_no_regulator_is_refused(changes, message):
 def test_a_goal_that_no_regulator_reaches_is_refused():
     drifting = {"system": {"name": "linear", "parameters": {"A": [[0.5, 0.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}}
     two = {"cost": {"Q": 1, "R": 1}, "initial_states": {"lower": [-1, -1], "upper": [1, 1]}}
-    with pytest.raises(UsageError, match="linear-quadratic regulator reaches"):
+    with pytest.raises(UsageError, match="a linear law stabilises"):
         problem(CHAIN | drifting | two)
     held = {"system": {"name": "linear", "parameters": {"A": [[-0.5, 0.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}}
     assert float(P_of(problem(CHAIN | held | two))[0, 0]) > 0
 
 
 def test_a_goal_that_no_control_holds_is_refused():
-    with pytest.raises(UsageError, match=r"rate of velocity|target_control|held|holds"):
+    with pytest.raises(UsageError, match="a goal that is an equilibrium"):
         problem(PENDULUM, "target=[0.5,0]", "target_control=[0]")
 
 

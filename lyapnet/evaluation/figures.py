@@ -200,28 +200,30 @@ def _columns(panels: int) -> int:
 
 
 def value_slices(V: Value, problem: Problem) -> Figure:
-    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon."""
+    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon; a stationary V once."""
     system, initial_states, duration = problem.system, problem.initial_states, problem.horizon.duration
     region = widest_slice(initial_states, 61)
-    times = [0.0, duration / 2, 0.95 * duration]
+    stationary = problem.horizon.stationary
+    times = [0.0] if stationary else [0.0, duration / 2, 0.95 * duration]
     with torch.no_grad():
         values = [V(torch.tensor(t).to(region.states), region.states) for t in times]
-    figure = Figure(figsize=(9, 3.1), layout="constrained")
+    figure = Figure(figsize=(4.2 if stationary else 9, 3.1), layout="constrained")
     if len(region.axes) == 1:
         axes = figure.subplots()
-        for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN), strict=True):
-            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=f"t = {t:.2f} s")
+        for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN)[: len(times)], strict=True):
+            label = "V(x)" if stationary else f"t = {t:.2f} s"
+            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=label)
         axes.set_xlabel(system.state_labels[region.axes[0]])
         axes.set_ylabel("V(t, x) (cost)")
         axes.legend(frameon=False)
         return figure
     first, second = (numpy_of(g) for g in region.grid)
-    panels = figure.subplots(1, 3, sharey=True)
+    panels = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
     for panel, t, value in zip(panels, times, values, strict=True):
         surface = numpy_of(value).reshape(len(first), len(second)).T
         filled = panel.contourf(first, second, surface, levels=12, cmap="cividis")
         figure.colorbar(filled, ax=panel)
-        panel.set_title(f"V(t, x) at t = {t:.2f} s", fontsize=9)
+        panel.set_title("V(x)" if stationary else f"V(t, x) at t = {t:.2f} s", fontsize=9)
         panel.set_xlabel(system.state_labels[region.axes[0]])
     panels[0].set_ylabel(system.state_labels[region.axes[1]])
     return figure

@@ -308,7 +308,8 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
-    if program in ("value", "region") and gradient == "discrete" and _names(("lower", "upper"), "controls", content, overrides):
+    limited = _names(("lower", "upper"), "controls", content, overrides)
+    if program in ("value", "region") and gradient == "discrete" and limited:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
     known = PROGRAMS.get(program)

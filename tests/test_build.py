@@ -11,8 +11,17 @@ from torch.testing import assert_close
 from lyapnet.build import resolve
 from lyapnet.config import config_from_plain, load_config, to_plain
 from lyapnet.errors import UsageError
-from lyapnet.programs import LyapunovProgram, ValueProgram
-from lyapnet.systems import SYSTEMS, Cartpole, ControlAffineSystem, DoubleIntegrator, Reacher
+from lyapnet.programs import LyapunovProgram, RegionProgram, ValueProgram
+from lyapnet.systems import (
+    SYSTEMS,
+    Cartpole,
+    ControlAffineSystem,
+    DoubleIntegrator,
+    PathTracking,
+    Pendulum,
+    Reacher,
+    VanDerPol,
+)
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, SCRATCH, objects
 
 # The shipped configs against the task sheet
@@ -55,6 +64,16 @@ OWN = (
 )  # of four sections, as a user writes them
 
 
+PENDULUM = {"mass": 0.15, "length": 0.5, "damping": 0.1, "gravity": 9.81}
+CIRCLE = {"speed": 2, "length": 1, "radius": 10}
+REGIONS = {  # arXiv 2506.01356, table 1 and appendix C.2: system, its parameters, the limit of |u|, D
+    "double_integrator": (DoubleIntegrator, {"mass": 1}, 1, [26.4, 9.6]),
+    "van_der_pol": (VanDerPol, {"damping": 1}, 1, [4.8, 10.8]),
+    "pendulum_strong": (Pendulum, PENDULUM, 6, [20, 100]),
+    "pendulum_weak": (Pendulum, PENDULUM, 0.75, [19.2, 64.8]),
+    "path_tracking_wide": (PathTracking, CIRCLE, 0.84, [10, 10]),
+    "path_tracking_narrow": (PathTracking, CIRCLE, 0.5, [10, 10]),
+}
 REFERENCE = ("double_integrator", "cartpole_balancing", "cartpole_swingup", "reacher")  # the paper's four tasks
 
 
@@ -72,11 +91,25 @@ def test_the_limited_pendulum_has_limits_besides():
     assert objects(load_config(CONF / "pendulum_limited.yaml"))[0].controls.limits == (-8, 8)
 
 
+@pytest.mark.parametrize("name", REGIONS)
+def test_the_regions_are_the_published_tasks(name):
+    cls, parameters, limit, reach = REGIONS[name]
+    config = load_config(CONF / "regions" / f"{name}.yaml")
+    problem, _, program, _ = objects(config)
+    assert type(problem.system) is cls
+    x, u = torch.randn(9, 2).double(), torch.randn(9, 1).double()
+    assert_close(problem.system.dynamics(x, u), cls(**parameters).double().dynamics(x, u))
+    assert problem.controls.limits == (-limit, limit)
+    assert config.pointwise.region == reach
+    assert (config.experiment, type(program)) == (f"{name}_region", RegionProgram)
+
+
 def test_every_shipped_config_is_a_task_of_the_sheet():
     alone = {"integrator_chain", "pendulum_limited", "pendulum_held", "pendulum_periodic", "obstacle"}
-    alone |= {"cartpole_family", "reacher_family", "bryson_denham", "keep_out", "double_integrator_region"}
+    alone |= {"cartpole_family", "reacher_family", "bryson_denham", "keep_out"}
     alone |= {"double_integrator_two_sided"}
     assert {path.stem for path in EXPERIMENTS if path.parent == CONF} == {*TASKS, *OWN, *alone}
+    assert {path.stem for path in (CONF / "regions").glob("*.yaml")} == set(REGIONS)
     assert {path.stem for path in (CONF / "paper").glob("*.yaml")} == set(REFERENCE)
     assert {path.stem for path in SCRATCH.glob("*.yaml")} == {*REFERENCE, "double_integrator_value"}
 

@@ -61,9 +61,13 @@ class TrainingProgress(ProgressBar):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._progress is None:
             return
-        tables = [member.validation for member in members_of(pl_module)]
+        members = members_of(pl_module)
+        tables = [member.validation for member in members]
         summaries = [table.summary() for table in tables if table is not None]
         measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
+        shares = [float(member.region_share) for member in members if member.region_share is not None]
+        if shares:
+            measures.append(f"region {fmean(shares):.1%} of D")
         self._console.print(f"step {trainer.global_step}/{trainer.max_epochs}  {'  '.join(measures)}", soft_wrap=True)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

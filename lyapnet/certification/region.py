@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.certification.boxes import faces
-from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
+from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
@@ -95,7 +95,9 @@ class RegionClaim:
     @property
     def entered_within(self) -> float:
         """Seconds after which each closed loop of the region has V ≤ c, at most; ∞ where there is no region."""
-        return math.log(self.rho / self.hole) / self.decay if self.rho >= self.hole > 0 else math.inf
+        if not self.rho >= self.hole > 0:
+            return math.inf
+        return just_above(math.log(self.rho / self.hole) / self.decay)
 
     @property
     def counterexample(self) -> Counterexample | None:

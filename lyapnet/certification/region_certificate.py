@@ -104,7 +104,7 @@ class RegionCertificate(Certificate):
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         origin = f" {self._origin}" * bool(self._origin)
         return (
-            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)} Its volume is "
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)} The volume of the region is "
             f"at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
             f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
@@ -130,7 +130,7 @@ class RegionCertificate(Certificate):
         return (
             f"is never left under the receding law u(0, x), proved in continuous time for this model, {pushed}: no "
             f"closed loop that starts in it leaves it{kept}, and each comes to {{x ∈ D: V(0, x) ≤ c}}, c = "
-            f"{claim.hole!r}, within {claim.entered_within:.6g} s and stays there (practical stability; c is the "
+            f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
             f"ultimate bound). That set lies in {within}. That closed loops come closer to the goal, or to rest, is "
             f"not claimed."
         )

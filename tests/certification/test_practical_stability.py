@@ -370,6 +370,12 @@ def test_pushes_of_several_sizes_are_of_one_state():
             parse_pushes(named, controller())
 
 
+def test_a_certificate_names_its_disturbance_among_its_options():
+    certificate = region_certificate(controller(), set="-3:3,-4:4", disturbance=["velocity=0.2"])
+    assert "--disturbance=velocity=0.2" in certificate.command("best.ckpt")
+    assert certificate.claim.hole == pytest.approx(pushed_claim().hole, rel=1e-3)
+
+
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory):
     return str(tiny_checkpoint(tmp_path_factory.mktemp("logs")))
@@ -387,9 +393,3 @@ def test_the_command_takes_one_push_and_several(checkpoint, capsys, tmp_path):
     for wrong in (["--keep=proof"], ["--report=folder"], ["--disturbance=position=1"]):
         assert main([*line, "--disturbance=velocity=0,0.01", *wrong]) == 2
         assert "Expected one" in capsys.readouterr().err
-
-
-def test_a_certificate_names_its_disturbance_among_its_options():
-    certificate = region_certificate(controller(), set="-3:3,-4:4", disturbance=["velocity=0.2"])
-    assert "--disturbance=velocity=0.2" in certificate.command("best.ckpt")
-    assert certificate.claim.hole == pytest.approx(pushed_claim().hole, rel=1e-3)

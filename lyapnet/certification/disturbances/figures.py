@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from matplotlib import colormaps
@@ -50,19 +51,19 @@ def _draw_volumes(
 ) -> None:
     volumes = [claim.volume for claim in claims]
     ends = [claim.ultimate_volume if claim.disturbance is not None else 0.0 for claim in claims]  # nan: not drawn
-    panel.plot(pushes, volumes, "-", color=BLUE, linewidth=1, label="{V(0, x) ≤ ρ}, at least: not left")
-    panel.plot(pushes, ends, "s--", color=VERMILION, linewidth=1, markersize=4, label=ENDS)
+    style: dict[str, Any] = {"drawstyle": "steps-pre", "linewidth": 1}  # a claim about w is one about smaller pushes
+    panel.plot(pushes, volumes, "-", color=BLUE, **style, label="{V(0, x) ≤ ρ}, at least: not left")
+    panel.plot(pushes, ends, "s--", color=VERMILION, markersize=4, **style, label=ENDS)
     for w, claim in zip(pushes, claims, strict=True):
-        proved = claim.rho > -math.inf
-        panel.plot(w, claim.volume, "o" if proved else "x", color=BLUE if proved else VERMILION)
-        text = f"{claim.region_share:.0%} of D" if proved else "none proved"
-        panel.annotate(text, (w, claim.volume), (0, 7), textcoords="offset points", fontsize=7, ha="center")
+        panel.plot(w, claim.volume, "o" if claim.rho > -math.inf else "x", color=BLUE)
+        if claim.rho == -math.inf:
+            panel.annotate("none proved", (w, 0), (0, 7), textcoords="offset points", fontsize=7, ha="center")
     name, unit = _parts(pushed)
     panel.set_xlabel(f"largest push on d({name})/dt, w_max ({_per_second(unit)})")
     panel.set_ylabel(f"certified volume ({' · '.join(_parts(label)[1] for label in labels)})")
-    panel.set_ylim(0, 1.15 * max(*volumes, 1e-12))
+    panel.set_ylim(0, 1.25 * max(*volumes, 1e-12))
     panel.margins(x=0.12)
-    panel.legend(fontsize=7, frameon=False)
+    panel.legend(fontsize=7, frameon=False, loc="upper right")
 
 
 def _draw_levels(

@@ -14,10 +14,11 @@ from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.funnel import sound_claim
 from lyapnet.certification.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
+from lyapnet.certification.kept_regions import kept_region
 from lyapnet.certification.least_cost import DEGREE, RiseCondition, lower_claim
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress
-from lyapnet.certification.region import kept_region, region_claim
+from lyapnet.certification.region import region_claim
 from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.certification.two_sided_certificate import TwoSidedCertificate
@@ -36,11 +37,11 @@ Report = Callable[[Progress], None] | None
 def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
     """What `lyapnet certify check --json` prints: whether a file proves the claim that it was kept of.
 
-    What the claim is about (α, δ, D; λ, B, Y, c) is read from the file, the condition is built from the controller, and
-    all that the claim rests on is computed anew: the levels of X₀ and of the boundary of D, the bounds of the condition
-    and of W on every leaf of the cuts, contraction on B, share and volume, κ, e. The verdict is certified or refused,
-    with the reason. A funnel has to hold all of X₀, and a bound from below too; a region is certified up to the ρ of
-    the file, and how much of X₀ it holds is part of the answer.
+    What the claim is about (α, δ, D, w; λ, B, Y, c) is read from the file, the condition is built from the controller,
+    and all that the claim rests on is computed anew: the levels of X₀ and of the boundary of D, the bounds of the
+    condition and of W on every leaf of the cuts, contraction on B, share and volume, κ, e. The verdict is certified or
+    refused, with the reason. A funnel has to hold all of X₀, and a bound from below too; a region is certified up to
+    the ρ of the file, and how much of X₀ it holds is part of the answer.
     """
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
@@ -166,8 +167,9 @@ def _region(controller: Controller, path: Path, budget: Budget, report: Report) 
             f"certify region CKPT --keep {shlex.quote(str(path))} and the same options."
         )
     claim = region_claim(
-        controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True
-    )
+        controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
+        kept.disturbance,
+    )  # fmt: skip
     reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is beyond what was tried"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds
     return Checked(RegionCertificate(controller, claim, {}).numbers(), reason, seconds, kept.seconds)

@@ -63,8 +63,13 @@ class DecreaseCondition(nn.Module):
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
         fall = time_derivative(self.V, loop.system, t, x, u)
         if self.disturbance is not None:
-            fall = fall + (self.disturbance * self.V.value_and_state_gradient(t, x)[1].abs()).sum(-1)
+            fall = fall + self.worst_push(self.V.value_and_state_gradient(t, x)[1])
         return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
+
+    def worst_push(self, slope: State) -> PerState:
+        """Σ_i w_i |∂V/∂x_i|, by which pushes lift V̇ at most."""
+        assert self.disturbance is not None
+        return (self.disturbance * slope.abs()).sum(-1)
 
     def excluded(self, x: State) -> Bool[Tensor, "*batch"]:
         """Whether a constraint excludes a state."""

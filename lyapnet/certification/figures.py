@@ -158,10 +158,12 @@ def region(
         _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
         if paths is not None:
             x, y = (numpy_of(paths[..., k]) for k in pair)
-            line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under u(0, x)")
+            name = f"closed loops under u(0, x){', not pushed' if claim.disturbance is not None else ''}"
+            line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
             handles.setdefault("closed loops", line)
     legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
-    share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the region of attraction"
+    what = "region of attraction" if claim.disturbance is None else "region, however pushed"
+    share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the {what}"
     proved = claim.rho > -float("inf")
     figure.suptitle(f"{claim.verdict}: {share if proved else 'no region proved'}", fontsize=9)
     return figure
@@ -188,9 +190,11 @@ def _draw_over_state(
 
 
 def _levels_of_region(claim: RegionClaim) -> list["Level"]:
-    """The region, and the level that is wanted where it is higher."""
-    name = "V(0, x) ≤ ρ: never left, and attracted"
+    """The region, where it ends with a disturbance, and the level that is wanted where it is higher."""
+    name = "V(0, x) ≤ ρ: never left" + (", and attracted" if claim.disturbance is None else "")
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
+    if proved and claim.disturbance is not None:
+        proved += [Level(0.0, claim.hole, ORANGE, "V(0, x) ≤ c: entered, then never left", proved=True)]
     wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
     return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
 

@@ -145,7 +145,7 @@ def sound_claim(
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if disturbance is not None:
-        _require_disturbance(disturbance, problem)
+        _require_pushed(disturbance, problem)
     condition = DecreaseCondition(
         copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance
     )
@@ -178,10 +178,17 @@ def sound_claim(
     )  # fmt: skip
 
 
-def _require_disturbance(w: State, problem: Problem) -> None:
+def require_disturbance(w: State, n: int) -> None:
+    """Refuse what is no largest push on each of n states."""
+    if w.shape != (n,) or not bool(((w >= 0) & w.isfinite()).all()):
+        raise UsageError(
+            f"Expected disturbances ≥ 0 of {n} states, got {w.tolist()}; give the largest |w| in units of ẋ."
+        )
+
+
+def _require_pushed(w: State, problem: Problem) -> None:
     """Refuse a disturbance that is none, or that nothing is proved about."""
-    if not bool(((w >= 0) & w.isfinite()).all()):
-        raise UsageError(f"Expected disturbances ≥ 0, got {w.tolist()}; give the largest |w| in units of ẋ.")
+    require_disturbance(w, problem.system.n)
     if problem.constraints is not None:
         raise UsageError("Expected no state constraints beside disturbances, got some; their crossing is not bounded.")
     moved = [problem.system.state_names[i] for i in problem.system.constants if w[i] > 0]

@@ -6,20 +6,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lyapnet.certification.boxes import faces
-from lyapnet.certification.branch_and_bound import Budget, just_below, minimum
+from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.certification.condition import DecreaseCondition, own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
-from lyapnet.certification.funnel import LEVELS, for_levels, largest_seen, proof_within, setting_of, share_of
-from lyapnet.certification.kept_proofs import part_of, read_proofs, refusing
+from lyapnet.certification.funnel import (
+    LEVELS,
+    Setting,
+    for_levels,
+    largest_seen,
+    proof_within,
+    require_disturbance,
+    setting_of,
+    share_of,
+)
+from lyapnet.certification.kept_regions import REMEDY, KeptRegion, kept_region
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress, Proof
+from lyapnet.certification.ultimate_bound import extent_of, ultimate_level
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import Constraints, names_of
 from lyapnet.contracts import copied
@@ -30,8 +40,6 @@ from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
-NEW_FILE = "take another file"
-REMEDY = f"allow more seconds, or {NEW_FILE}"
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,15 @@ class RegionClaim:
     one equilibrium exponentially, at the rate κ, for ever. It is within `contraction.offset` of the goal: rounding,
     where the goal is an equilibrium of u(0, ·) itself.
 
+    With a disturbance, w_i > 0 for some i, the claim is about ẋ = F(x) + w(t), whatever w(t) is, with |w_i(t)| ≤ w_i.
+    Pushes do not fade at the goal, where V̇ does: V need not fall in the hole {x ∈ D: V(x) < c}, nothing contracts, and
+
+        V̇ ≤ V_xᵀF(x) + Σ_i w_i |∂V/∂x_i| ≤ −λ max(V(x), c) < 0   at each x ∈ D with c ≤ V(x) ≤ ρ.
+
+    Hence no closed loop that starts in {x ∈ D: V(x) ≤ ρ} leaves it or violates a constraint, each enters
+    {x ∈ D: V(x) ≤ c} within ln(ρ/c)/λ, and stays there: practical stability, with c as the ultimate bound. No
+    equilibrium is claimed, nor that any closed loop goes to the goal. {x ∈ D: V(x) ≤ c} lies in the box `extent`.
+
     Outside B, F may jump: V̇ ≤ … holds of every value between, so that it is about Filippov's solutions.
 
     States that neither f, g, nor V and u depend on are left out: D is all of ℝ along them, and nothing is said of where
@@ -62,15 +79,25 @@ class RegionClaim:
     rim: float  # a lower bound of V on the boundary of D and where a constraint is violated: no ρ is higher
     wanted: float  # max V on X₀, or up to 0.1 % more
     least: float  # the largest V that was seen on X₀
-    hole: float  # c
-    contraction: Contraction | None
-    slowest: float  # the largest real part among the eigenvalues of the linearised law, in 1/s
+    hole: float  # c; 0 where there is none
+    contraction: Contraction | None  # none is sought with a disturbance
+    slowest: float  # the largest real part among the eigenvalues of the linearised law, in 1/s; nan with a disturbance
     volume_share: float  # of X₀ in the region; a lower bound
     region_share: float  # of D in it; a lower bound
     proof: Proof | None  # that V falls; none is tried where nothing contracts
     seconds: float
     left_out: list[int]  # ignorable states
     constraints: Sequence[str] = ()
+    disturbance: State | None = None  # w in units of ẋ, (n,); None where nothing is pushed
+    extent: Box | None = None  # around {x ∈ D: V(x) ≤ c}, with a disturbance and where ρ ≥ c; 0 along states left out
+    ultimate_share: float = math.nan  # of D in {x ∈ D: V(x) ≤ c}; an upper bound
+
+    @property
+    def entered_within(self) -> float:
+        """Seconds after which each closed loop of the region has V ≤ c, at most; ∞ where there is no region."""
+        if not self.rho >= self.hole > 0:
+            return math.inf
+        return just_above(math.log(self.rho / self.hole) / self.decay)
 
     @property
     def counterexample(self) -> Counterexample | None:
@@ -93,6 +120,16 @@ class RegionClaim:
         """Why the verdict is not certified, and what may help."""
         if self.verdict == "certified":
             return None
+        return self._why_it_does_not_hold_the_goal or self._why_it_is_small
+
+    @property
+    def _why_it_does_not_hold_the_goal(self) -> str | None:
+        """Why there is no hole, where there is none."""
+        if self.disturbance is not None:
+            return None if self.hole > 0 else (
+                "no levels c < ρ were found between which V(0, ·) falls whatever the pushes, so that nothing is left: "
+                "allow a smaller --disturbance, or a smaller --decay"
+            )  # fmt: skip
         if self.contraction is None and not self.slowest < 0:
             return (
                 f"u(0, x) does not hold the goal: linearised, an eigenvalue has the real part {self.slowest:.3g} 1/s; "
@@ -102,6 +139,16 @@ class RegionClaim:
             return "no box around the goal was found on which u(0, x) is seen to contract, in the time for it"
         if not self.hole > 0:
             return "V(0, ·) is not above 0 around the goal, or not seen to be in the time for it"
+        return None
+
+    @property
+    def _why_it_is_small(self) -> str:
+        """Why it does not hold all of X₀."""
+        if self.verdict == "falsified" and self.disturbance is not None:
+            return (
+                "V(0, ·) does not fall at the rate λ there, at a level above c, under the worst push: allow a smaller "
+                "--disturbance, or a smaller --decay"
+            )
         if self.verdict == "falsified":
             return (
                 "V(0, ·) does not fall at the rate λ there under u(0, ·): train on a longer horizon, or from states "
@@ -116,26 +163,38 @@ class RegionClaim:
     @property
     def volume(self) -> float:
         """That of the region, without the states that are left out; a lower bound."""
-        widths = [w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out]
-        return self.region_share * math.prod(widths)
+        return self.region_share * self._volume_of_set
+
+    @property
+    def ultimate_volume(self) -> float:
+        """That of {x ∈ D: V(x) ≤ c}, without the states that are left out; an upper bound, nan where there is none."""
+        return self.ultimate_share * self._volume_of_set
+
+    @property
+    def _volume_of_set(self) -> float:
+        return math.prod(w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out)
 
 
 class RecedingDecrease(DecreaseCondition):
-    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially."""
+    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially.
+
+    With a disturbance V̇ is at its worst, V_xᵀ(f + g u(0, x)) + Σ_i w_i |∂V/∂x_i|.
+    """
 
     proves, partial = "region", True
 
-    def __init__(self, closed_loop: ClosedLoop, decay: float):
-        super().__init__(closed_loop, 1.0, 0.0)
+    def __init__(self, closed_loop: ClosedLoop, decay: float, disturbance: State | None = None):
+        super().__init__(closed_loop, 1.0, 0.0, disturbance=disturbance)
         if not 0 < decay < math.inf:
             raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
         self.decay, self.hole, self.around = decay, 0.0, None
 
     @property
     def facts(self) -> dict[str, Any]:
-        B = self.around
+        B, w = self.around, self.disturbance
         around = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
-        return {"decay": self.decay, "hole": self.hole, **around}
+        pushed = {} if w is None else {"disturbance": w.tolist()}
+        return {"decay": self.decay, "hole": self.hole, **around, **pushed}
 
     def open_hole(
         self, around: Contraction, seen: Sequence[int], level: float, budget: Budget, proposed: float | None = None
@@ -151,20 +210,28 @@ class RecedingDecrease(DecreaseCondition):
             raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
         self.constraints = OutsideTheHole(self.V, around.box, self.hole)
 
+    def open_everywhere(self, level: float) -> None:
+        """Ask nothing in {x ∈ D: V < c}, where pushes may lift V."""
+        self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
+
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         value, slope = self.V.value_and_state_gradient(t, x)
         fall = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
+        if self.disturbance is not None:
+            fall = fall + self.worst_push(slope)
         return fall + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), fall
 
 
 class OutsideTheHole(Constraints):
-    """h(x) > 0 where x ∈ B and V(0, x) < c: there the contraction speaks, and V need not fall."""
+    """h(x) > 0 where x ∈ B, or D without one, and V(0, x) < c: there V need not fall."""
 
     names = ("outside the hole",)
 
-    def __init__(self, V: torch.nn.Module, box: Box, level: float):
+    def __init__(self, V: torch.nn.Module, box: Box | None, level: float):
         super().__init__()
-        self.V, self.level = V, level
+        self.V, self.level, self.axes = V, level, []
+        if box is None:
+            return
         ends = zip(box.center.tolist(), box.widths.tolist(), strict=True)
         self.axes = [(i, middle, width / 2) for i, (middle, width) in enumerate(ends) if width > 0]
 
@@ -184,6 +251,7 @@ def region_claim(
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
     replay: bool = False,
+    disturbance: State | None = None,
 ) -> RegionClaim:
     """The largest region of attraction of the receding law that is a sublevel set of V(0, ·), as the budget allows.
 
@@ -193,83 +261,80 @@ def region_claim(
         decay: λ > 0 in 1/s; 1 % of 1/T if None.
         states: D, around X₀; by default a box around {V(0, ·) ≤ max over X₀}.
         report, keep, replay: of prove. B, Y, c and ρ are those of the file that goes on, proved anew by bounds.
+        disturbance: w, (n,): the claim is about every ẋ = F + w(t) with |w_i(t)| ≤ w_i; with w = 0 it is as without.
 
     Raises:
-        UsageError: λ or D do not fit, it is about a family, or the closed loop has an operator without a rule; or the
-            file keeps the proof of something else.
+        UsageError: λ, w or D do not fit, it is about a family, or the closed loop has an operator without a rule; or
+            the file keeps the proof of something else.
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if problem.system.constants:
         raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
-    condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay)
+    w = _pushes(disturbance, problem)
+    condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay, w)
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
-    left_out, X0, wanted, D, domain, sides, _ = setting_of(condition, problem, 0.0, states, budget)
+    setting = setting_of(condition, problem, 0.0, states, budget)
+    left_out, X0, wanted, D, domain, sides, _ = setting
     seen = [i for i in range(X0.dimension) if i not in left_out]
     _require_inside(D, goal, seen)
     if kept is not None:
-        kept.require(decay, D)
+        kept.require(decay, D, w)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
-    seconds, proposed = (for_levels(budget).seconds, None) if kept is None else (LEVELS, (kept.box, kept.coordinates))
-    contraction, slowest = contraction_around(condition.closed_loop, goal, D, seen, seconds, proposed)
-    proof, rho, level = None, -math.inf, just_below(rim) if kept is None else kept.level(contraction, rim)
-    if contraction is not None:
-        condition.open_hole(contraction, seen, level, for_levels(budget), kept and kept.hole)
+    contraction, slowest, level = _open(condition, goal, setting, seen, rim, budget, kept)
+    proof, rho, extent, ultimate = None, -math.inf, None, math.nan
     if condition.hole > 0:
         proof = proof_within(
             condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay
         )
         rho = proof.level if proof.level >= condition.hole else rho
+    if w is not None and rho > -math.inf:
+        extent = extent_of(condition.V, D, condition.hole, _half(budget))
+        ultimate = 1 - share_of(lambda t, x: -condition.V(t, x), D.lower, D.upper, -condition.hole, _half(budget))
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
         decay, D, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
-        left_out, names_of(problem.constraints),
+        left_out, names_of(problem.constraints), w, extent, ultimate,
     )  # fmt: skip
 
 
-class KeptRegion(NamedTuple):
-    """What a file proposes to prove again of a region, and what it says is proved."""
-
-    path: Path
-    decay: float  # λ in 1/s
-    states: Box  # D; without width along states that nothing depends on
-    box: Box  # B
-    coordinates: Tensor  # Y
-    hole: float  # c
-    wanted: float  # the level that was tried
-    rho: float  # the level that is proved, as it says
-    seconds: float  # of the search
-
-    def require(self, decay: float, states: Box) -> None:
-        """Refuse another λ or D than those of the file."""
-        same = self.states.lower.equal(states.lower) and self.states.upper.equal(states.upper)
-        if self.decay != decay or not same:
-            raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
-
-    def level(self, contraction: Contraction | None, rim: float) -> float:
-        """The level that was tried, where V is above it on the boundary of D and the law contracts on B."""
-        where = "F that contracts on B" if contraction is None else f"V > ρ = {self.wanted!r} on the boundary of D"
-        if contraction is None or not self.wanted < rim:
-            raise UsageError(f"Expected {where} of {str(self.path)!r}, got no bounds that say so; {REMEDY}.")
-        return self.wanted
+def _pushes(disturbance: State | None, problem: Problem) -> State | None:
+    """w in float64; None where it is 0."""
+    if disturbance is None:
+        return None
+    require_disturbance(disturbance, problem.system.n)
+    return disturbance.double() if bool((disturbance > 0).any()) else None
 
 
-def kept_region(path: Path) -> KeptRegion:
-    """What the file of a region's proof says; nothing is bounded.
+def _open(
+    condition: RecedingDecrease,
+    goal: State,
+    setting: Setting,
+    seen: Sequence[int],
+    rim: float,
+    budget: Budget,
+    kept: KeptRegion | None,
+) -> tuple[Contraction | None, float, float]:
+    """Open the hole: around the goal where the law contracts, or as wide as pushes ask for; that of a file, if any.
 
-    Raises:
-        UsageError: it is another file.
+    Returns:
+        (the contraction, the largest real part of the linearised law's eigenvalues, the level to be tried); None and
+        nan with a disturbance.
     """
-    content = part_of(read_proofs(path), "region", path, NEW_FILE)
-    with refusing(path):
-        of, wanted, _ = content["of"]
-        lower, upper, *B = (torch.tensor(side, dtype=torch.float64) for side in (of["lower"], of["upper"], *of["box"]))
-        numbers = of["decay"], of["hole"], wanted, content["proved"], content["seconds"]
-        decay, hole, wanted, rho, seconds = (float(number) for number in numbers)
-        Y = torch.tensor(of["Y"], dtype=torch.float64)
-        return KeptRegion(path, decay, Box(lower[1:], upper[1:]), Box(*B), Y, hole, wanted, rho, seconds)
+    levels = for_levels(budget)
+    if condition.disturbance is not None:
+        level = just_below(rim) if kept is None else kept.level(True, rim)
+        found = ultimate_level(condition, setting.domain, goal, level, levels) if kept is None else kept.hole
+        condition.open_everywhere(found)
+        return None, math.nan, level
+    seconds, proposed = (levels.seconds, None) if kept is None else (LEVELS, kept.contracting)
+    contraction, slowest = contraction_around(condition.closed_loop, goal, setting.states, seen, seconds, proposed)
+    level = just_below(rim) if kept is None else kept.level(contraction is not None, rim)
+    if contraction is not None:
+        condition.open_hole(contraction, seen, level, for_levels(budget), kept and kept.hole)
+    return contraction, slowest, level
 
 
 def _half(budget: Budget) -> Budget:

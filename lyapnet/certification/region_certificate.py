@@ -1,7 +1,7 @@
 """Certificates by proof of the receding law: a region of attraction."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -14,7 +14,13 @@ from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.region import RegionClaim, region_claim
-from lyapnet.certification.sound_certificate import listed, parse_set
+from lyapnet.certification.sound_certificate import (
+    however_pushed,
+    listed,
+    named_pushes,
+    parse_disturbance,
+    parse_set,
+)
 from lyapnet.certification.tables import floored
 from lyapnet.controller import Controller
 from lyapnet.policy import ValuePolicy
@@ -24,7 +30,9 @@ PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the re
 
 
 class RegionCertificate(Certificate):
-    """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium."""
+    """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium; with a
+    disturbance, to a smaller set around the goal, which none leaves.
+    """
 
     kind: ClassVar[str] = "region"
     picture: ClassVar[str] = "region.png"
@@ -39,6 +47,11 @@ class RegionCertificate(Certificate):
         "rho": "largest ρ proved",
         "rim": "V(0, ·) on the boundary of D and of constraints, at least",
         "decay": "λ, 1/s",
+        "disturbance": "disturbances, at most",
+        "ultimate_level": "c, V(0, ·) from some time on, at most",
+        "ultimate_volume": "volume of {V(0, ·) ≤ c}, at most",
+        "ultimate_extent": "box around {V(0, ·) ≤ c}",
+        "entered_within": "seconds to {V(0, ·) ≤ c}, at most",
         "hole": "c, below which the contraction speaks",
         "contraction_box": "B",
         "contraction_rate": "κ, 1/s",
@@ -61,6 +74,13 @@ class RegionCertificate(Certificate):
             "contraction_rate": B.rate, "equilibrium_offset": B.offset,
             "contraction_coordinates": B.coordinates.tolist(), "contraction_fingerprint": B.fingerprint,
         }  # fmt: skip
+        pushed = {} if claim.disturbance is None else {"disturbance": self.pushes}
+        if claim.extent is not None:
+            pushed |= {
+                "ultimate_level": claim.hole, "ultimate_volume": claim.ultimate_volume,
+                "entered_within": claim.entered_within,
+                "ultimate_extent": [claim.extent.lower.tolist(), claim.extent.upper.tolist()],
+            }  # fmt: skip
         searched = {} if proof is None else {
             "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
         }  # fmt: skip
@@ -71,7 +91,8 @@ class RegionCertificate(Certificate):
             "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
             "constraints": list(claim.constraints) if proved else [],
             "counterexample": found and {"x": found.x, "condition": found.condition, "V": found.height},
-            "seconds": claim.seconds, **around, **searched, **({"origin": self._origin} if self._origin else {}),
+            "seconds": claim.seconds, **around, **pushed, **searched,
+            **({"origin": self._origin} if self._origin else {}),
         }  # fmt: skip
 
     def in_words(self) -> str:
@@ -82,16 +103,42 @@ class RegionCertificate(Certificate):
         left_out = ", ".join(names[i] for i in claim.left_out)
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         origin = f" {self._origin}" * bool(self._origin)
-        assert claim.contraction is not None
         return (
-            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} is a region of attraction of the receding law u(0, x), "
-            f"proved in continuous time for this model: no closed loop that starts in it leaves it{kept}, and all go "
-            f"to one equilibrium exponentially, for ever, which is within {claim.contraction.offset:.3g} of the goal "
-            f"(in the norm of x). Its volume is at least {claim.volume:.6g}, in the units of the states; it holds at "
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)} The volume of the region is "
+            f"at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
             f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
             f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
         )
+
+    def _end(self, kept: str) -> str:
+        """What the region is, and where closed loops end."""
+        claim, B, pushed = self.claim, self.claim.contraction, however_pushed(self.pushes)
+        if B is not None:
+            return (
+                f"is a region of attraction of the receding law u(0, x), proved in continuous time for this model: no "
+                f"closed loop that starts in it leaves it{kept}, and all go to one equilibrium exponentially, for "
+                f"ever, which is within {B.offset:.3g} of the goal (in the norm of x)."
+            )
+        assert claim.extent is not None
+        names, (lower, upper) = (
+            self.controller.system.state_names,
+            (side.tolist() for side in (claim.extent.lower, claim.extent.upper)),
+        )
+        seen = [i for i in range(len(names)) if i not in claim.left_out]
+        within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
+        return (
+            f"is never left under the receding law u(0, x), proved in continuous time for this model, {pushed}: no "
+            f"closed loop that starts in it leaves it{kept}, and each comes to {{x ∈ D: V(0, x) ≤ c}}, c = "
+            f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
+            f"ultimate bound). That set lies in {within}. That closed loops come closer to the goal, or to rest, is "
+            f"not claimed."
+        )
+
+    @property
+    def pushes(self) -> dict[str, float]:
+        """The disturbed states and how much their derivatives are pushed at most."""
+        return named_pushes(self.claim.disturbance, self.controller.system.state_names)
 
     @property
     def _origin(self) -> str:
@@ -102,14 +149,22 @@ class RegionCertificate(Certificate):
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction
         rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
+        inside = f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''}"
+        if self.pushes:
+            c = repr(claim.hole) if claim.hole > 0 else "c"
+            w = ", ".join(f"w({name}) = {w!r}" for name, w in self.pushes.items())
+            return [
+                f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
+                f"at each x ∈ D with {c} ≤ V ≤ {rho}",
+                inside,
+            ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
         box = "B" if B is None else f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]"
         Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
             f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
             f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}",
-            f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''},  "
-            f"V > {hole} > 0 on the boundary of {box}",
+            f"{inside},  V > {hole} > 0 on the boundary of {box}",
             f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
             f"continuous; {Y}",
         ]
@@ -118,11 +173,15 @@ class RegionCertificate(Certificate):
         found = self.claim.counterexample
         why = {
             "certified": "it does",
-            "falsified": "V does not fall so in the set that this would take (closed loops may go to the goal even so)",
+            "falsified": "V does not fall so in the set that this would take "
+            f"(closed loops may {'stay in it' if self.pushes else 'go to the goal'} even so)",
             "unknown": self.claim.reason,
         }[self.verdict]
         where = "" if found is None else f" At x = {listed(found.x)} it fails by {found.condition:.3g}."
-        return f"The verdict is on the claim that a sublevel set on which V falls so holds all of X₀: {why}.{where}"
+        but = f" but for {{V < {self.claim.hole!r}}}" if self.pushes and self.claim.hole > 0 else ""
+        return (
+            f"The verdict is on the claim that a sublevel set on which V falls so{but} holds all of X₀: {why}.{where}"
+        )
 
     def figure(self) -> figures.Figure:
         controller, problem = self.controller, self.controller.problem
@@ -155,6 +214,7 @@ def region_certificate(
     seconds: float = 60.0,
     workers: int = 1,
     device: str = "cpu",
+    disturbance: Sequence[str] | None = None,
     keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
@@ -167,6 +227,7 @@ def region_certificate(
         decay: λ in 1/s; 1 % of 1/T if None.
         set: D, as parse_set reads it; found if None.
         seconds: when to stop undecided.
+        disturbance: STATE=w for each ẋ_i that is pushed by at most w.
         keep: a file in which the proof is kept, and from which it goes on.
         report: is told how far the proof is.
         started: time.monotonic() from which the seconds count; now if None.
@@ -175,9 +236,10 @@ def region_certificate(
     claim = region_claim(
         controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
         stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
+        disturbance=parse_disturbance(disturbance or (), controller),
     )  # fmt: skip
     options = {
-        "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device, "keep": keep,
-        "seed": seed,
+        "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device,
+        "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
     }  # fmt: skip
     return RegionCertificate(controller, claim, options)

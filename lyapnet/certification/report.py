@@ -60,12 +60,9 @@ def write_outputs(
         command: that makes the certificate again.
     """
     targets = [path for path in (figure, folder and folder / certificate.picture) if path]
-    picture = certificate.figure() if targets else None
+    picture = certificate.figure() if targets else Figure()
     for path in targets:
-        buffer = io.BytesIO()
-        assert picture is not None
-        picture.savefig(buffer, dpi=150, format=path.suffix.removeprefix("."))
-        write_atomically(path, buffer.getbuffer())
+        write_figure(picture, path)
         yield path
     if folder is None:
         return
@@ -76,6 +73,13 @@ def write_outputs(
     ):
         write_atomically(folder / name, (text.rstrip() + "\n").encode())
         yield folder / name
+
+
+def write_figure(picture: Figure, path: Path) -> None:
+    """Write a figure whole or not at all, in the format that the file's name says."""
+    buffer = io.BytesIO()
+    picture.savefig(buffer, dpi=150, format=path.suffix.removeprefix("."))
+    write_atomically(path, buffer.getbuffer())
 
 
 def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[str, Any]:

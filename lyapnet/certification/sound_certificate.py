@@ -84,8 +84,7 @@ class SoundCertificate(Certificate):
     @property
     def pushes(self) -> dict[str, float]:
         """The disturbed states and how much their derivatives are pushed at most."""
-        w, names = self.claim.disturbance, self.controller.system.state_names
-        return {} if w is None else {names[i]: float(w[i]) for i in range(len(w)) if w[i] > 0}
+        return named_pushes(self.claim.disturbance, self.controller.system.state_names)
 
     def in_words(self) -> str:
         claim = self.claim
@@ -102,8 +101,7 @@ class SoundCertificate(Certificate):
     @property
     def _however_pushed(self) -> str:
         """What the claim adds about disturbances."""
-        each = ", ".join(f"of at most {w!r} on d({name})/dt" for name, w in self.pushes.items())
-        return f"whatever pushes there are, {each}, " if each else ""
+        return f"{however_pushed(self.pushes)}, " if self.pushes else ""
 
     @property
     def _or_violates(self) -> str:
@@ -147,6 +145,17 @@ class SoundCertificate(Certificate):
         return figures.funnel(
             self.claim, controller.V, problem.initial_states, problem.goal, labels, problem.constraints
         )
+
+
+def named_pushes(w: State | None, names: Sequence[str]) -> dict[str, float]:
+    """The disturbed states and how much their derivatives are pushed at most."""
+    return {} if w is None else {names[i]: float(w[i]) for i in range(len(w)) if w[i] > 0}
+
+
+def however_pushed(pushes: Mapping[str, float]) -> str:
+    """What a claim says of disturbances."""
+    each = ", ".join(f"of at most {w!r} on d({name})/dt" for name, w in pushes.items())
+    return f"whatever pushes there are, {each}"
 
 
 def listed(x: Sequence[float]) -> str:

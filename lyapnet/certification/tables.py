@@ -55,6 +55,8 @@ def _shown(key: str, value: Any) -> str:
         return f"{value:,}"
     if isinstance(value, list):
         return f"[{', '.join(_shown('', entry) for entry in value)}]"
+    if key == "ultimate_volume":
+        return f"{value:.4g}"
     if key.startswith("confidence"):
         return f"1 − {1 - value:.2g}"
     if key.endswith(("bound", "volume_share")):

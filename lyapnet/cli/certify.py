@@ -97,6 +97,10 @@ Seconds = Annotated[
 ]  # fmt: skip
 Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
+Disturbance = Annotated[
+    list[str] | None,
+    typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
 Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -190,10 +194,7 @@ def sound(
     seconds: Seconds = 60.0,
     workers: Workers = 1,
     device: Device = "cpu",
-    disturbance: Annotated[
-        list[str] | None,
-        typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
-    ] = None,
+    disturbance: Disturbance = None,
     keep: Keep = None,
     refine: Annotated[
         int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
@@ -279,6 +280,13 @@ def region(
     seconds: Seconds = 60.0,
     workers: Workers = 1,
     device: Device = "cpu",
+    disturbance: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="The largest push on the derivative of a state; may be given again. STATE=W,W,… claims for each W.",
+            metavar="STATE=W",
+        ),
+    ] = None,
     keep: Keep = None,
     seed: Seed = 0,
     as_json: AsJson = False,
@@ -288,6 +296,10 @@ def region(
 ) -> None:  # fmt: skip
     """A region of attraction of the receding law u(0, x), for ever: proved."""
     begun = time.monotonic()
+    several = any("," in each for each in disturbance or ())
+    if several and (keep is not None or report is not None):
+        raise UsageError("Expected one disturbance with --keep or --report, got several; name one for each.")
+    from lyapnet.certification.disturbances.regions import regions_under_pushes
     from lyapnet.certification.region_certificate import region_certificate
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set
@@ -299,11 +311,16 @@ def region(
     given = given.with_functions(value, law)
     controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
-        certificate = region_certificate(
-            controller, decay, states, seconds, workers, device, keep, seed, progress, started=begun
-        )
-    _show(certificate, given, as_json)
-    _write(certificate, given, as_json, figure, report)
+        options, certificate, regions = (decay, states, seconds, workers, device), None, None
+        if several:
+            regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress)
+        else:
+            certificate = region_certificate(controller, *options, disturbance, keep, seed, progress, started=begun)
+    if regions is not None:
+        _show_several(regions, given, as_json, figure)
+    if certificate is not None:
+        _show(certificate, given, as_json)
+        _write(certificate, given, as_json, figure, report)
 
 
 @app.command()
@@ -344,6 +361,20 @@ def _show(certificate: Any, given: Given, as_json: bool) -> None:
     if not as_json:
         table = certificate_table(given.title, certificate.result, certificate.labels)
         Console(highlight=False, markup=False).print(table)
+
+
+def _show_several(regions: Any, given: Given, as_json: bool, figure: Path | None) -> None:
+    """Regions under pushes of several sizes as a table or JSON, and their figure."""
+    from lyapnet.certification.disturbances.tables import table
+    from lyapnet.certification.report import write_figure
+
+    if as_json:
+        print(json.dumps(regions.result, allow_nan=False))
+    else:
+        Console(highlight=False, markup=False).print(table(given.title, regions))
+    if figure is not None:
+        write_figure(regions.figure(), figure)
+        Console(stderr=True, highlight=False, markup=False).print(f"wrote {figure}", soft_wrap=True)
 
 
 def _write(certificate: Any, given: Given, as_json: bool, figure: Path | None, report: Path | None) -> None:

@@ -10,7 +10,8 @@ from lyapnet.certification import Budget, kept_proofs, region_claim
 from lyapnet.certification.checking import check, kept_funnel
 from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.funnel import setting_of
-from lyapnet.certification.region import KeptRegion, OutsideTheHole, RecedingDecrease
+from lyapnet.certification.kept_regions import KeptRegion
+from lyapnet.certification.region import OutsideTheHole, RecedingDecrease
 from lyapnet.certification.region_certificate import region_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.certification.two_sided_certificate import two_sided_certificate

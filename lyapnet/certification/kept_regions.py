@@ -1,0 +1,72 @@
+"""What the file of a region's proof proposes to prove again."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.certification.kept_proofs import part_of, read_proofs, refusing
+from lyapnet.errors import UsageError
+from lyapnet.sets import Box
+from lyapnet.types import State
+
+NEW_FILE = "take another file"
+REMEDY = f"allow more seconds, or {NEW_FILE}"
+
+
+class KeptRegion(NamedTuple):
+    """What a file proposes to prove again of a region, and what it says is proved."""
+
+    path: Path
+    decay: float  # λ in 1/s
+    states: Box  # D; without width along states that nothing depends on
+    contracting: tuple[Box, Tensor] | None  # (B, Y); none with a disturbance
+    disturbance: State | None  # w
+    hole: float  # c
+    wanted: float  # the level that was tried
+    rho: float  # the level that is proved, as it says
+    seconds: float  # of the search
+
+    def require(self, decay: float, states: Box, disturbance: State | None) -> None:
+        """Refuse another λ, D or w than those of the file."""
+        same = self.states.lower.equal(states.lower) and self.states.upper.equal(states.upper)
+        if self.decay != decay or not same:
+            raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
+        kept, given = (None if w is None else w.tolist() for w in (self.disturbance, disturbance))
+        if kept != given:
+            raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
+
+    def level(self, contracts: bool, rim: float) -> float:
+        """The level that was tried, where V is above it on the boundary of D.
+
+        Args:
+            contracts: whether the law is seen to contract on B, where it has to.
+        """
+        where = f"V > ρ = {self.wanted!r} on the boundary of D" if contracts else "F that contracts on B"
+        if not contracts or not self.wanted < rim:
+            raise UsageError(f"Expected {where} of {str(self.path)!r}, got no bounds that say so; {REMEDY}.")
+        return self.wanted
+
+
+def kept_region(path: Path) -> KeptRegion:
+    """What the file of a region's proof says; nothing is bounded.
+
+    Raises:
+        UsageError: it is another file.
+    """
+    content = part_of(read_proofs(path), "region", path, NEW_FILE)
+    with refusing(path):
+        of, wanted, _ = content["of"]
+        lower, upper = (torch.tensor(of[side], dtype=torch.float64) for side in ("lower", "upper"))
+        numbers = of["decay"], of["hole"], wanted, content["proved"], content["seconds"]
+        decay, hole, wanted, rho, seconds = (float(number) for number in numbers)
+        w, contracting = None, None
+        if "disturbance" in of:
+            w = torch.tensor(of["disturbance"], dtype=torch.float64)
+            if not bool((w > 0).any()):
+                raise ValueError("a disturbance that is none")
+        else:
+            lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
+            contracting = Box(lowest, highest), Y
+        return KeptRegion(path, decay, Box(lower[1:], upper[1:]), contracting, w, hole, wanted, rho, seconds)

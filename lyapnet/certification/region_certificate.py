@@ -12,8 +12,10 @@ from torchdiffeq import odeint
 from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
+from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress
-from lyapnet.certification.region import RegionClaim, region_claim
+from lyapnet.certification.region import OutsideTheHole, RecedingDecrease, RegionClaim, region_claim
 from lyapnet.certification.sound_certificate import (
     however_pushed,
     listed,
@@ -22,10 +24,13 @@ from lyapnet.certification.sound_certificate import (
     parse_set,
 )
 from lyapnet.certification.tables import floored
+from lyapnet.contracts import copied
 from lyapnet.controller import Controller
 from lyapnet.policy import ValuePolicy
 from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.types import Corner
 
+NEARLY = 0.999  # of the least V on the boundary of D: a region that comes so close is as large as D lets it be
 PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the region they begin
 
 
@@ -65,6 +70,20 @@ class RegionCertificate(Certificate):
         "origin": "V and u",
     }
     claim: RegionClaim
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing more to prove in D: the region holds all of X₀, or comes up to the boundary."""
+        return self.verdict == "certified" or self.claim.rho >= NEARLY * self.claim.rim
+
+    def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
+        """The condition in plain arithmetic, {0} × D, and the level up to which it was to hold."""
+        claim = self.claim
+        condition = RecedingDecrease(copied(self.controller.closed_loop), claim.decay, claim.disturbance)
+        if claim.hole > 0:
+            around = None if claim.contraction is None else claim.contraction.box
+            condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
+        return condition, over_time(claim.states, 0.0), claim.rim
 
     def numbers(self) -> dict[str, Any]:
         claim, names, found = self.claim, self.controller.system.state_names, self.claim.counterexample

@@ -12,16 +12,19 @@ import torch
 from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
+from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.funnel import SoundClaim, sound_claim
+from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.tables import floored
+from lyapnet.contracts import copied
 from lyapnet.controller import Controller
 from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.sets import Box
-from lyapnet.types import PerState, State
+from lyapnet.types import Corner, PerState, State
 
 COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
 SEARCHED = 64  # of them, where each optimum is a search
@@ -54,6 +57,17 @@ class SoundCertificate(Certificate):
         "fingerprint": "fingerprint of what was bounded",
     }
     claim: SoundClaim
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing more to prove: a funnel holds all of X₀."""
+        return self.verdict == "certified"
+
+    def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
+        """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to hold."""
+        claim = self.claim
+        condition = DecreaseCondition(copied(self.controller.closed_loop), claim.alpha, claim.delta)
+        return condition, over_time(claim.states, claim.duration), claim.wanted
 
     def numbers(self) -> dict[str, Any]:
         return {**self.proved(), "guaranteed_cost_ratio": self.compared.ratio}

@@ -101,6 +101,8 @@ Disturbance = Annotated[
     list[str] | None,
     typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
 ]
+Overrides = Annotated[list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")]
+Refine = Annotated[int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
 Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -173,9 +175,7 @@ def statistical(
 @of_a_controller
 def sound(
     given: Given,
-    overrides: Annotated[
-        list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
-    ] = None,
+    overrides: Overrides = None,
     alpha: Annotated[
         float,
         _number(
@@ -196,9 +196,7 @@ def sound(
     device: Device = "cpu",
     disturbance: Disturbance = None,
     keep: Keep = None,
-    refine: Annotated[
-        int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
-    ] = 0,
+    refine: Refine = 0,
     two_sided: Annotated[
         bool, typer.Option("--two-sided", help="Bound the optimum from below, too: no control is cheaper.")
     ] = False,
@@ -210,12 +208,7 @@ def sound(
 ) -> None:  # fmt: skip
     """A funnel that no closed loop leaves, and its cost: proved."""
     begun = time.monotonic()
-    if refine and keep is not None:
-        raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
-    if refine and given.at:
-        raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
-    if overrides and not refine:
-        raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
+    _require_refinable(refine, overrides, keep, given)
     if two_sided and (refine or disturbance):
         raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
     from lyapnet.certification.report import require_writable
@@ -250,13 +243,7 @@ def sound(
         _show(certificate, found, as_json)
         return certificate
 
-    if refine:
-        from lyapnet.training.refinement import refine as train_on
-
-        checkpoint, certificate = train_on(given.checkpoint, certified, refine, overrides or [], notes, given.parts())
-        given = given.of(checkpoint)
-    else:
-        certificate = certified(given.checkpoint, begun)
+    given, certificate = _refined(given, certified, refine, overrides, begun)
     _write(certificate, given, as_json, figure, report)
 
 
@@ -264,6 +251,7 @@ def sound(
 @of_a_controller
 def region(
     given: Given,
+    overrides: Overrides = None,
     decay: Annotated[
         float | None,
         _number(
@@ -288,6 +276,7 @@ def region(
         ),
     ] = None,
     keep: Keep = None,
+    refine: Refine = 0,
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
@@ -296,7 +285,10 @@ def region(
 ) -> None:  # fmt: skip
     """A region of attraction of the receding law u(0, x), for ever: proved."""
     begun = time.monotonic()
+    _require_refinable(refine, overrides, keep, given)
     several = any("," in each for each in disturbance or ())
+    if refine and (several or value or law):
+        raise UsageError("Expected --refine with one checkpoint and one disturbance, got several or --value; drop it.")
     if several and (keep is not None or report is not None):
         raise UsageError("Expected one disturbance with --keep or --report, got several; name one for each.")
     from lyapnet.certification.disturbances.regions import regions_under_pushes
@@ -309,18 +301,23 @@ def region(
         parse_set(states)
     require_writable(figure, report, keep)
     given = given.with_functions(value, law)
-    controller = given.load()
-    with proof_progress(Console(stderr=True, highlight=False, markup=False), "region") as progress:
-        options, certificate, regions = (decay, states, seconds, workers, device), None, None
-        if several:
+    options, notes = (decay, states, seconds, workers, device), Console(stderr=True, highlight=False, markup=False)
+    if several:
+        controller = given.load()
+        with proof_progress(notes, "region") as progress:
             regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress)
-        else:
-            certificate = region_certificate(controller, *options, disturbance, keep, seed, progress, started=begun)
-    if regions is not None:
-        _show_several(regions, given, as_json, figure)
-    if certificate is not None:
-        _show(certificate, given, as_json)
-        _write(certificate, given, as_json, figure, report)
+        return _show_several(regions, given, as_json, figure)
+
+    def certified(path: Path, started: float | None = None) -> Any:
+        started, found = started or time.monotonic(), given.of(path)
+        controller = found.load()
+        with proof_progress(notes, "region") as progress:
+            certificate = region_certificate(controller, *options, disturbance, keep, seed, progress, started=started)
+        _show(certificate, found, as_json)
+        return certificate
+
+    given, certificate = _refined(given, certified, refine, overrides, begun)
+    return _write(certificate, given, as_json, figure, report)
 
 
 @app.command()
@@ -346,6 +343,29 @@ def check(
         table = certificate_table(f"{proof}, {given.title}", result, labels_of(result))
         Console(highlight=False, markup=False).print(table)
     raise typer.Exit(result["verdict"] != "certified")
+
+
+def _require_refinable(rounds: int, overrides: list[str] | None, keep: str | None, given: Given) -> None:
+    """Refuse what does not go with --refine, and overrides without it."""
+    if rounds and keep is not None:
+        raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
+    if rounds and given.at:
+        raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
+    if overrides and not rounds:
+        raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
+
+
+def _refined(
+    given: Given, certified: Callable[..., Any], rounds: int, overrides: list[str] | None, begun: float
+) -> tuple[Given, Any]:
+    """The controller and its certificate, after so many rounds of training at most."""
+    if not rounds:
+        return given, certified(given.checkpoint, begun)
+    from lyapnet.training.refinement import refine
+
+    notes = Console(stderr=True, highlight=False, markup=False)
+    checkpoint, certificate = refine(given.checkpoint, certified, rounds, overrides or [], notes, given.parts())
+    return given.of(checkpoint), certificate
 
 
 def _record(certificate: Any, draws: Any) -> None:

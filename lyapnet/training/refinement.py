@@ -1,6 +1,5 @@
-"""Counterexamples back into training, until a sound claim is certified: `lyapnet certify --refine`."""
+"""Counterexamples back into training, until a claim is certified: `lyapnet certify sound | region --refine`."""
 
-import copy
 import csv
 import io
 from collections.abc import Callable, Sequence
@@ -11,7 +10,8 @@ from rich.console import Console
 from torch import Tensor
 
 from lyapnet.build import Parts
-from lyapnet.certification import DecreaseCondition, violations
+from lyapnet.certification import violations
+from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
@@ -23,17 +23,18 @@ from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
 
 POINTS_FILE = "points.csv"
 CALLBACKS = "callbacks="  # how an override that names them begins
+Refinable = SoundCertificate | RegionCertificate
 FURTHER = 256  # counterexamples, and as many undecided points, of each round
 
 
 def refine(
     checkpoint: Path,
-    certified: Callable[[Path], SoundCertificate],
+    certified: Callable[[Path], Refinable],
     rounds: int,
     overrides: Sequence[str],
     console: Console,
     parts: Parts | None = None,
-) -> tuple[Path, SoundCertificate]:
+) -> tuple[Path, Refinable]:
     """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
 
     Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
@@ -42,7 +43,7 @@ def refine(
     the same command goes on after whatever stopped it.
 
     Args:
-        certified: makes the sound certificate of the controller of a checkpoint.
+        certified: makes the certificate of the controller of a checkpoint, a funnel or a region.
         parts: those of the user's own that it is made with; nothing else that a checkpoint names is imported.
 
     Raises:
@@ -55,7 +56,7 @@ def refine(
         run = _finished_run(folder)
         if run is None:
             certificate = certified(checkpoint)
-            if certificate.claim.verdict == "certified":
+            if certificate.complete:
                 return checkpoint, certificate
             if not (folder / CONFIG).exists():
                 _prepare(folder, certificate, overrides, parts)
@@ -64,21 +65,15 @@ def refine(
     return checkpoint, certified(checkpoint)
 
 
-def failing_points(certificate: SoundCertificate) -> Tensor:
-    """Points (t, x) at which a condition fails or is undecided inside the funnel that X₀ needs, (k, 1 + n)."""
-    controller, claim = certificate.controller, certificate.claim
-    condition = DecreaseCondition(copy.deepcopy(controller.closed_loop).double(), claim.alpha, claim.delta)
-    lower, upper = (
-        torch.cat([side.new_tensor([time]), side])
-        for time, side in ((0.0, claim.states.lower), (claim.duration, claim.states.upper))
-    )
-    generator = stream(controller.config.seed, CERTIFICATION, 1)
-    failing = violations(condition, (lower, upper), claim.wanted, FURTHER, generator)
+def failing_points(certificate: Refinable) -> Tensor:
+    """Points (t, x) at which a condition fails or is undecided inside the set that is sought, (k, 1 + n)."""
+    claim, generator = certificate.claim, stream(certificate.controller.config.seed, CERTIFICATION, 1)
+    failing = violations(*certificate.sought(), FURTHER, generator)
     chosen = torch.randperm(len(claim.undecided), generator=generator)[:FURTHER]
     return torch.cat([failing, claim.undecided[chosen]])
 
 
-def _extent(certificate: SoundCertificate) -> list[float]:
+def _extent(certificate: Refinable) -> list[float]:
     """A bound of each |x_i − x*_i| in D; 1 for states that the claim leaves out."""
     states = certificate.claim.states
     reach = states.reach_from(certificate.controller.problem.goal.to(states.lower))
@@ -91,7 +86,7 @@ def _finished_run(folder: Path) -> Run | None:
     return runs[-1] if runs and runs[-1].finished else None
 
 
-def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[str], parts: Parts) -> None:
+def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], parts: Parts) -> None:
     """Write what a round trains on, and its config last."""
     controller = certificate.controller
     require_parts(controller.config, parts, folder.parent)
@@ -114,7 +109,8 @@ def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[st
     write_atomically(folder / POINTS_FILE, text.getvalue().encode())
     config["logs"], config["experiment"] = str(folder.parent), folder.name
     pointwise["counterexamples"] = str(folder / POINTS_FILE)
-    pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
+    if config["program"]["name"] != "region":  # which has a weight of its own
+        pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
     pointwise["region"] = pointwise["region"] or _extent(certificate)
     config["training"]["learning_rate"] /= 5
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())

@@ -16,6 +16,7 @@ from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
 from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.refining import refined, require_refinable
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
 
@@ -101,6 +102,11 @@ Disturbance = Annotated[
     list[str] | None,
     typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
 ]
+Value = Annotated[
+    Path | None,
+    typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
+]
+Law = Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")]
 Overrides = Annotated[list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")]
 Refine = Annotated[int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
@@ -208,7 +214,7 @@ def sound(
 ) -> None:  # fmt: skip
     """A funnel that no closed loop leaves, and its cost: proved."""
     begun = time.monotonic()
-    _require_refinable(refine, overrides, keep, given)
+    require_refinable(refine, overrides, keep, given)
     if two_sided and (refine or disturbance):
         raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
     from lyapnet.certification.report import require_writable
@@ -243,7 +249,7 @@ def sound(
         _show(certificate, found, as_json)
         return certificate
 
-    given, certificate = _refined(given, certified, refine, overrides, begun)
+    given, certificate = refined(given, certified, refine, overrides, begun)
     _write(certificate, given, as_json, figure, report)
 
 
@@ -259,11 +265,8 @@ def region(
             "λ, at which V(0, ·) has to fall, in 1/s; 1 % of 1/T if none.",
         ),
     ] = None,
-    value: Annotated[
-        Path | None,
-        typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
-    ] = None,
-    law: Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")] = None,
+    value: Value = None,
+    law: Law = None,
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
@@ -271,7 +274,7 @@ def region(
     disturbance: Annotated[
         list[str] | None,
         typer.Option(
-            help="The largest push on the derivative of a state; may be given again. STATE=W,W,… claims for each W.",
+            help="The largest push on the derivative of a state; may be given again. STATE=W,W claims for each W.",
             metavar="STATE=W",
         ),
     ] = None,
@@ -285,7 +288,7 @@ def region(
 ) -> None:  # fmt: skip
     """A region of attraction of the receding law u(0, x), for ever: proved."""
     begun = time.monotonic()
-    _require_refinable(refine, overrides, keep, given)
+    require_refinable(refine, overrides, keep, given)
     several = any("," in each for each in disturbance or ())
     if refine and (several or value or law):
         raise UsageError("Expected --refine with one checkpoint and one disturbance, got several or --value; drop it.")
@@ -316,7 +319,7 @@ def region(
         _show(certificate, found, as_json)
         return certificate
 
-    given, certificate = _refined(given, certified, refine, overrides, begun)
+    given, certificate = refined(given, certified, refine, overrides, begun)
     return _write(certificate, given, as_json, figure, report)
 
 
@@ -325,6 +328,8 @@ def region(
 def check(
     proof: Annotated[Path, typer.Argument(help="The file of --keep.", metavar="PROOF")],
     given: Given,
+    value: Value = None,
+    law: Law = None,
     workers: Workers = 1,
     as_json: AsJson = False,
     debug: Debug = False,
@@ -334,6 +339,7 @@ def check(
     from lyapnet.certification.checking import labels_of
     from lyapnet.certification.tables import certificate_table, proof_progress
 
+    given = given.with_functions(value, law)
     controller = given.load()
     with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
         result = checked(controller, proof, workers, progress)
@@ -343,29 +349,6 @@ def check(
         table = certificate_table(f"{proof}, {given.title}", result, labels_of(result))
         Console(highlight=False, markup=False).print(table)
     raise typer.Exit(result["verdict"] != "certified")
-
-
-def _require_refinable(rounds: int, overrides: list[str] | None, keep: str | None, given: Given) -> None:
-    """Refuse what does not go with --refine, and overrides without it."""
-    if rounds and keep is not None:
-        raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
-    if rounds and given.at:
-        raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
-    if overrides and not rounds:
-        raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(overrides)!r}; add it.")
-
-
-def _refined(
-    given: Given, certified: Callable[..., Any], rounds: int, overrides: list[str] | None, begun: float
-) -> tuple[Given, Any]:
-    """The controller and its certificate, after so many rounds of training at most."""
-    if not rounds:
-        return given, certified(given.checkpoint, begun)
-    from lyapnet.training.refinement import refine
-
-    notes = Console(stderr=True, highlight=False, markup=False)
-    checkpoint, certificate = refine(given.checkpoint, certified, rounds, overrides or [], notes, given.parts())
-    return given.of(checkpoint), certificate
 
 
 def _record(certificate: Any, draws: Any) -> None:

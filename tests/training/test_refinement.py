@@ -18,6 +18,8 @@ from rich.console import Console
 import lyapnet
 from lyapnet.build import Parts
 from lyapnet.certification import DecreaseCondition, SoundClaim, sound_certificate
+from lyapnet.certification.region import RegionClaim
+from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
@@ -103,7 +105,8 @@ def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     before, config = load_config(trained / "config.yaml"), load_config(folder / "config.yaml")
     assert config.training.learning_rate == pytest.approx(before.training.learning_rate / 5)
     assert (config.training.iterations, config.pointwise.points) == (3, 8), "the overrides"
-    assert config.pointwise.weight == before.program.constraint > 0 == before.pointwise.weight
+    assert config.pointwise.weight == before.program.constraint > 0
+    assert before.pointwise.weight is None
     assert config.pointwise.counterexamples == str(folder.resolve() / "points.csv")
     assert config.pointwise.region == [1.6, 2.6], "D"
     assert any(not torch.equal(w, weights(best(run))[name]) for name, w in weights(checkpoint).items())
@@ -124,6 +127,49 @@ def test_its_points_fail_the_condition_or_are_undecided(run):
     assert (c > 0).all()
     assert (W <= 20.0).all()
     assert len(refinement.failing_points(claimed(best(run), level=-1.0))) == 2, "no violation lies below this level"
+
+
+@pytest.fixture(scope="module")
+def region_run(tmp_path_factory):
+    """The folder of a run of the region program that has hardly begun."""
+    folder = tmp_path_factory.mktemp("regions")
+    tiny = [each for each in TINY if "steps" not in each]
+    changes = [*tiny, "horizon={steps: 40, dt: 0.2, stationary: true}", "training.warmup=0", "pointwise.points=16"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lyapnet.training.start.OPTIMA", 6)
+        patch.setattr("lyapnet.training.pretraining.STEPS", (5, 5))
+        assert main(["train", "--config", "conf/regions/van_der_pol.yaml", f"logs={folder}", *changes]) == 0
+    return folder / "van_der_pol_region/version_0"
+
+
+def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
+    before = load_config(region_run / "config.yaml")
+    options = ["--set=-4.8:4.8,-10.8:10.8", "--seconds", "5", "--refine", "1", "--json"]
+    assert main(["certify", "region", str(best(region_run)), *FEW, *options]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["kind"] == "region"
+    folder = region_run / "refine_1"
+    assert runs(folder) == ["version_0"]
+    config = load_config(folder / "config.yaml")
+    assert config.pointwise.weight is before.pointwise.weight is None, "the program has one of its own"
+    assert config.pointwise.region == [4.8, 10.8]
+    _, points = points_of(folder)
+    assert not points[:, 0].any(), "V has no time"
+    controller = lyapnet.load(best(region_run))
+    t, x = points[:, 0].double(), points[:, 1:].double()
+    value, slope = controller.V.value_and_state_gradient(t, x)
+    fall = (slope * controller.system.dynamics(x, controller.closed_loop.policy(t, x))).sum(-1)
+    assert float((fall > -0.01 * value).double().mean()) > 0.5, "V rises there, or hardly falls; others are undecided"
+
+
+def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
+    controller = lyapnet.load(best(region_run))
+    claim = partial(
+        RegionClaim, 0.01, Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1, contraction=None,
+        slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
+    )  # fmt: skip
+    assert RegionCertificate(controller, claim(rho=1.9999), {"seed": 0}).complete
+    assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).complete
 
 
 def test_the_same_command_does_not_train_again(run, monkeypatch):

@@ -70,7 +70,6 @@ REGIONS = {  # arXiv 2506.01356, table 1 and appendix C.2: system, its parameter
     "double_integrator": (DoubleIntegrator, {"mass": 1}, 1, [26.4, 9.6]),
     "van_der_pol": (VanDerPol, {"damping": 1}, 1, [4.8, 10.8]),
     "pendulum_strong": (Pendulum, PENDULUM, 6, [20, 100]),
-    "pendulum_weak": (Pendulum, PENDULUM, 0.75, [19.2, 64.8]),
     "path_tracking_wide": (PathTracking, CIRCLE, 0.84, [10, 10]),
     "path_tracking_narrow": (PathTracking, CIRCLE, 0.5, [10, 10]),
 }

@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from lyapnet.build import Parts
+from lyapnet.build import Parts, build_program
 from lyapnet.certification import DecreaseCondition, violations
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
@@ -114,7 +114,8 @@ def _prepare(folder: Path, certificate: SoundCertificate, overrides: Sequence[st
     write_atomically(folder / POINTS_FILE, text.getvalue().encode())
     config["logs"], config["experiment"] = str(folder.parent), folder.name
     pointwise["counterexamples"] = str(folder / POINTS_FILE)
-    pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
+    program = parts.program or build_program(controller.config)
+    pointwise["weight"] = pointwise["weight"] or program.pointwise or config["program"]["constraint"]
     pointwise["region"] = pointwise["region"] or _extent(certificate)
     config["training"]["learning_rate"] /= 5
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())

@@ -104,7 +104,8 @@ def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     before, config = load_config(trained / "config.yaml"), load_config(folder / "config.yaml")
     assert config.training.learning_rate == pytest.approx(before.training.learning_rate / 5)
     assert (config.training.iterations, config.pointwise.points) == (3, 8), "the overrides"
-    assert config.pointwise.weight == before.program.constraint > 0 == before.pointwise.weight
+    assert before.pointwise.weight is None
+    assert config.pointwise.weight == before.program.constraint > 0
     assert config.pointwise.counterexamples == str(folder.resolve() / "points.csv")
     assert config.pointwise.region == [1.6, 2.6], "D"
     assert any(not torch.equal(w, weights(best(run))[name]) for name, w in weights(checkpoint).items())

@@ -126,6 +126,8 @@ class Regulator(nn.Module):
         counts = (np.eye(len(A)) != A).any(0) | Q.any(0) | S.any(1)
         A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
         try:
+            if not counts.any():
+                raise ValueError("no state has a part in it")
             P = solve_discrete_are(A, B, Q, R, s=S)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise ValueError(

@@ -79,7 +79,7 @@ def check_training_sizes(config: Any) -> None:
     require_memory("evaluation.test_states", options.test_states, test, "choose fewer")
     certified = NUMBER * n * options.certified_states
     require_memory("evaluation.certified_states", options.certified_states, certified, "choose fewer")
-    if config.pointwise.weight:
+    if config.pointwise.weight != 0:  # null: the program's own
         points = NUMBER * config.pointwise.points * max([n, *hidden])
         require_memory("pointwise.points", config.pointwise.points, points, "choose fewer")
 

@@ -108,6 +108,7 @@ IMPOSSIBLE = [
     ("network.state_scale", [1, 2, 3]), ("system.parameters", {"mass": "heavy"}), ("system.parameters", {"masss": 1}),
     ("network.epsilon", -1), ("rollout.compile", "perhaps"), ("program.name", "value"), ("controls.name", "ball"),
     ("pointwise", {"weight": 1, "points": 10**13}), ("pointwise", {"weight": 1, "counterexamples": "no.csv"}),
+    ("pointwise", {"points": 10**13}),
     ("pointwise", {"weight": 1, "region": [1, 2, 3]}), ("training.optimizer", "sgd"), ("training.precision", "half"),
 ]  # fmt: skip
 

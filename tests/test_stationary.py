@@ -7,9 +7,11 @@ import torch
 from scipy.linalg import solve_continuous_are
 from torch.testing import assert_close
 
-from lyapnet.build import build_problem, build_value_function
+from lyapnet import load, train
+from lyapnet.build import Parts, build_problem, build_value_function
 from lyapnet.calculus import gradients
 from lyapnet.config import config_from_plain
+from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.expansions import riccati
 from lyapnet.networks import FCN, Scaling, StationaryNetwork, Timeless
@@ -95,6 +97,65 @@ def test_what_has_no_regulator_is_refused(changes, message):
         problem(CHAIN, *changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (["network.terminal=exact"], "network.terminal=free with horizon.stationary"),
+        (["network.smooth=true"], "takes smooth, got stationary; remove network.smooth"),
+        (["network.name=stationary", "horizon.stationary=false", "cost.Q_T=1"], "horizon.stationary: true"),
+    ],
+)
+def test_a_network_that_does_not_suit_is_refused(changes, message):
+    config = config_from_plain(CHAIN | {"program": {"name": "value"}}, changes)
+    with pytest.raises(UsageError, match=message):
+        build_value_function(config, build_problem(config))
+
+
+def obstacle_at(distance):
+    """An obstacle of radius 0.2 beside the goal."""
+    return {"cost": CHAIN["cost"] | {"obstacles": [{"center": {"x1": distance}, "radius": 0.2, "weight": 5.0}]}}
+
+
+def test_a_goal_at_which_something_is_paid_is_refused():
+    with pytest.raises(UsageError, match=r"q\(x\*\) = 0 for horizon.stationary, got 3.03"):  # 5 exp(−2/4)
+        problem(CHAIN | obstacle_at(0.1))
+    assert P_of(problem(CHAIN | obstacle_at(0.8))).isfinite().all()
+
+
+def test_a_goal_outside_the_constraints_is_refused():
+    away = {"initial_states": {"lower": [1.5, 0, 0], "upper": [2, 0.1, 0.1]}}
+    with pytest.raises(UsageError, match="a goal within the constraints"):
+        problem(CHAIN | away | {"constraints": {"lower": {"x1": 1.2}}})
+    own = problem(CHAIN | away | {"constraints": {"lower": {"x1": -1.2}}})
+    assert_close(P_of(own), P_of(problem(CHAIN)))
+
+
+class Flat(Cost):
+    """Its q is one number, where it should be one for each state."""
+
+    def state(self, x):
+        return (x**2).sum()
+
+    def R(self, x):
+        return torch.ones(*x.shape[:-1], 1, 1)
+
+    def terminal(self, x):
+        return (x**2).sum(-1)
+
+
+def test_what_is_wrong_with_an_own_cost_is_said_in_words():
+    own = Parts(cost=Flat())
+    idle = {"system": {"name": "linear", "parameters": {"A": [[0.0]], "B": [[1.0]]}}, "cost": {}}
+    with pytest.raises(UsageError, match=r"q\(x\) of Flat"):
+        build_problem(config_from_plain(CHAIN | idle | {"initial_states": {"lower": [-1], "upper": [1]}}), own)
+
+
+def test_where_nothing_moves_and_nothing_costs_there_is_no_regulator():
+    idle = {"system": {"name": "linear", "parameters": {"A": [[0.0]], "B": [[1.0]]}}, "cost": {"Q": 0, "R": 1}}
+    with pytest.raises(UsageError, match="no state has a part in it"):
+        problem(CHAIN | idle | {"initial_states": {"lower": [-1], "upper": [1]}})
+
+
 def test_a_goal_that_no_regulator_reaches_is_refused():
     drifting = {"system": {"name": "linear", "parameters": {"A": [[0.5, 0.0], [0.0, 0.0]], "B": [[0.0], [1.0]]}}}
     two = {"cost": {"Q": 1, "R": 1}, "initial_states": {"lower": [-1, -1], "upper": [1, 1]}}
@@ -165,6 +226,23 @@ def test_the_regulator_of_a_linear_system_is_known_before_training():
     assert_close(learner.V(torch.zeros(()).double(), x), ((x @ P) * x).sum(-1), rtol=1e-3, atol=0)
 
 
+@torch.no_grad()
+def test_before_a_start_too_V_vanishes_at_the_target_alone():
+    config = config_from_plain(CHAIN, ["target=[0.5,0,0]"])
+    V, target = build_value_function(config, build_problem(config)), torch.tensor([0.5, 0.0, 0.0]).double()
+    assert float(V(torch.zeros(()).double(), target)) == 0 < float(V(torch.zeros(()).double(), 0 * target))
+
+
+def test_from_the_goal_alone_there_is_a_start():
+    only = {"initial_states": {"lower": [0, 0, 0], "upper": [0, 0, 0]}}
+    (learner,) = build_module(config_from_plain(CHAIN | only)).members
+    start = choose_start([learner])
+    assert start is not None
+    assert start.chosen.cost == 0
+    H = learner.V.curvature(torch.zeros(()).double())
+    assert_close(H, 2 * P_of(learner.problem), rtol=1e-6, atol=1e-6)
+
+
 def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     """Of a pendulum between tight limits it lies far below what V is on a wide X₀, and a fit sees both."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
@@ -182,11 +260,12 @@ def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
 
 
 def test_a_checkpoint_is_loaded_with_its_tail(tmp_path):
-    from lyapnet import load, train
-
     own = CHAIN | {"logs": str(tmp_path), "trainer": {"accelerator": "cpu"}}
     run = train(config_from_plain(own, ["training.iterations=1", "training.warmup=0", "rollout.compile=off"]))
     controller = load(run.best)
     assert controller.horizon.stationary
     assert_close(P_of(controller.problem), P_of(problem(CHAIN)))
     assert dataclasses.replace(controller.horizon, stationary=False) != controller.horizon
+    ends = config_from_plain(own, ["horizon.stationary=false", "cost.Q_T=1", "program.name=value"])
+    with pytest.raises(UsageError, match=r"which has V\(x\), got a task of V\(t, x\)"):
+        train(ends, finetune=run.best)

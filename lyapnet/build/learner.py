@@ -39,8 +39,10 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
     """
     options, n = config.network, problem.system.n
     cls, kept = network or class_of(config, "network"), _kept_states(config, problem.system)
+    name = options.name
     if problem.horizon.stationary and cls is ExpansionNetwork:  # the standard one
-        cls = StationaryNetwork
+        cls, name = StationaryNetwork, "stationary"
+    _require_same_end(problem, cls, options.terminal)
     angles = [kept.index(angle) for angle in problem.system.angles if angle in kept]
     chosen: dict[str, Any] = {
         "hidden": options.hidden,
@@ -58,13 +60,15 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
             f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."
         )
     for key in (key for key in chosen if key not in accepted):
-        name = {"embedded_angles": "embed_angles"}.get(key, key)
-        raise UsageError(f"Expected a network that takes {name}, got {options.name}; remove network.{name}.")
+        option = {"embedded_angles": "embed_angles"}.get(key, key)
+        raise UsageError(f"Expected a network that takes {option}, got {name}; remove network.{option}.")
     with float64_defaults(), torch.random.fork_rng(devices=[]), section("network"):
         torch.manual_seed(config.seed)
         V = cls(scaling=_scaling(config, problem, kept), **chosen)
         goal = problem.goal.double().cpu()[kept]
-        if goal.any() and not isinstance(V, ExpansionNetwork | StationaryNetwork):  # which have their own centre
+        if isinstance(V, StationaryNetwork):
+            V.goal.copy_(goal)
+        elif goal.any() and not isinstance(V, ExpansionNetwork):  # which has its own centre
             V = CentredNetwork(V, goal)
         if options.terminal == "exact":
             V = TerminalAnchor(V, _terminal_cost(problem, kept), problem.horizon.duration)
@@ -73,6 +77,23 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         if len(kept) < n:
             V = IgnoringStates(V, kept, n)
     return V.to(DTYPES[config.training.precision])
+
+
+def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str) -> None:
+    """Refuse a V without time in a task that ends, and one that is φ at T in a task that does not.
+
+    Raises:
+        UsageError: as said.
+    """
+    stationary = problem.horizon.stationary
+    if issubclass(cls, StationaryNetwork) and not stationary:
+        raise UsageError(
+            "Expected horizon.stationary: true with the stationary network, got a horizon that ends; its V has no time."
+        )
+    if stationary and terminal == "exact":
+        raise UsageError(
+            "Expected network.terminal=free with horizon.stationary, got exact; V has no end at which it could be φ."
+        )
 
 
 def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout:

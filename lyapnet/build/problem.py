@@ -74,10 +74,10 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
-        if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
-            problem = without_end(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
+        if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
+            problem = without_end(problem)
         return problem.to(dtype)
 
 

@@ -8,6 +8,7 @@ from lyapnet.errors import UsageError
 from lyapnet.problem import Problem
 
 PURPOSE, INSTEAD = "horizon.stationary", "choose another goal, or stationary: false"
+FREE, STATES = 1e-3, 256  # of the mean q at states of X₀: what staying at the goal may cost per second
 
 
 def without_end(problem: Problem) -> Problem:
@@ -16,7 +17,8 @@ def without_end(problem: Problem) -> Problem:
     V of the linearised problem is then φ at every t, whatever T is. No limit may be met at the goal.
 
     Raises:
-        UsageError: no control holds the goal, a limit is met there, or no regulator brings the state there.
+        UsageError: no control holds the goal, a limit is met there, it lies outside the constraints, staying there
+            costs something, or no regulator brings the state there.
     """
     limits, rest = problem.controls.limits, problem.rest
     if limits is None:
@@ -30,9 +32,30 @@ def without_end(problem: Problem) -> Problem:
             f"Expected limits around the control at the goal, {rest.tolist()}, for {PURPOSE}, got {lower.tolist()} to "
             f"{upper.tolist()}; widen controls, or choose another target."
         )
+    _require_lasting_goal(problem)
     n = problem.system.n
     try:
         regulator = Regulator(problem.replaced(cost=RegulatorTail(problem.cost, torch.zeros(n, n))), PURPOSE, INSTEAD)
     except ValueError as error:
         raise UsageError(str(error)) from error
     return problem.replaced(cost=RegulatorTail(problem.cost, regulator.P))
+
+
+def _require_lasting_goal(problem: Problem) -> None:
+    """Refuse a goal outside the constraints, and one at which q is paid: for ever, that is more than any number.
+
+    Raises:
+        UsageError: as said.
+    """
+    place = f"x* = {problem.goal.tolist()}"
+    if problem.constraints is not None and bool((problem.constraints(problem.goal) > 0).any()):
+        raise UsageError(f"Expected a goal within the constraints for {PURPOSE}, got {place} outside; {INSTEAD}.")
+    at_goal, mean = (
+        float(problem.cost.state(x).mean())
+        for x in (problem.goal, problem.initial_states.sample(STATES, torch.Generator().manual_seed(0)))
+    )
+    if abs(at_goal) > FREE * abs(mean):
+        raise UsageError(
+            f"Expected q(x*) = 0 for {PURPOSE}, got {at_goal:.3g} per second at {place}; write a cost that vanishes "
+            "there, move cost.obstacles away from it, or take stationary: false."
+        )

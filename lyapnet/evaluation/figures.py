@@ -211,11 +211,11 @@ def value_slices(V: Value, problem: Problem) -> Figure:
     if len(region.axes) == 1:
         axes = figure.subplots()
         for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN)[: len(times)], strict=True):
-            label = "V(x)" if stationary else f"t = {t:.2f} s"
-            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=label)
+            axes.plot(numpy_of(region.grid[0]), numpy_of(value), color=color, label=f"t = {t:.2f} s")
         axes.set_xlabel(system.state_labels[region.axes[0]])
-        axes.set_ylabel("V(t, x) (cost)")
-        axes.legend(frameon=False)
+        axes.set_ylabel(f"{'V(x)' if stationary else 'V(t, x)'} (cost)")
+        if not stationary:
+            axes.legend(frameon=False)
         return figure
     first, second = (numpy_of(g) for g in region.grid)
     panels = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]

@@ -10,7 +10,7 @@ from lyapnet.networks.centred import CentredNetwork
 from lyapnet.networks.expansion import ExpansionNetwork
 from lyapnet.networks.fcn import FCN
 from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
-from lyapnet.networks.ignoring import IgnoringStates
+from lyapnet.networks.ignoring import IgnoringStates, kept_states
 from lyapnet.networks.quadratic import QuadraticForm
 from lyapnet.networks.stationary import StationaryNetwork, Timeless
 
@@ -39,4 +39,5 @@ __all__ = [
     "StationaryNetwork",
     "TerminalAnchor",
     "Timeless",
+    "kept_states",
 ]

@@ -42,3 +42,8 @@ class IgnoringStates(ValueFunction):
             return None
         places = torch.eye(self.n).to(H)[self.kept]
         return places.mT @ H @ places
+
+
+def kept_states(V: ValueFunction, n: int) -> list[int]:
+    """The indices of the states, of n, on which a V depends."""
+    return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(n))

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction, time_derivative
+from lyapnet.problem import Problem
 from lyapnet.programs.base import Program
 from lyapnet.rollout import ClosedLoop, Rollout
 from lyapnet.sets import Box
@@ -43,7 +44,7 @@ class PointwiseCondition:
 
     closed_loop: ClosedLoop
     V: ValueFunction
-    goal: State
+    problem: Problem
     program: Program
     region: Box
     duration: float
@@ -64,10 +65,15 @@ class PointwiseCondition:
         V = rollout.closed_loop.V
         if V is None:
             raise ValueError("Expected a control law that a V defines, got another one; use a ValuePolicy.")
-        self.closed_loop, self.V, self.goal = rollout.closed_loop, V, rollout.problem.goal
+        self.closed_loop, self.V, self.problem = rollout.closed_loop, V, rollout.problem
         self.duration, self.stationary = rollout.problem.horizon.duration, rollout.problem.horizon.stationary
         self.program, self.region = program, region
         self.weight, self.points, self.further = weight, points, further
+
+    @property
+    def goal(self) -> State:
+        """x* (n,), on the device and in the precision that the problem has by now."""
+        return self.problem.goal
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step.
@@ -94,9 +100,9 @@ class PointwiseCondition:
 
     def draw(self, generator: torch.Generator) -> tuple[Time, State]:
         """The points of a step before the worst are chosen: SURPLUS times as many as it uses."""
-        x = self.region.sample(SURPLUS * self.points, generator)
-        share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64)
-        goal = self.goal.to(x)
+        goal = self.goal
+        x = self.region.sample(SURPLUS * self.points, generator).to(goal)
+        share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64).to(x.device)
         nearer = NEAREST**near if self.stationary else near
         x = goal + (x - goal) * torch.where(late < 0.5, 1.0, nearer)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)

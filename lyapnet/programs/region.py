@@ -9,15 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.networks import kept_states
 from lyapnet.programs.base import Program
 from lyapnet.programs.pointwise import LEAST, PointwiseCondition
 from lyapnet.programs.terms import hinge, terminal_hinge
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, State, ValuePath
 
-CEILING = (
-    1.15  # times the least V on the boundary of D: points above count neither as failing nor as part of the region
-)
+CEILING = 1.15  # times the least V on the boundary of D: points above do not count as failing
 SHARPNESS, SOFTNESS = 8.0, 30.0  # of what is smoothed: a step at V = ρ, and the least V on the boundary, both in log V
 BOUNDARY, SAMPLES = 1024, 20_000  # points on the boundary, and of D where the region is measured
 
@@ -89,7 +88,8 @@ class RegionCondition(PointwiseCondition):
         value, slope = V.value_and_state_gradient(now, x)
         rising = (slope * loop.system.dynamics(x, loop.policy(now, x))).sum(-1) >= 0
         boundary = self._log_value(self._boundary(generator)).exp()
-        return (value < torch.cat([value[rising], boundary]).min()).to(x).mean()
+        level = torch.minimum(value.where(rising, torch.inf).min(), boundary.min())
+        return (value < level).to(x).mean()
 
     def _log_value(self, x: State) -> PerState:
         return self.V(x.new_zeros(()), x).clamp_min(torch.finfo(x.dtype).tiny).log()
@@ -97,12 +97,12 @@ class RegionCondition(PointwiseCondition):
     def _boundary(self, generator: torch.Generator) -> State:
         """Points of the boundary of D, as many on each side along which V changes."""
         x = self.region.sample(BOUNDARY, generator).to(self.goal)
-        sides = [(i, side) for i in self._axes() for side in (self.region.lower[i], self.region.upper[i])]
+        sides = [(i, side) for i in self.axes for side in (self.region.lower[i], self.region.upper[i])]
         for k, (i, side) in enumerate(sides):
             x[k :: len(sides), i] = side
         return x
 
-    def _axes(self) -> list[int]:
-        """The states that V depends on."""
-        kept = getattr(self.V, "kept", None)
-        return list(range(self.region.dimension)) if kept is None else kept.tolist()
+    @property
+    def axes(self) -> list[int]:
+        """The states that V depends on: along the others V does not change, and D has no boundary."""
+        return kept_states(self.V, self.region.dimension)

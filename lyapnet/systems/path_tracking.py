@@ -33,4 +33,4 @@ class PathTracking(ControlAffineSystem):
         return torch.stack([self.speed * torch.sin(theta), -turning], -1)
 
     def g(self, x: State) -> InputMatrix:
-        return torch.tensor([[0.0], [self.speed / self.length]]).to(x).expand(*x.shape[:-1], 2, 1)
+        return x.new_tensor([[0.0], [self.speed / self.length]]).expand(*x.shape[:-1], 2, 1)

@@ -163,7 +163,7 @@ class BodyFrameQuadrotor(ControlAffineSystem):
         return torch.cat([(R * v[..., None]).sum(-2), falling, attitude_rates(attitude, w), turning], -1)
 
     def g(self, x: State) -> InputMatrix:
-        pushing = torch.tensor([[0.0]] * 5 + [[1 / self.mass]] + [[0.0]] * 6).to(x)
+        pushing = x.new_tensor([[0.0]] * 5 + [[1 / self.mass]] + [[0.0]] * 6)
         turning = torch.diag(1 / self.inertia).to(x)
         turning = torch.cat([torch.zeros_like(turning)] * 3 + [turning])
         return torch.cat([pushing, turning], 1).expand(*x.shape[:-1], 12, 4)

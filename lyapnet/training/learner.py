@@ -87,13 +87,15 @@ class Learner(nn.Module):
     def measure_on(self, trajectory: Trajectory) -> Tensor:
         """The loss of the validation states and points, kept in `validation_loss`, and their table in `validation`.
 
-        With the region program it is the share of D that is not in the region yet, as far as samples tell.
+        With the region program it is the share of D that is not in the region yet, as far as samples tell, kept in
+        `region_share`.
         """
         self.validation = measure(self.problem, self.program, trajectory, self.validation_optimum)
-        loss = self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
         if isinstance(self.pointwise, RegionCondition):
             self.region_share = self.pointwise.sampled_share(stream(self.seed, VALIDATION, POINTS))
             loss = 1 - self.region_share
+        else:
+            loss = self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
         self.validation_loss = float(loss)
         return loss
 

@@ -147,6 +147,12 @@ def _start_from(config: Config, module: TrainingModule, checkpoint: Path | None)
                     f"Expected a family in {names}, as of {str(checkpoint)!r}, got one in {own}; give the same names "
                     "in the same order, or start anew without --finetune."
                 )
+            if given.horizon.stationary != config.horizon.stationary:
+                its, own = ("V(x)" if each.horizon.stationary else "V(t, x)" for each in (given, config))
+                raise UsageError(
+                    f"Expected horizon.stationary as of {str(checkpoint)!r}, which has {its}, got a task of {own}; "
+                    "start anew without --finetune."
+                )
             if not config.family:
                 _note_another_target(given.target, module.members[0].problem, checkpoint)
         for member in module.members:

@@ -9,7 +9,7 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from lyapnet.build import Parts
+from lyapnet.build import Parts, build_program
 from lyapnet.certification import violations
 from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.certification.sound_certificate import SoundCertificate
@@ -109,8 +109,8 @@ def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], par
     write_atomically(folder / POINTS_FILE, text.getvalue().encode())
     config["logs"], config["experiment"] = str(folder.parent), folder.name
     pointwise["counterexamples"] = str(folder / POINTS_FILE)
-    if config["program"]["name"] != "region":  # which has a weight of its own
-        pointwise["weight"] = pointwise["weight"] or config["program"]["constraint"]
+    program = parts.program or build_program(controller.config)
+    pointwise["weight"] = pointwise["weight"] or program.pointwise or config["program"]["constraint"]
     pointwise["region"] = pointwise["region"] or _extent(certificate)
     config["training"]["learning_rate"] /= 5
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())

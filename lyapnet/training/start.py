@@ -22,7 +22,7 @@ from lyapnet.expansions import (
     path_under,
     riccati,
 )
-from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork
+from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, kept_states
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
@@ -100,7 +100,7 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     if not has_place_for_start(learners):
         return None
     networks = [_network_of(learner.V) for learner in learners]
-    problem, kept = learners[0].problem, _kept(learners[0].V)
+    problem, kept = learners[0].problem, _kept(learners[0])
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
     report("the optimum from the centre of X₀")
@@ -167,19 +167,19 @@ def _fitted(
         return []
     examples = examples_of(problem, optimum, stream(0, START, 4))
     _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
-    found_here = list[Candidate]()
+    without_fit = list[Candidate]()
     if problem.horizon.stationary:
-        found_here.append(_tried("the regulator, up to where it is right", learners[0], x0, began))
-        if _best([base, *found_here]) != base:
+        without_fit.append(_tried("the regulator, up to where it is right", learners[0], x0, began))
+        if _best([base, *without_fit]) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"fitting V to {found} optima")
     for learner in learners:
         fit(learner, optimum, examples)
     fitted = _tried(f"{found} optima from states of X₀", learners[0], x0, began)
-    if _best([base, *found_here, fitted]) != fitted:
+    if _best([base, *without_fit, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
-    return [*found_here, fitted]
+    return [*without_fit, fitted]
 
 
 def _take_least_wrong(
@@ -196,7 +196,7 @@ def _take_least_wrong(
     An expansion says much near its own path, and away from it, in a task with limits or several ways to the goal, worse
     than nothing.
     """
-    problem, kept, first = learners[0].problem, _kept(learners[0].V), learners[0]
+    problem, kept, first = learners[0].problem, _kept(learners[0]), learners[0]
 
     def put(choice: tuple[Expansion | None, float], learner: Learner, own: dict[str, Tensor]) -> None:
         network, (expansion, level) = _network_of(learner.V), choice
@@ -276,10 +276,8 @@ def take(
     """
     expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
     if isinstance(network, StationaryNetwork):
-        own = network.scale
-        network.take(
-            expansion.x[0].to(own), expansion.hessian[0].to(own), level * float(expansion.initially(x0).mean())
-        )
+        mean = float(expansion.initially(x0).mean()) or 1.0  # of an X₀ that is the goal alone
+        network.take(*(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean)
         return
     curvature = _curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
@@ -330,8 +328,8 @@ def _network_of(V: ValueFunction) -> Any:
     return inner if isinstance(inner, ExpansionNetwork | StationaryNetwork) else None
 
 
-def _kept(V: ValueFunction) -> list[int]:
-    return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(_network_of(V).n))
+def _kept(learner: Learner) -> list[int]:
+    return kept_states(learner.V, learner.problem.system.n)
 
 
 def _shown(candidate: Candidate) -> str:

@@ -95,6 +95,15 @@ def test_figures_are_drawn_with_units(drawing):
     assert states | controls | {"time (s)"} <= labels(paths)
 
 
+def test_a_stationary_V_is_drawn_once(drawing):
+    _, problem, V, _ = drawing
+    figure = figures.value_slices(V, problem.in_steps(stationary=True))
+    shown = " ".join([title(figure), *labels(figure)])
+    assert "V(x)" in shown
+    assert "t = " not in shown
+    assert "V(t" not in shown
+
+
 def test_slice_of_initial_states(drawing):
     name, problem, *_ = drawing
     cut = figures.widest_slice(problem.initial_states, 7)

@@ -88,6 +88,28 @@ def test_its_boundary_has_points_on_each_side(of):
         assert {float(side) for side in x[on[i], i]} == {-reach, reach}
 
 
+def test_it_follows_its_learner_to_another_device():
+    """To that of tensors without data, which others cannot be mixed with; limits of controls have to have some."""
+    (learner,) = build_module(config_from_plain({**OWN, "controls": {}})).members
+    learner.to("meta")
+    condition = learner.pointwise
+    assert condition(stream(1), COST.to("meta"), COST.to("meta")).is_meta
+    assert condition.sampled_share(stream(1)).is_meta
+
+
+def test_along_ignored_states_D_has_no_boundary():
+    cart = {
+        "system": {"name": "cartpole"}, "cost": {"Q": [0, 1, 0.1, 0.1], "R": 0.1},
+        "initial_states": {"lower": [-0.1] * 4, "upper": [0.1] * 4}, "pointwise": {"region": [9, 1, 2, 3]},
+        "controls": {"lower": -9, "upper": 9}, "network": {"ignored_states": ["cart position"]},
+    }  # fmt: skip
+    (learner,) = build_module(config_from_plain(OWN | cart)).members
+    assert learner.pointwise.axes == [1, 2, 3]
+    on = learner.pointwise._boundary(stream(2)).abs() == learner.pointwise.region.upper
+    assert bool(on.any(1).all())
+    assert not on[:, 0].any()
+
+
 def test_growth_widens_the_region(of):
     """Down its gradient the inscribed ellipse becomes larger, and up, smaller."""
     condition = of(torch.eye(2), growth=1e4, share=1e-6)

@@ -119,6 +119,23 @@ def test_each_check_can_fail(check):
         check(broken)
 
 
+def test_no_digits_are_lost_where_single_precision_is_the_default(system):
+    loses_no_digits(system)
+
+
+@pytest.mark.parametrize("make", [partial(PathTracking, speed=2.1), partial(BodyFrameQuadrotor, mass=1.1)])
+def test_no_digits_of_parameters_are_lost_either(make):
+    loses_no_digits(make())
+
+
+def loses_no_digits(system):
+    x = draw(system, 6)[0]
+    expected = [function(x) for function in maps_of(system)]
+    torch.set_default_dtype(torch.float32)
+    for function, value in zip(maps_of(system), expected, strict=True):
+        assert_close(function(x), value, rtol=1e-13, atol=1e-13)
+
+
 def test_a_registered_system_that_cannot_be_built_fails(monkeypatch, build_system):
     class Unlisted(DoubleIntegrator):
         def __init__(self, undeclared: float):

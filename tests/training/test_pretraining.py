@@ -199,7 +199,7 @@ def test_a_law_that_diverges_leaves_finite_examples(problem, free):
     path = path_under(problem, lambda _, x: 1e40 * x[..., :1] * x.norm(), optimum.path.x[0])
     assert float(path.x.abs().max()) > 1e300
     visited = examples_visited(problem, optimum, path)
-    assert all(column.isfinite().all() for column in visited.columns)
+    assert all(column.isfinite().all() for column in visited)
 
 
 def test_only_finite_trajectories_are_examples(problem):

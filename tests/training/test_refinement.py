@@ -25,6 +25,7 @@ from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import Interrupted, UsageError
+from lyapnet.programs import RegionProgram
 from lyapnet.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
@@ -105,11 +106,18 @@ def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     before, config = load_config(trained / "config.yaml"), load_config(folder / "config.yaml")
     assert config.training.learning_rate == pytest.approx(before.training.learning_rate / 5)
     assert (config.training.iterations, config.pointwise.points) == (3, 8), "the overrides"
-    assert config.pointwise.weight == before.program.constraint > 0
     assert before.pointwise.weight is None
+    assert config.pointwise.weight == before.program.constraint > 0
     assert config.pointwise.counterexamples == str(folder.resolve() / "points.csv")
     assert config.pointwise.region == [1.6, 2.6], "D"
     assert any(not torch.equal(w, weights(best(run))[name]) for name, w in weights(checkpoint).items())
+
+
+def test_a_region_is_refined_with_the_weight_of_its_program(tmp_path):
+    region = ["program.name=region", "program.constraint=0", "program.margin=null", "program.bound=null"]
+    run = train(tmp_path, *region, "horizon.stationary=true", "cost.Q_T=null", "network.name=stationary")
+    refine(run)
+    assert load_config(run / "refine_1/config.yaml").pointwise.weight == RegionProgram.pointwise
 
 
 def test_its_points_fail_the_condition_or_are_undecided(run):
@@ -151,7 +159,8 @@ def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
     folder = region_run / "refine_1"
     assert runs(folder) == ["version_0"]
     config = load_config(folder / "config.yaml")
-    assert config.pointwise.weight is before.pointwise.weight is None, "the program has one of its own"
+    assert before.pointwise.weight is None
+    assert config.pointwise.weight == RegionProgram.pointwise, "the program's own"
     assert config.pointwise.region == [4.8, 10.8]
     _, points = points_of(folder)
     assert not points[:, 0].any(), "V has no time"

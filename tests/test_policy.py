@@ -164,6 +164,8 @@ def vanishes_with_the_state(policy, t, x):
 @pytest.mark.parametrize("policy", POLICIES.values(), ids=POLICIES)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 def test_control_vanishes_with_the_state(policy, dtype, system, cost, V):
+    if bool(system.f(torch.zeros(system.n)).any()):
+        pytest.skip("a control holds the origin, which does not vanish there")
     smooth = Formula(lambda t, x: (2 + torch.sin(3 * t)) * ((x**2).sum(-1) + (x**4).sum(-1)))
     sloped = Formula(lambda t, x: V(t, x) + 100 * t)
     t, x = (v.to(dtype) for v in draw(system, 64))

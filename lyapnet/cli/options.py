@@ -66,7 +66,7 @@ class Given:
 
     def of(self, checkpoint: Path) -> "Given":
         """The same of another checkpoint."""
-        return Given(checkpoint, self.own, self.at)
+        return replace(self, checkpoint=checkpoint)
 
     def parts(self) -> Any:
         """The user's own parts, made with the config of the checkpoint."""

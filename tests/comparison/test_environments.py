@@ -64,7 +64,7 @@ def test_environment_made_by_name_is_the_task_of_the_config(name):
     sections = ("system", "cost", "initial_states", "horizon")
     of_config, of_name = build_problem(config), environment.problem
     assert {key: TASKS[name][key] for key in sections}.keys() == TASKS[name].keys()
-    assert to_plain(config)["horizon"] == TASKS[name]["horizon"]
+    assert to_plain(config)["horizon"] == {**TASKS[name]["horizon"], "stationary": False}
     x = of_config.initial_states.sample(5)
     u = torch.ones(5, of_config.system.m)
     for part in ("lower", "upper"):

@@ -9,6 +9,7 @@ from scipy.linalg import solve_discrete_are
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.cost.base import quadratic_form
 from lyapnet.expansions import in_float64
 from lyapnet.linear_algebra import apply
 from lyapnet.policy import ValuePolicy
@@ -151,8 +152,7 @@ class Regulator(nn.Module):
 
     def cost(self, x: State) -> PerState:
         """What is left to pay, without limits."""
-        delta = x - self.problem.goal
-        return (apply(self.P, delta) * delta).sum(-1)
+        return quadratic_form(self.P, x - self.problem.goal)
 
 
 class LaterPolicy(ValuePolicy):

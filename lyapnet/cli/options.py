@@ -49,6 +49,11 @@ class Given:
         return ", ".join([name, *(self.at or []), *(path.name for path in self.functions or ())])
 
     @property
+    def named(self) -> dict[str, str]:
+        """The user's own parts that the command names."""
+        return {part: name for part, name in self.own.items() if name is not None}
+
+    @property
     def again(self) -> dict[str, str | None]:
         """The options that give the same controller again, but for --at."""
         return {**self.own, **dict(zip(("value", "law"), map(str, self.functions or ()), strict=False))}
@@ -74,8 +79,9 @@ class Given:
         from lyapnet.checkpoint import read_checkpoint
         from lyapnet.loading import config_of
 
-        named = {part: name for part, name in self.own.items() if name is not None}
-        return parts_named(config_of(read_checkpoint(self.checkpoint), self.checkpoint), named) if named else Parts()
+        if not self.named:
+            return Parts()
+        return parts_named(config_of(read_checkpoint(self.checkpoint), self.checkpoint), self.named)
 
     def load(self) -> Any:
         """The controller."""
@@ -88,8 +94,7 @@ class Given:
         else:
             from lyapnet.importing import imported_controller
 
-            named = {part: name for part, name in self.own.items() if name is not None}
-            controller = imported_controller(self.checkpoint, *self.functions, named)
+            controller = imported_controller(self.checkpoint, *self.functions, self.named)
         torch.set_num_threads(controller.config.training.threads)
         return member_of(controller, self.at) if self.at else controller
 

@@ -66,7 +66,8 @@ class SoundCertificate(Certificate):
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to hold."""
         claim = self.claim
-        condition = DecreaseCondition(copied(self.controller.closed_loop), claim.alpha, claim.delta)
+        loop = copied(self.controller.closed_loop)
+        condition = DecreaseCondition(loop, claim.alpha, claim.delta, disturbance=claim.disturbance)
         return condition, over_time(claim.states, claim.duration), claim.wanted
 
     def numbers(self) -> dict[str, Any]:

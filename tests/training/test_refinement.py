@@ -4,6 +4,7 @@ Most rounds are of a claim that is made up, as a proof takes seconds; one goes t
 """
 
 import csv
+import dataclasses
 import json
 import shutil
 import sys
@@ -14,6 +15,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 from rich.console import Console
+from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.build import Parts
@@ -135,6 +137,20 @@ def test_its_points_fail_the_condition_or_are_undecided(run):
     assert (c > 0).all()
     assert (W <= 20.0).all()
     assert len(refinement.failing_points(claimed(best(run), level=-1.0))) == 2, "no violation lies below this level"
+
+
+def test_what_is_pushed_is_refined_against_the_push(run):
+    """The condition that is sought is the claim's own: V̇ at its worst under |w| ≤ w_max."""
+    still = claimed(best(run))
+    pushed = SoundCertificate(
+        still.controller, dataclasses.replace(still.claim, disturbance=torch.tensor([0.0, 0.5]).double()), {"seed": 0}
+    )
+    (condition, domain, level), (other, *_) = pushed.sought(), still.sought()
+    assert level == still.claim.wanted
+    t, x = torch.zeros(50).double(), domain[0][1:] + (domain[1] - domain[0])[1:] * torch.rand(50, 2).double()
+    _, slope = still.controller.V.value_and_state_gradient(t, x)
+    with torch.no_grad():
+        assert_close(condition(t, x) - other(t, x), 0.5 * slope[:, 1].abs())
 
 
 @pytest.fixture(scope="module")

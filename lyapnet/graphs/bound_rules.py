@@ -307,10 +307,11 @@ def _of_shape(operation: Any) -> Rule:
     return lambda x, *arguments, **keywords: operation(torch.zeros_like(x.radius[0]), *arguments, **keywords)
 
 
-for _operation in (
+OF_SHAPE = {
     aten.zeros_like.default, aten.ones_like.default, aten.full_like.default, aten.empty_like.default,
     aten.new_zeros.default, aten.new_ones.default, aten.new_full.default, aten.fill.Scalar,
-):  # fmt: skip
+}  # fmt: skip
+for _operation in OF_SHAPE:
     rule(_operation)(_of_shape(_operation))
 
 

@@ -11,6 +11,7 @@ in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the
 
 import copy
 import hashlib
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -22,12 +23,14 @@ from torch.utils._pytree import tree_map_only
 
 from lyapnet.errors import LyapnetError, UsageError, one_line
 from lyapnet.graphs import taylor
+from lyapnet.graphs.bound_kernel.kernel import BoundKernel, kernel_of
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
 from lyapnet.graphs.simplification import with_known_truths, without_copies
-from lyapnet.graphs.taylor import TaylorForm, box_form
+from lyapnet.graphs.taylor import TaylorForm, box_form, wide_axes
 from lyapnet.graphs.tracing import trace
 from lyapnet.types import Corner, Corners, OnBoxes
 
+MANY = 4000  # boxes, whose bounds take torch as long as a kernel takes to compile
 HELD = 32  # points of the box at which a trace is held against its function
 
 
@@ -70,11 +73,25 @@ class BoundedFunction:
         self._nodes = list(with_known_truths(without_copies(self.graph.graph)).nodes)
         self._fold_constants()
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
+        self._seen: Counter[tuple[int, ...]] = Counter()  # boxes, by the axes along which they have a width
+        self._kernels: dict[tuple[int, ...], BoundKernel | None] = {}
         self.forms(lower[None], upper[None])  # an operator without a rule is found here
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
-        """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box."""
-        return self.image(box_form(lower, upper, self.degree))
+        """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.
+
+        Machine code takes over once there are many boxes on the CPU, if there is any.
+        """
+        kernel = self._kernel(lower, upper) if lower.device.type == "cpu" else None
+        return self.image(box_form(lower, upper, self.degree)) if kernel is None else kernel.forms(lower, upper)
+
+    def _kernel(self, lower: Corners, upper: Corners) -> BoundKernel | None:
+        """The kernel for boxes with a width along the same axes as these, once MANY of them were bounded."""
+        wide = tuple(wide_axes(lower, upper).tolist())
+        self._seen[wide] += len(lower)
+        if self._seen[wide] > MANY and wide not in self._kernels:
+            self._kernels[wide] = kernel_of(self._nodes, self._constants, lower.shape[-1], wide, self.degree)
+        return self._kernels.get(wide)
 
     def image(self, box: TaylorForm) -> list[TaylorForm]:
         """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""

@@ -76,10 +76,10 @@ def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Se
     path = file_of(module, arguments)
     digest = path.with_suffix(".sha256")
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    _require_own(path.parent)
+    require_own(path.parent)
     if path.is_file():
         try:
-            _require_own(path)
+            require_own(path)
             if digest.read_text(encoding="ascii") == digest_of_file(path):
                 return aoti_load_package(str(path))
             reason = "another digest than what was compiled"
@@ -118,7 +118,7 @@ def one_number_at_a_time(module: nn.Module) -> nn.Module:
     return module
 
 
-def _require_own(path: Path) -> None:
+def require_own(path: Path) -> None:
     """Refuse a folder or file of machine code that another user owns or may write."""
     facts = path.stat()
     if facts.st_uid != os.getuid() or facts.st_mode & 0o022:

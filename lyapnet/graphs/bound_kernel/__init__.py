@@ -1,0 +1,1 @@
+"""Bounds of a function by machine code, one block of boxes after another."""

@@ -1,0 +1,147 @@
+"""Bounds of one function on many boxes by machine code: a program on forms, run by compiled C++."""
+
+import ctypes
+import hashlib
+import logging
+import multiprocessing
+import platform
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lyapnet.errors import CompilationError, one_line
+from lyapnet.files import digest_of_file, write_atomically
+from lyapnet.graphs.bound_kernel.program import Program
+from lyapnet.graphs.bound_kernel.rules import written
+from lyapnet.graphs.compilation import cache_folder, has_compiler, require_own
+from lyapnet.graphs.taylor import TaylorForm
+from lyapnet.types import Corners
+
+SOURCES = [Path(__file__).with_name(name) for name in ("functions.h", "forms.h", "program.cpp")]
+FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
+MOST_AXES = 16  # as in forms.h
+
+
+class BoundKernel:
+    """(lower, upper) ↦ the forms of a graph's results, for boxes with a width along the same axes.
+
+    Args:
+        nodes, constants: of the graph, and the values of those that do not depend on the point.
+        axes, wide, degree: of Program.
+
+    Raises:
+        NotImplementedError: an operation has no rule here.
+        CompilationError: there is no machine code.
+    """
+
+    def __init__(
+        self, nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int
+    ):
+        if len(wide) > MOST_AXES:
+            raise NotImplementedError(f"more than {MOST_AXES} axes")
+        program = Program(axes, wide, degree)
+        results = written(program, nodes, constants)
+        self._program = program.assembled([entry for y in results for entry in _entries(y)])
+        self._shapes = [y.shape for y in results]
+        self._terms, self._dimension = len(program.monomials), program.dimension
+
+    def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
+        """The results on boxes (boxes, 1 + n), one form each."""
+        program, boxes = self._program, len(lower)
+        lower, upper = lower.contiguous(), upper.contiguous()
+        sizes = [shape.numel() for shape in self._shapes]
+        results = torch.zeros(sum(sizes), self._terms + 1, boxes, dtype=torch.float64)
+        failed = library().lyapnet_bound(
+            *(_address(part) for part in (program.tables, program.code, program.numbers)),
+            *(ctypes.c_void_p(side.data_ptr()) for side in (lower, upper)),
+            *map(ctypes.c_long, (boxes, program.arena, program.spare)), ctypes.c_void_p(results.data_ptr()),
+        )  # fmt: skip
+        if failed:
+            raise MemoryError("Expected memory for a block of boxes, got none.")
+        forms = []
+        for part, shape in zip(results.split(sizes), self._shapes, strict=True):
+            every = part.permute(1, 2, 0).reshape(self._terms + 1, boxes, *shape)
+            forms.append(TaylorForm(every[:-1], every[-1], self._dimension))
+        return forms
+
+
+def kernel_of(
+    nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int
+) -> BoundKernel | None:
+    """A kernel; None where an operation has no rule, or there is no machine code."""
+    try:
+        return BoundKernel(nodes, constants, axes, wide, degree) if has_library() else None
+    except NotImplementedError:
+        return None
+
+
+@cache
+def has_library() -> bool:
+    """Whether there is machine code; a note says why not."""
+    try:
+        library()
+    except CompilationError as error:
+        if multiprocessing.parent_process() is None:
+            logging.getLogger(__name__).warning("note: %s; bounds go on without machine code.", error)
+        return False
+    return True
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The compiled C++, from disk, or compiled now: one file for each machine.
+
+    Raises:
+        CompilationError: there is no compiler, or it fails; or the cache is not the user's own.
+    """
+    path, folder = file_of_library(), cache_folder()
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    require_own(folder)
+    digest = path.with_suffix(".sha256")
+    if path.is_file():
+        require_own(path)
+        if digest.is_file() and digest.read_text(encoding="ascii") == digest_of_file(path):
+            return ctypes.CDLL(str(path))
+        logging.getLogger(__name__).warning("note: compiling again what is in %s: got another digest.", path)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".new_") as draft:
+        file = Path(draft) / path.name
+        _compile(file)
+        write_atomically(digest, digest_of_file(file).encode())
+        file.replace(path)
+    return ctypes.CDLL(str(path))
+
+
+def _compile(file: Path) -> None:
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
+    if not has_compiler():
+        raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
+    command = [get_cpp_compiler(), *FLAGS, str(SOURCES[-1]), "-o", str(file)]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", None) or str(error)
+        raise CompilationError(f"Expected bounds to compile, got {one_line(RuntimeError(said))[:200]}") from error
+    file.chmod(0o600)
+
+
+def file_of_library() -> Path:
+    """Where the machine code is kept: by its source, how it is compiled, and the instructions of the CPU."""
+    parts = [platform.machine(), sorted(torch.cpu.get_capabilities().items()), FLAGS, *(p.read_bytes() for p in SOURCES)]
+    return cache_folder() / f"bounds_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
+
+
+def _entries(forms: Any) -> list[Any]:
+    from lyapnet.graphs.bound_kernel.program import Entry
+
+    return [Entry(k) for k in forms.entries.flatten().tolist()]
+
+
+def _address(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)

@@ -1,0 +1,216 @@
+// A function's operations on Taylor forms as a flat program, run on one block of boxes after another: all forms of a
+// block stay in the cache. Programs are written by lyapnet/graphs/bound_program.py.
+
+#include "forms.h"
+
+#include <cstdlib>
+#include <memory>
+
+namespace {
+
+constexpr int TILE = 4;  // rows and columns of a product of matrices that stay in registers
+
+// Σ_m w_m x_m + offset; rounded by what comes out, where each number of it is the result of one operation
+void combine(const Block &block, const int *&code) {
+    const Entry out = block.entry(code);
+    const int operations = *code++, count = *code++;
+    const double offset = block.numbers[*code++];
+    V *into = opened(block, out);
+    V radius = splat(0), entered = splat(std::fabs(offset));
+    for (int n = 0; n < count; n++) {
+        const Entry x = block.entry(code);
+        const double weight = block.numbers[*code++];
+        for (int i = 0; i < x.support->count; i++) into[x.support->at[i]] += weight * x.terms[i];
+        radius += std::fabs(weight) * x.radius();
+        if (operations > 1) entered += std::fabs(weight) * magnitude(x);
+    }
+    into[0] += offset;
+    closed(out, into);
+    out.radius() = radius;
+    if (operations == 1) round_off(out, 1);
+    if (operations > 1) out.radius() += 2 * operations * EPSILON * entered + TINY;
+}
+
+template <int J, int K>
+void tile(const V *const *x, const double *w, int inner, int columns, V *const *out, int t) {
+    V sum[J][K] = {};
+    for (int i = 0; i < inner; i++)
+        for (int j = 0; j < J; j++)
+            for (int k = 0; k < K; k++) sum[j][k] += w[i * columns + j] * x[i][t + k];
+    for (int j = 0; j < J; j++)
+        for (int k = 0; k < K; k++) out[j][t + k] = sum[j][k];
+}
+
+template <int J>
+void tiles(const V *const *x, const double *w, int inner, int columns, V *const *out, int terms) {
+    int t = 0;
+    for (; t + TILE <= terms; t += TILE) tile<J, TILE>(x, w, inner, columns, out, t);
+    if (terms - t == 1) tile<J, 1>(x, w, inner, columns, out, t);
+    if (terms - t == 2) tile<J, 2>(x, w, inner, columns, out, t);
+    if (terms - t == 3) tile<J, 3>(x, w, inner, columns, out, t);
+}
+
+// taylor.matrix_product, of one row; entries with a smaller support than that of the result are padded
+void matrix_product(const Block &block, const int *&code) {
+    const int inner = *code++, columns = *code++;
+    const Support &s = block.supports[*code++];
+    const double *weights = block.numbers + *code++;
+    std::vector<const V *> x(inner);
+    std::vector<V *> out(columns);
+    V *radius = block.spare, *room = block.spare + inner;
+    for (int i = 0; i < inner; i++) {
+        const Entry entry = block.entry(code);
+        radius[i] = entry.radius() + 4 * inner * EPSILON * magnitude(entry) + TINY;
+        x[i] = entry.terms;
+        if (entry.support != &s) {
+            for (int k = 0; k < s.count; k++) block.dense[s.at[k]] = splat(0);
+            for (int k = 0; k < entry.support->count; k++) block.dense[entry.support->at[k]] = entry.terms[k];
+            for (int k = 0; k < s.count; k++) room[k] = block.dense[s.at[k]];
+            x[i] = room, room += s.count;
+        }
+    }
+    for (int j = 0; j < columns; j++) {
+        const Entry entry = block.entry(code);
+        out[j] = entry.terms;
+        V total = splat(0);
+        for (int i = 0; i < inner; i++) total += std::fabs(weights[i * columns + j]) * radius[i];
+        entry.radius() = total;
+    }
+    int j = 0;
+    for (; j + TILE <= columns; j += TILE) tiles<TILE>(x.data(), weights + j, inner, columns, &out[j], s.count);
+    for (; j < columns; j++) tiles<1>(x.data(), weights + j, inner, columns, &out[j], s.count);
+}
+
+enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, LEAKY, CLAMP };
+
+void apply_named(const Block &block, const int *&code) {
+    const int function = *code++;
+    const Entry x = block.entry(code), out = block.entry(code);
+    const double p = block.numbers[*code++], q = block.numbers[*code++];
+    switch (function) {
+        case EXP: return apply(block, x, out, Exp{});
+        case LOG: return apply(block, x, out, Log{});
+        case LOG1P: return apply(block, x, out, Log1p{});
+        case SQRT: return apply(block, x, out, Sqrt{});
+        case RECIPROCAL: return apply(block, x, out, Reciprocal{});
+        case SIGMOID: return apply(block, x, out, Sigmoid{p, q});
+        case SOFTPLUS: return apply(block, x, out, Softplus{p, q});
+        case SIN: return apply(block, x, out, Sin{});
+        case COS: return apply(block, x, out, Cos{});
+        case TAN: return apply(block, x, out, Tan{});
+        case SQUARE: return apply(block, x, out, Square{});
+        case LEAKY: return apply(block, x, out, Leaky{p});
+        case CLAMP: return apply(block, x, out, Clamp{p, q});
+    }
+}
+
+enum Operation { COMBINE, MATRIX_PRODUCT, MULTIPLY, FUNCTION, WHERE, NO_WIDER, SIGN, POSITIVE, NEGATION, CONJUNCTION };
+
+V one(M truth) { return truth ? splat(1) : splat(0); }
+
+void operate(const Block &block, int operation, const int *&code) {
+    if (operation == COMBINE) return combine(block, code);
+    if (operation == MATRIX_PRODUCT) return matrix_product(block, code);
+    if (operation == FUNCTION) return apply_named(block, code);
+    const Entry x = block.entry(code), y = block.entry(code);
+    if (operation == MULTIPLY) return multiply(block, x, y, block.entry(code));
+    if (operation == WHERE) {
+        const Entry otherwise = block.entry(code);
+        return where(block, x, y, otherwise, block.entry(code));
+    }
+    if (operation == CONJUNCTION) {
+        const Truth a = truth_of(block, x), b = truth_of(block, y);
+        return between(block.entry(code), one(a.certain & b.certain), one(a.possible & b.possible));
+    }
+    if (operation == NO_WIDER) {  // from here on, the second entry is the result
+        const double low = block.numbers[*code++];
+        return no_wider(block, x, y, low, block.numbers[*code++]);
+    }
+    const Range ends = interval(block, x);
+    if (operation == SIGN) return between(y, one(ends.low > 0) - one(ends.low < 0), one(ends.high > 0) - one(ends.high < 0));
+    if (operation == POSITIVE) return between(y, one(ends.low > 0), one(ends.high > 0));
+    const Truth truth = truth_of(block, x);  // NEGATION
+    between(y, one(~truth.possible), one(~truth.certain));
+}
+
+// taylor.box_form, of the boxes in the lanes
+void read_boxes(const Block &block, const int *&code, const double *lower, const double *upper, long first, long boxes) {
+    const int axes = *code++;
+    for (int axis = 0; axis < axes; axis++) {
+        const Entry y = block.entry(code);
+        V low, high;
+        for (int lane = 0; lane < LANES; lane++) {
+            const long box = first + lane < boxes ? first + lane : boxes - 1;
+            low[lane] = lower[box * axes + axis], high[lane] = upper[box * axes + axis];
+        }
+        fill(y, splat(0));
+        y.terms[0] = (low + high) * 0.5;
+        if (y.support->count > 1) y.terms[1] = (high - low) * 0.5;
+        round_off(y, 2);
+    }
+}
+
+// (results, terms and radius, boxes)
+void write_results(const Block &block, const int *&code, double *results, long first, long boxes) {
+    const long here = boxes - first < LANES ? boxes - first : LANES;
+    const int count = *code++;
+    for (int n = 0; n < count; n++, results += (block.terms + 1) * boxes) {
+        const Entry y = block.entry(code);
+        for (int i = 0; i <= y.support->count; i++) {
+            const int row = i < y.support->count ? y.support->at[i] : block.terms;
+            for (long lane = 0; lane < here; lane++) results[row * boxes + first + lane] = y.terms[i][lane];
+        }
+    }
+}
+
+// The monomials of all forms, and the supports: dimension, degree, terms, axes, places, count, supports
+void read_tables(Block &block, const int *tables) {
+    block.dimension = *tables++, block.degree = *tables++, block.terms = *tables++;
+    block.axes = tables, tables += 3 * block.terms;
+    block.place = tables, tables += block.terms * block.terms;
+    for (int count = *tables++; count > 0; count--) {
+        const int *upto = tables;
+        tables += 4;
+        block.supports.push_back({upto[3], upto, tables});
+        tables += upto[3];
+    }
+}
+
+}  // namespace
+
+// Runs a program on boxes (boxes, axes) each; `results` holds zeros.
+extern "C" int lyapnet_bound(
+    const int *tables, const int *code, const double *numbers, const double *lower, const double *upper, long boxes,
+    long arena, long spare, double *results
+) {
+    Block block;
+    read_tables(block, tables);
+    const size_t vectors = arena + block.terms + spare;
+    const std::unique_ptr<void, void (*)(void *)> memory(std::aligned_alloc(sizeof(V), vectors * sizeof(V)), std::free);
+    if (!memory) return 1;
+    block.arena = static_cast<V *>(memory.get()), block.dense = block.arena + arena;
+    block.spare = block.dense + block.terms, block.numbers = numbers;
+    for (int count = *code++; count > 0; count--) {
+        const Entry constant = block.entry(code);
+        fill(constant, splat(0));
+        constant.terms[0] = splat(numbers[*code++]);
+    }
+    for (long first = 0; first < boxes; first += LANES) {
+        const int *at = code;
+        read_boxes(block, at, lower, upper, first, boxes);
+        for (int count = *at++; count > 0; count--) {
+            const int operation = *at++;
+            operate(block, operation, at);
+        }
+        write_results(block, at, results, first, boxes);
+    }
+    return 0;
+}
+
+// eˣ, eˣ − 1 or log(1 + x) of numbers, as bounds compute them
+extern "C" void lyapnet_elementary(int which, double *values, long count) {
+    for (long i = 0; i < count; i++) {
+        const V x = splat(values[i]);
+        values[i] = which == 2 ? log_one_more(x)[0] : which == 1 ? exponential(x).less_one[0] : exponential(x).whole[0];
+    }
+}

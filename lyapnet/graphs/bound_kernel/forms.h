@@ -16,64 +16,67 @@ namespace {
 constexpr int MOST_AXES = 16;
 
 struct Support {
-    int count;         // of monomials
+    int count;         // of monomials; the first is 1
     const int *upto;   // how many of them are of degree ≤ 0, 1, 2, 3
     const int *at;     // their numbers, rising
 };
 
-struct Entry {
-    V *terms;  // of the support, and behind them the radius
+struct Term {  // of a product: x[i] · y[j] is part of result[k]
+    int i, j, k;
+};
+
+struct Product {
+    int count;
+    const Term *terms;
+};
+
+struct Entry {  // a form of one number: its terms, r, and Σ |terms| of degree 1, 2, 3
+    V *terms;
     const Support *support;
     V &radius() const { return terms[support->count]; }
+    V &size(int degree) const { return terms[support->count + degree]; }
 };
 
 struct Block {  // what all operations on a block of boxes share
     int dimension, degree, terms;
-    const int *axes;   // of each monomial, three
-    const int *place;  // where the product of two monomials stands
+    const int *axes;  // of each monomial, three
     std::vector<Support> supports;
-    V *arena, *dense, *spare;  // the forms; a form with all terms; room for an operation's own forms
+    std::vector<Product> products;      // for the supports of two factors
+    std::vector<const int *> placings;  // where the terms of one support stand in another
+    V *arena, *spare;                   // the forms; room for an operation's own
     const double *numbers;
 
     Entry entry(const int *&code) const {
         const int offset = *code++;
         return {arena + offset, &supports[*code++]};
     }
-};
-
-struct Sizes {
-    V of[4];  // Σ |terms| of each degree
-    V spread;
-};
-
-Sizes sizes_of(const Block &block, const Entry &x) {
-    Sizes sizes = {{splat(0), splat(0), splat(0), splat(0)}, splat(0)};
-    const Support &s = *x.support;
-    for (int k = 0, i = 0; k <= block.degree; k++) {
-        for (; i < s.upto[k]; i++) sizes.of[k] += absolute(x.terms[i]);
-        if (k) sizes.spread += sizes.of[k];
+    V spread(const Entry &x) const {
+        V total = x.size(1);
+        for (int k = 2; k <= degree; k++) total += x.size(k);
+        return total;
     }
-    return sizes;
-}
+    V magnitude(const Entry &x) const { return absolute(x.terms[0]) + spread(x) + x.radius(); }
 
-V magnitude(const Entry &x) {
-    V total = absolute(x.radius());
-    for (int i = 0; i < x.support->count; i++) total += absolute(x.terms[i]);
-    return total;
-}
-
-// Room for so many rounded operations.
-void round_off(const Entry &x, double operations) { x.radius() += 2 * operations * EPSILON * magnitude(x) + TINY; }
+    // The end of an operation: the sizes of its result, and room for so many rounded operations.
+    void finish(const Entry &x, double operations) const {
+        for (int k = 1, i = 1; k <= degree; k++) {
+            V total = splat(0);
+            for (; i < x.support->upto[k]; i++) total += absolute(x.terms[i]);
+            x.size(k) = total;
+        }
+        if (operations > 0) x.radius() += 2 * operations * EPSILON * magnitude(x) + TINY;
+    }
+};
 
 // TaylorForm.interval
 Range interval(const Block &block, const Entry &x) {
     const Support &s = *x.support;
-    const Sizes sizes = sizes_of(block, x);
-    V up = sizes.spread, down = sizes.spread;
-    if (s.upto[2] > s.upto[1]) {
+    const V spread = block.spread(x);
+    V up = spread, down = spread;
+    if (block.degree > 1 && s.upto[2] > s.upto[1]) {
         V slope[MOST_AXES], diagonal[MOST_AXES], across[MOST_AXES];
         for (int k = 0; k < block.dimension; k++) slope[k] = diagonal[k] = across[k] = splat(0);
-        for (int i = s.upto[0]; i < s.upto[1]; i++) slope[s.at[i] - 1] = absolute(x.terms[i]);
+        for (int i = 1; i < s.upto[1]; i++) slope[s.at[i] - 1] = absolute(x.terms[i]);
         for (int i = s.upto[1]; i < s.upto[2]; i++) {
             const int j = block.axes[3 * s.at[i]], k = block.axes[3 * s.at[i] + 1];
             if (j == k) {
@@ -83,13 +86,13 @@ Range interval(const Block &block, const Entry &x) {
                 across[j] += half, across[k] += half;
             }
         }
-        up = down = sizes.of[3];
+        up = down = block.degree == 3 ? x.size(3) : splat(0);
         for (int k = 0; k < block.dimension; k++) {
             up += parabola(slope[k], across[k] + diagonal[k]);
             down += parabola(slope[k], across[k] - diagonal[k]);
         }
     }
-    const V slack = x.radius() + 4 * block.terms * EPSILON * (sizes.of[0] + sizes.spread + x.radius()) + TINY;
+    const V slack = x.radius() + 4 * block.terms * EPSILON * (absolute(x.terms[0]) + spread + x.radius()) + TINY;
     const V low = x.terms[0] - down - slack, high = x.terms[0] + up + slack;
     const M known = finite(low) & finite(high);
     return {known ? low : splat(-INFINITY), known ? high : splat(INFINITY)};
@@ -100,54 +103,39 @@ void fill(const Entry &out, V radius) {
     out.radius() = radius;
 }
 
-void between(const Entry &out, V low, V high) {
+void between(const Block &block, const Entry &out, V low, V high) {
     fill(out, (high - low) * 0.5);
     out.terms[0] = (low + high) * 0.5;
+    block.finish(out, 0);
 }
 
-// Where terms of the support of `out` may be added up: in itself if that has them all.
-V *opened(const Block &block, const Entry &out) {
-    V *at = out.support->count == block.terms ? out.terms : block.dense;
-    for (int i = 0; i < out.support->count; i++) at[out.support->at[i]] = splat(0);
-    return at;
-}
-
-void closed(const Entry &out, const V *from) {
-    if (from != out.terms)
-        for (int i = 0; i < out.support->count; i++) out.terms[i] = from[out.support->at[i]];
-}
-
-// taylor.multiply, of forms with any support
-void multiply(const Block &block, const Entry &x, const Entry &y, const Entry &out) {
-    const Sizes a = sizes_of(block, x), b = sizes_of(block, y);
-    const V ax = a.of[0] + a.spread, by = b.of[0] + b.spread, rx = x.radius(), ry = y.radius();
-    V radius = ax * ry + by * rx + rx * ry + (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry) + TINY;
-    for (int j = 1; block.degree > 1 && j <= block.degree; j++)
-        for (int k = block.degree + 1 - j; k <= block.degree; k++) radius += a.of[j] * b.of[k];
-    V *into = opened(block, out);
-    const Support &s = *x.support, &t = *y.support;
-    for (int k = 0, i = 0; k <= block.degree; k++)
-        for (; i < s.upto[k]; i++) {
-            const V factor = x.terms[i];
-            const int *place = block.place + s.at[i] * block.terms;
-            for (int j = 0; j < t.upto[block.degree - k]; j++) into[place[t.at[j]]] += factor * y.terms[j];
-        }
+// taylor.multiply, up to `finish`
+void multiply(const Block &block, const Product &product, const Entry &x, const Entry &y, const Entry &out) {
+    const V ax = absolute(x.terms[0]) + block.spread(x), by = absolute(y.terms[0]) + block.spread(y);
+    const V rx = x.radius(), ry = y.radius(), rounding = (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry);
+    V radius = ax * ry + by * rx + rx * ry + rounding + TINY;
     if (block.degree == 1) {  // _linear_product
-        V *c = block.spare, *e = c + block.dimension;
+        V *c = block.spare, *e = c + block.dimension, middle = splat(0);
         for (int k = 0; k < 2 * block.dimension; k++) c[k] = splat(0);
-        for (int i = 1; i < s.count; i++) c[s.at[i] - 1] = x.terms[i];
-        for (int i = 1; i < t.count; i++) e[t.at[i] - 1] = y.terms[i];
+        for (int i = 1; i < x.support->count; i++) c[x.support->at[i] - 1] = x.terms[i];
+        for (int i = 1; i < y.support->count; i++) e[y.support->at[i] - 1] = y.terms[i];
         for (int k = 0; k < block.dimension; k++) {
-            into[0] += c[k] * e[k] * 0.5;
+            middle += c[k] * e[k] * 0.5;
             radius += absolute(c[k] * e[k]) * 0.5;
             for (int j = 0; j < k; j++) radius += absolute(c[j] * e[k] + c[k] * e[j]);
         }
+        fill(out, radius);
+        out.terms[0] = middle;
+    } else {
+        for (int j = 1; j <= block.degree; j++)
+            for (int k = block.degree + 1 - j; k <= block.degree; k++) radius += x.size(j) * y.size(k);
+        fill(out, radius);
     }
-    closed(out, into);
-    out.radius() = radius;
+    const Term *const end = product.terms + product.count;
+    for (const Term *t = product.terms; t != end; t++) out.terms[t->k] += x.terms[t->i] * y.terms[t->j];
 }
 
-// elementary_functions._secant
+// elementary_functions._secant, up to `finish`
 template <class F>
 void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
     const Jet low = f.jet(lo), high = f.jet(hi);
@@ -170,12 +158,16 @@ void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
     for (int i = 0; i < x.support->count; i++) out.terms[i] = a * x.terms[i];
     out.terms[0] += (least + most) * 0.5;
     out.radius() = absolute(a) * x.radius() + (most - least) * 0.5 + nearby + 16 * EPSILON * largest + TINY;
-    round_off(out, 2);
 }
 
-// elementary_functions._expanded
+struct Powers {  // of a form, in the support of a function of it
+    const Product &square, &cube;
+    const int *placing;
+};
+
+// elementary_functions._expanded, up to `finish`
 template <class F, int DEGREE>
-void expanded(const Block &block, const Entry &x, const Entry &out, V lo, V hi, const F &f) {
+void expanded(const Block &block, const Powers &powers, const Entry &x, const Entry &out, V lo, V hi, const F &f) {
     constexpr bool CUBIC = DEGREE == 3;
     const V m = (lo + hi) * 0.5, w = (hi - lo) * 0.5 * (1 + 8 * EPSILON) + 4 * EPSILON * absolute(m);
     const Jet jet = f.jet(m);
@@ -191,40 +183,42 @@ void expanded(const Block &block, const Entry &x, const Entry &out, V lo, V hi, 
     }
     const V higher = absolute(c) + (absolute(k) + absolute(M) * (CUBIC ? w : splat(1))) * w;
     e += 32 * EPSILON * (absolute(a) + absolute(b) * w + higher * w * w) + TINY;
-    Entry y = {block.spare, x.support}, yy = {y.terms + block.terms + 1, out.support};
-    Entry yyy = {yy.terms + block.terms + 1, out.support};
-    for (int i = 0; i <= x.support->count; i++) y.terms[i] = x.terms[i];
+    const Entry y = {block.spare, x.support}, yy = {y.terms + block.terms + 4, out.support};
+    for (int i = 0; i <= x.support->count + block.degree; i++) y.terms[i] = x.terms[i];
     y.terms[0] -= m;
-    round_off(y, 1);
-    multiply(block, y, y, yy);
-    if (CUBIC) multiply(block, yy, y, yyy);
-    V *into = opened(block, out);
-    for (int i = 0; i < x.support->count; i++) into[x.support->at[i]] = b * y.terms[i];
-    closed(out, into);
-    for (int i = 0; i < out.support->count; i++) {
-        out.terms[i] += c * yy.terms[i];
-        if (CUBIC) out.terms[i] += k * yyy.terms[i];
-    }
-    out.terms[0] += a;
+    y.radius() += 2 * EPSILON * block.magnitude(y) + TINY;
+    multiply(block, powers.square, y, y, yy);
+    for (int i = 0; i < out.support->count; i++) out.terms[i] = c * yy.terms[i];
     out.radius() = absolute(b) * y.radius() + absolute(c) * yy.radius() + e;
-    if (CUBIC) out.radius() += absolute(k) * yyy.radius();
-    round_off(out, 6);
+    if (CUBIC) {
+        const Entry yyy = {yy.terms + block.terms + 4, out.support};
+        block.finish(yy, 0);
+        multiply(block, powers.cube, yy, y, yyy);
+        for (int i = 0; i < out.support->count; i++) out.terms[i] += k * yyy.terms[i];
+        out.radius() += absolute(k) * yyy.radius();
+    }
+    for (int i = 0; i < x.support->count; i++) out.terms[powers.placing[i]] += b * y.terms[i];
+    out.terms[0] += a;
 }
 
 // elementary_functions.linearised, and bound_rules._loosened_above
 template <class F>
-void apply(const Block &block, const Entry &x, const Entry &out, const F &f) {
+void apply(const Block &block, const Powers &powers, const Entry &x, const Entry &out, const F &f) {
     const Range ends = interval(block, x);
     const M known = finite(ends.low) & finite(ends.high) & f.defined(ends.low, ends.high);
     const V lo = known ? ends.low : splat(1), hi = known ? ends.high : splat(1);
-    if constexpr (F::SMOOTH) {
-        if (block.degree == 2) expanded<F, 2>(block, x, out, lo, hi, f);
-        else if (block.degree == 3) expanded<F, 3>(block, x, out, lo, hi, f);
-        else secant(x, out, lo, hi, f);
+    double operations = 2;
+    if (F::SMOOTH && block.degree > 1) {
+        operations = 6;
+        if constexpr (F::SMOOTH) {
+            if (block.degree == 2) expanded<F, 2>(block, powers, x, out, lo, hi, f);
+            else expanded<F, 3>(block, powers, x, out, lo, hi, f);
+        }
     } else {
         secant(x, out, lo, hi, f);
     }
     for (int i = 0; i < out.support->count; i++) out.terms[i] = known ? out.terms[i] : splat(0);
+    block.finish(out, operations);
     out.radius() = known ? out.radius() : splat(INFINITY);
     if constexpr (F::LOOSENED) out.radius() += ends.high > f.threshold ? splat(f.room) : splat(0);
 }
@@ -236,30 +230,25 @@ struct Truth {
 // branches._truth
 Truth truth_of(const Block &block, const Entry &x) {
     const Range ends = interval(block, x);
-    return {(ends.low > 0) | (ends.high < 0), ~(magnitude(x) == 0)};
+    return {(ends.low > 0) | (ends.high < 0), ~(block.magnitude(x) == 0)};
 }
 
-// branches.where
-void where(const Block &block, const Entry &truth, const Entry &x, const Entry &y, const Entry &out) {
-    const Truth is = truth_of(block, truth);
-    V *into = opened(block, out), *other = block.spare, apart = splat(0);
-    for (int i = 0; i < out.support->count; i++) other[out.support->at[i]] = splat(0);
-    for (int i = 0; i < x.support->count; i++) into[x.support->at[i]] = x.terms[i];
-    for (int i = 0; i < y.support->count; i++) other[y.support->at[i]] = y.terms[i];
-    Entry both = {other + block.terms, out.support};
-    for (int i = 0; i < out.support->count; i++) {
-        const int k = out.support->at[i];
-        apart += absolute(into[k] - other[k]) * 0.5;
-        both.terms[i] = (into[k] + other[k]) * 0.5;
+// branches.where; the support of the result holds those of both
+void where(const Block &block, const Truth &is, const int *const placings[2], const Entry &x, const Entry &y, const Entry &out) {
+    const int count = out.support->count;
+    V *mine = block.spare, *other = mine + count, apart = splat(0);
+    for (int i = 0; i < 2 * count; i++) mine[i] = splat(0);
+    for (int i = 0; i < x.support->count; i++) mine[placings[0][i]] = x.terms[i];
+    for (int i = 0; i < y.support->count; i++) other[placings[1][i]] = y.terms[i];
+    for (int i = 0; i < count; i++) {
+        apart += absolute(mine[i] - other[i]) * 0.5;
+        out.terms[i] = (mine[i] + other[i]) * 0.5;
     }
-    both.radius() = apart + larger(x.radius(), y.radius());
-    round_off(both, block.terms);
-    for (int i = 0; i < out.support->count; i++) {
-        const int k = out.support->at[i];
-        into[k] = is.certain ? into[k] : (is.possible ? both.terms[i] : other[k]);
-    }
-    closed(out, into);
-    out.radius() = is.certain ? x.radius() : (is.possible ? both.radius() : y.radius());
+    out.radius() = apart + larger(x.radius(), y.radius());
+    block.finish(out, block.terms);
+    for (int i = 0; i < count; i++) out.terms[i] = is.certain ? mine[i] : (is.possible ? out.terms[i] : other[i]);
+    out.radius() = is.certain ? x.radius() : (is.possible ? out.radius() : y.radius());
+    block.finish(out, 0);
 }
 
 // branches._no_wider
@@ -270,6 +259,7 @@ void no_wider(const Block &block, const Entry &y, const Entry &out, double low, 
     for (int i = 0; i < y.support->count; i++) out.terms[i] = wide ? splat(0) : y.terms[i];
     out.terms[0] = wide ? splat((low + high) / 2) : out.terms[0];
     out.radius() = wide ? splat((high - low) / 2 + room) : y.radius();
+    block.finish(out, 0);
 }
 
 }  // namespace

@@ -15,20 +15,22 @@ void combine(const Block &block, const int *&code) {
     const Entry out = block.entry(code);
     const int operations = *code++, count = *code++;
     const double offset = block.numbers[*code++];
-    V *into = opened(block, out);
-    V radius = splat(0), entered = splat(std::fabs(offset));
+    V entered = splat(std::fabs(offset)), radius = splat(0);
+    fill(out, splat(0));
     for (int n = 0; n < count; n++) {
         const Entry x = block.entry(code);
+        const int *const placing = block.placings[*code++];
         const double weight = block.numbers[*code++];
-        for (int i = 0; i < x.support->count; i++) into[x.support->at[i]] += weight * x.terms[i];
+        if (x.support == out.support)
+            for (int i = 0; i < x.support->count; i++) out.terms[i] += weight * x.terms[i];
+        else
+            for (int i = 0; i < x.support->count; i++) out.terms[placing[i]] += weight * x.terms[i];
         radius += std::fabs(weight) * x.radius();
-        if (operations > 1) entered += std::fabs(weight) * magnitude(x);
+        if (operations > 1) entered += std::fabs(weight) * block.magnitude(x);
     }
-    into[0] += offset;
-    closed(out, into);
-    out.radius() = radius;
-    if (operations == 1) round_off(out, 1);
-    if (operations > 1) out.radius() += 2 * operations * EPSILON * entered + TINY;
+    out.terms[0] += offset;
+    out.radius() = operations > 1 ? radius + 2 * operations * EPSILON * entered + TINY : radius;
+    block.finish(out, operations == 1);
 }
 
 template <int J, int K>
@@ -53,32 +55,34 @@ void tiles(const V *const *x, const double *w, int inner, int columns, V *const 
 // taylor.matrix_product, of one row; entries with a smaller support than that of the result are padded
 void matrix_product(const Block &block, const int *&code) {
     const int inner = *code++, columns = *code++;
-    const Support &s = block.supports[*code++];
     const double *weights = block.numbers + *code++;
+    const int count = *code++;  // of terms of the result
     std::vector<const V *> x(inner);
     std::vector<V *> out(columns);
     V *radius = block.spare, *room = block.spare + inner;
     for (int i = 0; i < inner; i++) {
         const Entry entry = block.entry(code);
-        radius[i] = entry.radius() + 4 * inner * EPSILON * magnitude(entry) + TINY;
+        const int *const placing = block.placings[*code++];
+        radius[i] = entry.radius() + 4 * inner * EPSILON * block.magnitude(entry) + TINY;
         x[i] = entry.terms;
-        if (entry.support != &s) {
-            for (int k = 0; k < s.count; k++) block.dense[s.at[k]] = splat(0);
-            for (int k = 0; k < entry.support->count; k++) block.dense[entry.support->at[k]] = entry.terms[k];
-            for (int k = 0; k < s.count; k++) room[k] = block.dense[s.at[k]];
-            x[i] = room, room += s.count;
+        if (entry.support->count < count) {
+            for (int k = 0; k < count; k++) room[k] = splat(0);
+            for (int k = 0; k < entry.support->count; k++) room[placing[k]] = entry.terms[k];
+            x[i] = room, room += count;
         }
     }
-    for (int j = 0; j < columns; j++) {
-        const Entry entry = block.entry(code);
-        out[j] = entry.terms;
+    const int *results = code;
+    for (int j = 0; j < columns; j++) out[j] = block.entry(code).terms;
+    int j = 0;
+    for (; j + TILE <= columns; j += TILE) tiles<TILE>(x.data(), weights + j, inner, columns, &out[j], count);
+    for (; j < columns; j++) tiles<1>(x.data(), weights + j, inner, columns, &out[j], count);
+    for (j = 0; j < columns; j++) {
+        const Entry entry = block.entry(results);
         V total = splat(0);
         for (int i = 0; i < inner; i++) total += std::fabs(weights[i * columns + j]) * radius[i];
         entry.radius() = total;
+        block.finish(entry, 0);
     }
-    int j = 0;
-    for (; j + TILE <= columns; j += TILE) tiles<TILE>(x.data(), weights + j, inner, columns, &out[j], s.count);
-    for (; j < columns; j++) tiles<1>(x.data(), weights + j, inner, columns, &out[j], s.count);
 }
 
 enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, LEAKY, CLAMP };
@@ -87,20 +91,22 @@ void apply_named(const Block &block, const int *&code) {
     const int function = *code++;
     const Entry x = block.entry(code), out = block.entry(code);
     const double p = block.numbers[*code++], q = block.numbers[*code++];
+    const Product &square = block.products[*code++], &cube = block.products[*code++];
+    const Powers powers = {square, cube, block.placings[*code++]};
     switch (function) {
-        case EXP: return apply(block, x, out, Exp{});
-        case LOG: return apply(block, x, out, Log{});
-        case LOG1P: return apply(block, x, out, Log1p{});
-        case SQRT: return apply(block, x, out, Sqrt{});
-        case RECIPROCAL: return apply(block, x, out, Reciprocal{});
-        case SIGMOID: return apply(block, x, out, Sigmoid{p, q});
-        case SOFTPLUS: return apply(block, x, out, Softplus{p, q});
-        case SIN: return apply(block, x, out, Sin{});
-        case COS: return apply(block, x, out, Cos{});
-        case TAN: return apply(block, x, out, Tan{});
-        case SQUARE: return apply(block, x, out, Square{});
-        case LEAKY: return apply(block, x, out, Leaky{p});
-        case CLAMP: return apply(block, x, out, Clamp{p, q});
+        case EXP: return apply(block, powers, x, out, Exp{});
+        case LOG: return apply(block, powers, x, out, Log{});
+        case LOG1P: return apply(block, powers, x, out, Log1p{});
+        case SQRT: return apply(block, powers, x, out, Sqrt{});
+        case RECIPROCAL: return apply(block, powers, x, out, Reciprocal{});
+        case SIGMOID: return apply(block, powers, x, out, Sigmoid{p, q});
+        case SOFTPLUS: return apply(block, powers, x, out, Softplus{p, q});
+        case SIN: return apply(block, powers, x, out, Sin{});
+        case COS: return apply(block, powers, x, out, Cos{});
+        case TAN: return apply(block, powers, x, out, Tan{});
+        case SQUARE: return apply(block, powers, x, out, Square{});
+        case LEAKY: return apply(block, powers, x, out, Leaky{p});
+        case CLAMP: return apply(block, powers, x, out, Clamp{p, q});
     }
 }
 
@@ -113,24 +119,30 @@ void operate(const Block &block, int operation, const int *&code) {
     if (operation == MATRIX_PRODUCT) return matrix_product(block, code);
     if (operation == FUNCTION) return apply_named(block, code);
     const Entry x = block.entry(code), y = block.entry(code);
-    if (operation == MULTIPLY) return multiply(block, x, y, block.entry(code));
+    if (operation == MULTIPLY) {
+        const Entry out = block.entry(code);
+        multiply(block, block.products[*code++], x, y, out);
+        return block.finish(out, 0);
+    }
     if (operation == WHERE) {
-        const Entry otherwise = block.entry(code);
-        return where(block, x, y, otherwise, block.entry(code));
+        const Entry truth = block.entry(code), out = block.entry(code);
+        const int *const placings[] = {block.placings[code[0]], block.placings[code[1]]};
+        code += 2;
+        return where(block, truth_of(block, truth), placings, x, y, out);
     }
     if (operation == CONJUNCTION) {
         const Truth a = truth_of(block, x), b = truth_of(block, y);
-        return between(block.entry(code), one(a.certain & b.certain), one(a.possible & b.possible));
+        return between(block, block.entry(code), one(a.certain & b.certain), one(a.possible & b.possible));
     }
     if (operation == NO_WIDER) {  // from here on, the second entry is the result
         const double low = block.numbers[*code++];
         return no_wider(block, x, y, low, block.numbers[*code++]);
     }
     const Range ends = interval(block, x);
-    if (operation == SIGN) return between(y, one(ends.low > 0) - one(ends.low < 0), one(ends.high > 0) - one(ends.high < 0));
-    if (operation == POSITIVE) return between(y, one(ends.low > 0), one(ends.high > 0));
+    if (operation == SIGN) return between(block, y, one(ends.low > 0) - one(ends.low < 0), one(ends.high > 0) - one(ends.high < 0));
+    if (operation == POSITIVE) return between(block, y, one(ends.low > 0), one(ends.high > 0));
     const Truth truth = truth_of(block, x);  // NEGATION
-    between(y, one(~truth.possible), one(~truth.certain));
+    between(block, y, one(~truth.possible), one(~truth.certain));
 }
 
 // taylor.box_form, of the boxes in the lanes
@@ -146,7 +158,7 @@ void read_boxes(const Block &block, const int *&code, const double *lower, const
         fill(y, splat(0));
         y.terms[0] = (low + high) * 0.5;
         if (y.support->count > 1) y.terms[1] = (high - low) * 0.5;
-        round_off(y, 2);
+        block.finish(y, 2);
     }
 }
 
@@ -163,16 +175,25 @@ void write_results(const Block &block, const int *&code, double *results, long f
     }
 }
 
-// The monomials of all forms, and the supports: dimension, degree, terms, axes, places, count, supports
+// dimension, degree, terms, axes of each monomial, and with their counts: supports, products, placings
 void read_tables(Block &block, const int *tables) {
     block.dimension = *tables++, block.degree = *tables++, block.terms = *tables++;
     block.axes = tables, tables += 3 * block.terms;
-    block.place = tables, tables += block.terms * block.terms;
     for (int count = *tables++; count > 0; count--) {
         const int *upto = tables;
         tables += 4;
         block.supports.push_back({upto[3], upto, tables});
         tables += upto[3];
+    }
+    for (int count = *tables++; count > 0; count--) {
+        const int terms = *tables++;
+        block.products.push_back({terms, reinterpret_cast<const Term *>(tables)});
+        tables += 3 * terms;
+    }
+    for (int count = *tables++; count > 0; count--) {
+        const int terms = *tables++;
+        block.placings.push_back(tables);
+        tables += terms;
     }
 }
 
@@ -185,15 +206,15 @@ extern "C" int lyapnet_bound(
 ) {
     Block block;
     read_tables(block, tables);
-    const size_t vectors = arena + block.terms + spare;
+    const size_t vectors = arena + spare;
     const std::unique_ptr<void, void (*)(void *)> memory(std::aligned_alloc(sizeof(V), vectors * sizeof(V)), std::free);
     if (!memory) return 1;
-    block.arena = static_cast<V *>(memory.get()), block.dense = block.arena + arena;
-    block.spare = block.dense + block.terms, block.numbers = numbers;
+    block.arena = static_cast<V *>(memory.get()), block.spare = block.arena + arena, block.numbers = numbers;
     for (int count = *code++; count > 0; count--) {
         const Entry constant = block.entry(code);
         fill(constant, splat(0));
         constant.terms[0] = splat(numbers[*code++]);
+        block.finish(constant, 0);
     }
     for (long first = 0; first < boxes; first += LANES) {
         const int *at = code;

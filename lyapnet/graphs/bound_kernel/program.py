@@ -78,12 +78,14 @@ class Program:
         self.monomials = monomials(self.dimension, degree)
         number = {powers: k for k, powers in enumerate(self.monomials)}
         self._place = [[number.get(tuple(sorted(a + b)), -1) for b in self.monomials] for a in self.monomials]
-        self._products: dict[tuple[Support, Support], Support] = {}
+        self._powers: dict[tuple[Support, Support], Support] = {}
+        self._products: dict[tuple[Support, Support, Support], int] = {}
+        self._placings: dict[tuple[Support, Support], int] = {}
         self._known: dict[tuple[object, ...], Entry] = {}
         self._numbers: list[float] = []
         self._number: dict[float | bytes, int] = {}
         self._instructions: list[list[int]] = []
-        self._spare = 3 * (len(self.monomials) + 1)
+        self._spare = 3 * (len(self.monomials) + 4)
         self.supports: list[Support] = []
         self.constants: dict[Entry, float] = {}
         self.constant(0.0)
@@ -108,8 +110,8 @@ class Program:
             return self.constant(offset)
         if summands[0][0] == 1 and len(summands) == 1 and not offset:
             return summands[0][1]
-        words = [word for weight, x in summands for word in (x, self._at(weight))]
         support = self._union(x for _, x in summands)
+        words = [word for weight, x in summands for word in (x, self._placing(x, support), self._at(weight))]
         return self._emit("combine", support, operations, len(summands), self._at(offset), *words, result_first=True)
 
     def scale(self, x: Entry, factor: float) -> Entry:
@@ -124,7 +126,9 @@ class Program:
         if x == y and self.degree == 1:
             return self.function("square", x)
         x, y = min(x, y), max(x, y)
-        return self._emit("multiply", self._product(self.supports[x], self.supports[y]), x, y)
+        a, b = self.supports[x], self.supports[y]
+        support = self._product(a, b)
+        return self._emit("multiply", support, x, y, behind=(self._table(a, b, support),))
 
     def function(self, name: str, x: Entry, p: float = 0.0, q: float = 0.0) -> Entry:
         """f(x), with its parameters."""
@@ -133,11 +137,10 @@ class Program:
             for _ in range(self.degree - 1):
                 power = self._product(power, self.supports[x])
                 support = tuple(sorted({*support, *power}))
-        words = OPERATIONS["function"], FUNCTIONS[name], x, self._at(p), self._at(q)
-        if words not in self._known:
-            self._known[words] = self._new(support)
-            self._instructions.append([*words[:3], self._known[words], *words[3:]])
-        return self._known[words]
+        a = self.supports[x]
+        powers = self._table(a, a, support), self._table(support, a, support), self._placing(x, support)
+        parameters = self._at(p), self._at(q)
+        return self._emit("function", support, FUNCTIONS[name], x, behind=(*parameters, *powers))
 
     def matrix_product(self, row: Sequence[Entry], weight: Tensor) -> list[Entry]:
         """A row times a constant matrix."""
@@ -148,14 +151,16 @@ class Program:
         if key not in self._known:
             results = [self._new(support) for _ in range(weight.shape[1])]
             self._known[key] = results[0]
-            head = [OPERATIONS["matrix_product"], *weight.shape, _SupportOf(results[0]), at]
-            self._instructions.append([*head, *row, *results])
-            self._spare = max(self._spare, len(row) * (len(support) + 2))
+            head = [OPERATIONS["matrix_product"], *weight.shape, at, len(support)]
+            padded = [word for x in row for word in (x, self._placing(x, support))]
+            self._instructions.append([*head, *padded, *results])
+            self._spare = max(self._spare, len(row) * (len(support) + 1))
         return [Entry(self._known[key] + j) for j in range(weight.shape[1])]
 
     def where(self, truth: Entry, x: Entry, y: Entry) -> Entry:
         """x where a number is not 0, else y; their hull where that is undecided."""
-        return self._emit("where", self._union((x, y)), truth, x, y)
+        support = self._union((x, y))
+        return self._emit("where", support, x, y, truth, behind=(self._placing(x, support), self._placing(y, support)))
 
     def truth(self, name: str, *operands: Entry) -> Entry:
         """A truth, or a sign."""
@@ -172,9 +177,7 @@ class Program:
 
         def words(items: Iterable[int]) -> Iterable[int]:
             for word in items:
-                if isinstance(word, _SupportOf):
-                    yield of_support[self.supports[word]]
-                elif isinstance(word, Entry):
+                if isinstance(word, Entry):
                     yield offset[word]
                     yield of_support[self.supports[word]]
                 else:
@@ -198,7 +201,7 @@ class Program:
 
         def place(x: Entry) -> None:
             nonlocal arena
-            size = len(self.supports[x]) + 1
+            size = self._size(x)
             if free.get(size):
                 offset[x] = free[size].pop()
             else:
@@ -212,19 +215,31 @@ class Program:
                 place(x)
             for x in sorted(entries - kept):
                 if last[x] == k:
-                    free.setdefault(len(self.supports[x]) + 1, []).append(offset[x])
+                    free.setdefault(self._size(x), []).append(offset[x])
         return offset, arena
+
+    def _size(self, x: Entry) -> int:
+        """The numbers that a form takes: its terms, its remainder, and the sizes of its terms of each degree."""
+        return len(self.supports[x]) + 1 + self.degree
 
     def _tables(self, of_support: dict[Support, int]) -> Iterable[int]:
         yield from (self.dimension, self.degree, len(self.monomials))
         for powers in self.monomials:
             yield from (*powers, *(-1,) * (3 - len(powers)))
-        for row in self._place:
-            yield from row
         yield len(of_support)
         for support in of_support:
             yield from self._counts(support)
             yield from support
+        yield len(self._products)
+        for a, b, support in self._products:
+            terms = self._terms_of(a, b, support)
+            yield len(terms)
+            for term in terms:
+                yield from term
+        yield len(self._placings)
+        for a, support in self._placings:
+            yield len(a)
+            yield from map(support.index, a)
 
     def _counts(self, support: Support) -> list[int]:
         """How many monomials of a support are of degree ≤ 0, 1, 2, 3."""
@@ -251,9 +266,23 @@ class Program:
 
     def _product(self, a: Support, b: Support) -> Support:
         """The monomials in the products of those of two forms."""
-        if (a, b) not in self._products:
-            self._products[a, b] = tuple(sorted({self._place[i][j] for i in a for j in b} - {-1}))
-        return self._products[a, b]
+        if (a, b) not in self._powers:
+            self._powers[a, b] = tuple(sorted({self._place[i][j] for i in a for j in b} - {-1}))
+        return self._powers[a, b]
+
+    def _table(self, a: Support, b: Support, support: Support) -> int:
+        """Which product of forms with two supports it is, in a third."""
+        return self._products.setdefault((a, b, support), len(self._products))
+
+    def _placing(self, x: Entry, support: Support) -> int:
+        """Which placing of the terms of a form among those of a larger support it is."""
+        return self._placings.setdefault((self.supports[x], support), len(self._placings))
+
+    def _terms_of(self, a: Support, b: Support, support: Support) -> list[tuple[int, int, int]]:
+        """(i, j, k) where the i-th monomial of one support times the j-th of another is the k-th of a third."""
+        at = {monomial: k for k, monomial in enumerate(support)}
+        places = [(i, j, self._place[m][n]) for i, m in enumerate(a) for j, n in enumerate(b)]
+        return [(i, j, at[place]) for i, j, place in places if place in at]
 
     def _at(self, number: float) -> int:
         """Where a number stands."""
@@ -268,7 +297,3 @@ class Program:
             self._number[content] = len(self._numbers)
             self._numbers += weight.flatten().tolist()
         return self._number[content]
-
-
-class _SupportOf(int):
-    """The support of a form, in code."""

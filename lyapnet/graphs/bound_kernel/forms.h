@@ -21,15 +21,6 @@ struct Support {
     const int *at;     // their numbers, rising
 };
 
-struct Term {  // of a product: x[i] · y[j] is part of result[k]
-    int i, j, k;
-};
-
-struct Product {
-    int count;
-    const Term *terms;
-};
-
 struct Entry {  // a form of one number: its terms, r, and Σ |terms| of degree 1, 2, 3
     V *terms;
     const Support *support;
@@ -41,7 +32,7 @@ struct Block {  // what all operations on a block of boxes share
     int dimension, degree, terms;
     const int *axes;  // of each monomial, three
     std::vector<Support> supports;
-    std::vector<Product> products;      // for the supports of two factors
+    std::vector<const int *> products;  // for each term of a product: how many x[i] · y[j] it is the sum of, and (i, j)
     std::vector<const int *> placings;  // where the terms of one support stand in another
     V *arena, *spare;                   // the forms; room for an operation's own
     const double *numbers;
@@ -110,29 +101,29 @@ void between(const Block &block, const Entry &out, V low, V high) {
 }
 
 // taylor.multiply, up to `finish`
-void multiply(const Block &block, const Product &product, const Entry &x, const Entry &y, const Entry &out) {
+void multiply(const Block &block, const int *product, const Entry &x, const Entry &y, const Entry &out) {
     const V ax = absolute(x.terms[0]) + block.spread(x), by = absolute(y.terms[0]) + block.spread(y);
     const V rx = x.radius(), ry = y.radius(), rounding = (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry);
     V radius = ax * ry + by * rx + rx * ry + rounding + TINY;
+    for (int k = 0; k < out.support->count; k++) {
+        V sum = splat(0);
+        for (int n = *product++; n > 0; n--, product += 2) sum += x.terms[product[0]] * y.terms[product[1]];
+        out.terms[k] = sum;
+    }
+    for (int j = 1; block.degree > 1 && j <= block.degree; j++)
+        for (int k = block.degree + 1 - j; k <= block.degree; k++) radius += x.size(j) * y.size(k);
     if (block.degree == 1) {  // _linear_product
-        V *c = block.spare, *e = c + block.dimension, middle = splat(0);
+        V *c = block.spare, *e = c + block.dimension;
         for (int k = 0; k < 2 * block.dimension; k++) c[k] = splat(0);
         for (int i = 1; i < x.support->count; i++) c[x.support->at[i] - 1] = x.terms[i];
         for (int i = 1; i < y.support->count; i++) e[y.support->at[i] - 1] = y.terms[i];
         for (int k = 0; k < block.dimension; k++) {
-            middle += c[k] * e[k] * 0.5;
+            out.terms[0] += c[k] * e[k] * 0.5;
             radius += absolute(c[k] * e[k]) * 0.5;
             for (int j = 0; j < k; j++) radius += absolute(c[j] * e[k] + c[k] * e[j]);
         }
-        fill(out, radius);
-        out.terms[0] = middle;
-    } else {
-        for (int j = 1; j <= block.degree; j++)
-            for (int k = block.degree + 1 - j; k <= block.degree; k++) radius += x.size(j) * y.size(k);
-        fill(out, radius);
     }
-    const Term *const end = product.terms + product.count;
-    for (const Term *t = product.terms; t != end; t++) out.terms[t->k] += x.terms[t->i] * y.terms[t->j];
+    out.radius() = radius;
 }
 
 // elementary_functions._secant, up to `finish`
@@ -161,8 +152,7 @@ void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
 }
 
 struct Powers {  // of a form, in the support of a function of it
-    const Product &square, &cube;
-    const int *placing;
+    const int *square, *cube, *placing;
 };
 
 // elementary_functions._expanded, up to `finish`

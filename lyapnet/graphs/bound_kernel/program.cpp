@@ -91,8 +91,8 @@ void apply_named(const Block &block, const int *&code) {
     const int function = *code++;
     const Entry x = block.entry(code), out = block.entry(code);
     const double p = block.numbers[*code++], q = block.numbers[*code++];
-    const Product &square = block.products[*code++], &cube = block.products[*code++];
-    const Powers powers = {square, cube, block.placings[*code++]};
+    const Powers powers = {block.products[code[0]], block.products[code[1]], block.placings[code[2]]};
+    code += 3;
     switch (function) {
         case EXP: return apply(block, powers, x, out, Exp{});
         case LOG: return apply(block, powers, x, out, Log{});
@@ -185,16 +185,12 @@ void read_tables(Block &block, const int *tables) {
         block.supports.push_back({upto[3], upto, tables});
         tables += upto[3];
     }
-    for (int count = *tables++; count > 0; count--) {
-        const int terms = *tables++;
-        block.products.push_back({terms, reinterpret_cast<const Term *>(tables)});
-        tables += 3 * terms;
-    }
-    for (int count = *tables++; count > 0; count--) {
-        const int terms = *tables++;
-        block.placings.push_back(tables);
-        tables += terms;
-    }
+    for (std::vector<const int *> *list : {&block.products, &block.placings})
+        for (int count = *tables++; count > 0; count--) {
+            const int words = *tables++;
+            list->push_back(tables);
+            tables += words;
+        }
 }
 
 }  // namespace

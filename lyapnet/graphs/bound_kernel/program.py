@@ -232,10 +232,12 @@ class Program:
             yield from support
         yield len(self._products)
         for a, b, support in self._products:
-            terms = self._terms_of(a, b, support)
-            yield len(terms)
-            for term in terms:
-                yield from term
+            factors = self._factors(a, b, support)
+            yield sum(1 + 2 * len(pairs) for pairs in factors)
+            for pairs in factors:
+                yield len(pairs)
+                for pair in pairs:
+                    yield from pair
         yield len(self._placings)
         for a, support in self._placings:
             yield len(a)
@@ -278,11 +280,13 @@ class Program:
         """Which placing of the terms of a form among those of a larger support it is."""
         return self._placings.setdefault((self.supports[x], support), len(self._placings))
 
-    def _terms_of(self, a: Support, b: Support, support: Support) -> list[tuple[int, int, int]]:
-        """(i, j, k) where the i-th monomial of one support times the j-th of another is the k-th of a third."""
-        at = {monomial: k for k, monomial in enumerate(support)}
-        places = [(i, j, self._place[m][n]) for i, m in enumerate(a) for j, n in enumerate(b)]
-        return [(i, j, at[place]) for i, j, place in places if place in at]
+    def _factors(self, a: Support, b: Support, support: Support) -> list[list[tuple[int, int]]]:
+        """For each monomial of a support: (i, j) where it is the i-th monomial of a times the j-th of b."""
+        factors: dict[int, list[tuple[int, int]]] = {monomial: [] for monomial in support}
+        for i, m in enumerate(a):
+            for j, n in enumerate(b):
+                factors.get(self._place[m][n], []).append((i, j))
+        return list(factors.values())
 
     def _at(self, number: float) -> int:
         """Where a number stands."""

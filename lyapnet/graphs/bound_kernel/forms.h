@@ -151,66 +151,100 @@ void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
     out.radius() = absolute(a) * x.radius() + (most - least) * 0.5 + nearby + 16 * EPSILON * largest + TINY;
 }
 
-struct Powers {  // of a form, in the support of a function of it
+struct Powers {  // of a form, in the support of a smooth function of it
     const int *square, *cube, *placing;
 };
 
-// elementary_functions._expanded, up to `finish`
-template <class F, int DEGREE>
-void expanded(const Block &block, const Powers &powers, const Entry &x, const Entry &out, V lo, V hi, const F &f) {
+struct Argument {  // of a function: a form x = m + y with |y| ≤ w, and what its powers are
+    Range ends;
+    M known;
+    V lo, hi, m, w;
+    Entry y, yy, yyy;
+};
+
+Argument argument_of(const Entry &x, M known, const Range &ends) {
+    const V lo = known ? ends.low : splat(1), hi = known ? ends.high : splat(1), m = (lo + hi) * 0.5;
+    return {ends, known, lo, hi, m, (hi - lo) * 0.5 * (1 + 8 * EPSILON) + 4 * EPSILON * absolute(m), x, x, x};
+}
+
+// The powers of y, which lie in `spare`.
+void expand(const Block &block, const Powers &powers, const Entry &x, const Entry &out, Argument &of) {
+    const int room = block.terms + 1 + block.degree;
+    of.y = {block.spare, x.support};
+    of.yy = {block.spare + room, out.support};
+    of.yyy = {block.spare + 2 * room, out.support};
+    for (int i = 0; i < x.support->count + 1 + block.degree; i++) of.y.terms[i] = x.terms[i];
+    of.y.terms[0] -= of.m;
+    of.y.radius() += 2 * EPSILON * block.magnitude(of.y) + TINY;
+    multiply(block, powers.square, of.y, of.y, of.yy);
+    if (block.degree == 2) return;
+    block.finish(of.yy, 0);
+    multiply(block, powers.cube, of.yy, of.y, of.yyy);
+}
+
+// elementary_functions._expanded, up to `finish`; of the derivative of order DEGREE + 1 the range is given
+template <int DEGREE>
+void expanded(const Powers &powers, const Argument &of, const Jet &jet, const Range &range, const Entry &out) {
     constexpr bool CUBIC = DEGREE == 3;
-    const V m = (lo + hi) * 0.5, w = (hi - lo) * 0.5 * (1 + 8 * EPSILON) + 4 * EPSILON * absolute(m);
-    const Jet jet = f.jet(m);
-    const Range range = f.template range<DEGREE + 1>(lo, hi);
-    const V M = (range.low + range.high) * 0.5, span = range.high - range.low;
+    const V w = of.w, M = (range.low + range.high) * 0.5, span = range.high - range.low;
     V a = jet.d[0], b = jet.d[1], c = jet.d[2] * 0.5, k = splat(0), e;
     if (CUBIC) {
-        a -= M * w * w * w * w / 192, c += M * w * w / 24, k = jet.d[3] / 6;
-        e = (absolute(M) / 192 + span / 48) * (w * w * w * w) * (1 + 1e-9);
+        a -= M * (w * w) * (w * w) / 192, c += M * w * w / 24, k = jet.d[3] / 6;
+        e = (absolute(M) / 192 + span / 48) * (w * w) * (w * w) * (1 + 1e-9);
     } else {
         b += M * w * w * 0.125;
-        e = (absolute(M) / 24 + span / 12) * (w * w * w) * (1 + 1e-9);
+        e = (absolute(M) / 24 + span / 12) * (w * w) * w * (1 + 1e-9);
     }
     const V higher = absolute(c) + (absolute(k) + absolute(M) * (CUBIC ? w : splat(1))) * w;
     e += 32 * EPSILON * (absolute(a) + absolute(b) * w + higher * w * w) + TINY;
-    const Entry y = {block.spare, x.support}, yy = {y.terms + block.terms + 4, out.support};
-    for (int i = 0; i <= x.support->count + block.degree; i++) y.terms[i] = x.terms[i];
-    y.terms[0] -= m;
-    y.radius() += 2 * EPSILON * block.magnitude(y) + TINY;
-    multiply(block, powers.square, y, y, yy);
-    for (int i = 0; i < out.support->count; i++) out.terms[i] = c * yy.terms[i];
-    out.radius() = absolute(b) * y.radius() + absolute(c) * yy.radius() + e;
+    for (int i = 0; i < out.support->count; i++) out.terms[i] = c * of.yy.terms[i];
+    out.radius() = absolute(b) * of.y.radius() + absolute(c) * of.yy.radius() + e;
     if (CUBIC) {
-        const Entry yyy = {yy.terms + block.terms + 4, out.support};
-        block.finish(yy, 0);
-        multiply(block, powers.cube, yy, y, yyy);
-        for (int i = 0; i < out.support->count; i++) out.terms[i] += k * yyy.terms[i];
-        out.radius() += absolute(k) * yyy.radius();
+        for (int i = 0; i < out.support->count; i++) out.terms[i] += k * of.yyy.terms[i];
+        out.radius() += absolute(k) * of.yyy.radius();
     }
-    for (int i = 0; i < x.support->count; i++) out.terms[powers.placing[i]] += b * y.terms[i];
+    for (int i = 0; i < of.y.support->count; i++) out.terms[powers.placing[i]] += b * of.y.terms[i];
     out.terms[0] += a;
 }
 
-// elementary_functions.linearised, and bound_rules._loosened_above
-template <class F>
-void apply(const Block &block, const Powers &powers, const Entry &x, const Entry &out, const F &f) {
-    const Range ends = interval(block, x);
-    const M known = finite(ends.low) & finite(ends.high) & f.defined(ends.low, ends.high);
-    const V lo = known ? ends.low : splat(1), hi = known ? ends.high : splat(1);
-    double operations = 2;
-    if (F::SMOOTH && block.degree > 1) {
-        operations = 6;
-        if constexpr (F::SMOOTH) {
-            if (block.degree == 2) expanded<F, 2>(block, powers, x, out, lo, hi, f);
-            else expanded<F, 3>(block, powers, x, out, lo, hi, f);
-        }
-    } else {
-        secant(x, out, lo, hi, f);
-    }
+// The end of a function: nothing is known of it where its argument is not, or it is not defined.
+void settle(const Block &block, const Entry &out, M known, double operations) {
     for (int i = 0; i < out.support->count; i++) out.terms[i] = known ? out.terms[i] : splat(0);
     block.finish(out, operations);
     out.radius() = known ? out.radius() : splat(INFINITY);
-    if constexpr (F::LOOSENED) out.radius() += ends.high > f.threshold ? splat(f.room) : splat(0);
+}
+
+// elementary_functions.linearised
+template <class F>
+void apply(const Block &block, const Powers &powers, const Entry &x, const Range &ends, const Entry &out, const F &f) {
+    const M known = finite(ends.low) & finite(ends.high) & f.defined(ends.low, ends.high);
+    Argument of = argument_of(x, known, ends);
+    if constexpr (F::SMOOTH) {
+        if (block.degree > 1) {
+            expand(block, powers, x, out, of);
+            const Jet jet = f.jet(of.m);
+            if (block.degree == 2) expanded<2>(powers, of, jet, f.template range<3>(of.lo, of.hi), out);
+            else expanded<3>(powers, of, jet, f.template range<4>(of.lo, of.hi), out);
+            return settle(block, out, known, 6);
+        }
+    }
+    secant(x, out, of.lo, of.hi, f);
+    settle(block, out, known, 2);
+}
+
+struct Sigmoidal {  // what the sigmoid and the softplus of one form share
+    Argument of;
+    Logistic middle, low, high;
+};
+
+// The same for the sigmoid and the softplus in higher degrees
+template <class F>
+void apply(const Block &block, const Powers &powers, const Sigmoidal &shared, const Entry &out, const F &f) {
+    const Argument &of = shared.of;
+    const Jet jet = f.jet(shared.middle);
+    if (block.degree == 2) expanded<2>(powers, of, jet, f.template range<3>(of.lo, of.hi, shared.low, shared.high), out);
+    else expanded<3>(powers, of, jet, f.template range<4>(of.lo, of.hi, shared.low, shared.high), out);
+    settle(block, out, of.known, 6);
 }
 
 struct Truth {

@@ -88,7 +88,7 @@ struct Jet {
 // Functions whose derivatives rise or fall on all of their domain
 template <class F>
 struct Monotone {
-    static constexpr bool SMOOTH = true, LOOSENED = false;
+    static constexpr bool SMOOTH = true;
     template <int ORDER>
     Range range(V lo, V hi) const {
         const V a = F().jet(lo).d[ORDER], b = F().jet(hi).d[ORDER];
@@ -145,16 +145,16 @@ struct Reciprocal : Monotone<Reciprocal> {
 };
 
 struct Logistic {
-    V up, down, p, tanh_half;  // σ(v), σ(−v), σ'(v), tanh(v/2)
-    V u;                       // e^{−|v|}
+    V v, up, down, p, tanh_half;  // v, σ(v), σ(−v), σ'(v), tanh(v/2)
+    V u;                          // e^{−|v|}
 
-    explicit Logistic(V v) {
+    explicit Logistic(V v) : v(v) {
         const Exponential e = exponential(-absolute(v));
         u = e.whole;
         const V large = 1 / (1 + u), small = u * large, t = -e.less_one * large;
         up = v < 0 ? small : large, down = v < 0 ? large : small;
         p = large * small;
-        tanh_half = v < 0 ? -t : (v == v ? t : v);
+        tanh_half = v < 0 ? -t : t;
     }
 };
 
@@ -175,22 +175,17 @@ inline Range sigmoid_third(V lo, V hi, V p_lo, V p_hi) {
 inline V logit(V s) { return each<std::log>(s) - each<std::log1p>(-s); }
 
 struct Sigmoid {
-    static constexpr bool SMOOTH = true, LOOSENED = true;
-    double threshold, room;  // where torch's function differs from it, and by how much
+    static constexpr bool SMOOTH = false;  // by itself: it shares the powers of its argument
 
-    Jet jet(V v) const {
-        const Logistic l(v);
-        return {{l.up, l.p, -l.p * l.tanh_half, l.p * (1 - 6 * l.p), splat(0)}};
-    }
+    Jet jet(const Logistic &l) const { return {{l.up, l.p, -l.p * l.tanh_half, l.p * (1 - 6 * l.p), splat(0)}}; }
+    Jet jet(V v) const { return jet(Logistic(v)); }
     template <int ORDER>
-    Range range(V lo, V hi) const {
-        const Logistic a(lo), b(hi);
+    Range range(V lo, V hi, const Logistic &a, const Logistic &b) const {
         if (ORDER == 3) return sigmoid_third(lo, hi, a.p, b.p);
         const Range p = steepness(lo, hi, a.p, b.p);
-        const V factors[] = {p.low, p.high}, others[] = {12 * p.low - 1, 12 * p.high - 1};
         V least = splat(INFINITY), most = splat(-INFINITY);
-        for (V f : factors)
-            for (V g : others)
+        for (V f : {p.low, p.high})
+            for (V g : {12 * p.low - 1, 12 * p.high - 1})
                 for (V t : {a.tanh_half, b.tanh_half}) least = smaller(f * g * t, least), most = larger(f * g * t, most);
         return roomy(least, most);
     }
@@ -203,16 +198,14 @@ struct Sigmoid {
 };
 
 struct Softplus {
-    static constexpr bool SMOOTH = true, LOOSENED = true;
-    double threshold, room;
+    static constexpr bool SMOOTH = false;
 
-    Jet jet(V v) const {
-        const Logistic l(v);
-        return {{larger(v, splat(0)) + log_one_more(l.u), l.up, l.p, -l.p * l.tanh_half, splat(0)}};
+    Jet jet(const Logistic &l) const {
+        return {{larger(l.v, splat(0)) + log_one_more(l.u), l.up, l.p, -l.p * l.tanh_half, splat(0)}};
     }
+    Jet jet(V v) const { return jet(Logistic(v)); }
     template <int ORDER>
-    Range range(V lo, V hi) const {
-        const Logistic a(lo), b(hi);
+    Range range(V lo, V hi, const Logistic &a, const Logistic &b) const {
         if (ORDER == 4) return sigmoid_third(lo, hi, a.p, b.p);
         const double STEEPEST = 1.3169578969248166, EXTREME = 0.09622504486493764;  // σ'' is ∓1/(6√3) at ±log(2 + √3)
         const V x = -a.p * a.tanh_half, y = -b.p * b.tanh_half;
@@ -241,7 +234,7 @@ inline Range around(V value, V lo, V hi) {
 }
 
 struct Sin {
-    static constexpr bool SMOOTH = true, LOOSENED = false;
+    static constexpr bool SMOOTH = true;
     Jet jet(V v) const {
         const V s = each<std::sin>(v), c = each<std::cos>(v);
         return {{s, c, -s, -c, s}};
@@ -255,7 +248,7 @@ struct Sin {
 };
 
 struct Cos {
-    static constexpr bool SMOOTH = true, LOOSENED = false;
+    static constexpr bool SMOOTH = true;
     Jet jet(V v) const {
         const V s = each<std::sin>(v), c = each<std::cos>(v);
         return {{c, -s, -c, s, c}};
@@ -269,7 +262,7 @@ struct Cos {
 };
 
 struct Tan {
-    static constexpr bool SMOOTH = false, LOOSENED = false;
+    static constexpr bool SMOOTH = false;
     static V branch(V lo, V hi) { return each<std::nearbyint>((lo + hi) / (2 * PI)) * PI; }
     Jet jet(V v) const {
         const V t = each<std::tan>(v);
@@ -284,7 +277,7 @@ struct Tan {
 };
 
 struct Square {
-    static constexpr bool SMOOTH = false, LOOSENED = false;
+    static constexpr bool SMOOTH = false;
     Jet jet(V v) const { return {{v * v, 2 * v}}; }
     int stationary(V a, V, V, V *at) const { return at[0] = a * 0.5, 1; }
     M defined(V, V) const { return always(); }
@@ -292,7 +285,7 @@ struct Square {
 
 // v above 0 and a multiple of v below
 struct Leaky {
-    static constexpr bool SMOOTH = false, LOOSENED = false;
+    static constexpr bool SMOOTH = false;
     double slope;
     Jet jet(V v) const { return {{v > 0 ? v : slope * v, v > 0 ? splat(1) : splat(slope)}}; }
     int stationary(V, V, V, V *at) const { return at[0] = splat(0), 1; }
@@ -300,7 +293,7 @@ struct Leaky {
 };
 
 struct Clamp {
-    static constexpr bool SMOOTH = false, LOOSENED = false;
+    static constexpr bool SMOOTH = false;
     double low, high;
     Jet jet(V v) const {
         const V y = clamped(v, splat(low), splat(high));

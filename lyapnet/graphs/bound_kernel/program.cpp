@@ -5,6 +5,7 @@
 
 #include <cstdlib>
 #include <memory>
+#include <optional>
 
 namespace {
 
@@ -87,26 +88,52 @@ void matrix_product(const Block &block, const int *&code) {
 
 enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, LEAKY, CLAMP };
 
-void apply_named(const Block &block, const int *&code) {
-    const int function = *code++;
-    const Entry x = block.entry(code), out = block.entry(code);
-    const double p = block.numbers[*code++], q = block.numbers[*code++];
-    const Powers powers = {block.products[code[0]], block.products[code[1]], block.placings[code[2]]};
-    code += 3;
+void apply_one(
+    const Block &block, const Powers &powers, int function, const Entry &x, const Range &ends, const Entry &out, double p,
+    double q
+) {
     switch (function) {
-        case EXP: return apply(block, powers, x, out, Exp{});
-        case LOG: return apply(block, powers, x, out, Log{});
-        case LOG1P: return apply(block, powers, x, out, Log1p{});
-        case SQRT: return apply(block, powers, x, out, Sqrt{});
-        case RECIPROCAL: return apply(block, powers, x, out, Reciprocal{});
-        case SIGMOID: return apply(block, powers, x, out, Sigmoid{p, q});
-        case SOFTPLUS: return apply(block, powers, x, out, Softplus{p, q});
-        case SIN: return apply(block, powers, x, out, Sin{});
-        case COS: return apply(block, powers, x, out, Cos{});
-        case TAN: return apply(block, powers, x, out, Tan{});
-        case SQUARE: return apply(block, powers, x, out, Square{});
-        case LEAKY: return apply(block, powers, x, out, Leaky{p});
-        case CLAMP: return apply(block, powers, x, out, Clamp{p, q});
+        case EXP: return apply(block, powers, x, ends, out, Exp{});
+        case LOG: return apply(block, powers, x, ends, out, Log{});
+        case LOG1P: return apply(block, powers, x, ends, out, Log1p{});
+        case SQRT: return apply(block, powers, x, ends, out, Sqrt{});
+        case RECIPROCAL: return apply(block, powers, x, ends, out, Reciprocal{});
+        case SIGMOID: return apply(block, powers, x, ends, out, Sigmoid{});
+        case SOFTPLUS: return apply(block, powers, x, ends, out, Softplus{});
+        case SIN: return apply(block, powers, x, ends, out, Sin{});
+        case COS: return apply(block, powers, x, ends, out, Cos{});
+        case TAN: return apply(block, powers, x, ends, out, Tan{});
+        case SQUARE: return apply(block, powers, x, ends, out, Square{});
+        case LEAKY: return apply(block, powers, x, ends, out, Leaky{p});
+        case CLAMP: return apply(block, powers, x, ends, out, Clamp{p, q});
+    }
+}
+
+// All functions of one form
+void apply_functions(const Block &block, const int *&code) {
+    const Entry x = block.entry(code);
+    const Range ends = interval(block, x);
+    const M known = finite(ends.low) & finite(ends.high);
+    std::optional<Sigmoidal> shared;
+    for (int count = *code++; count > 0; count--) {
+        const int function = *code++;
+        const Entry out = block.entry(code);
+        const double p = block.numbers[code[0]], q = block.numbers[code[1]];
+        const Powers powers = {block.products[code[2]], block.products[code[3]], block.placings[code[4]]};
+        code += 5;
+        if ((function == SIGMOID || function == SOFTPLUS) && block.degree > 1) {
+            if (!shared) {
+                Argument of = argument_of(x, known, ends);
+                expand(block, powers, x, out, of);
+                shared.emplace(Sigmoidal{of, Logistic(of.m), Logistic(of.lo), Logistic(of.hi)});
+            }
+            if (function == SIGMOID) apply(block, powers, *shared, out, Sigmoid{});
+            else apply(block, powers, *shared, out, Softplus{});
+        } else {
+            apply_one(block, powers, function, x, ends, out, p, q);
+        }
+        if (function == SIGMOID || function == SOFTPLUS)
+            out.radius() += ends.high > p ? splat(q) : splat(0);  // bound_rules._loosened_above
     }
 }
 
@@ -117,7 +144,7 @@ V one(M truth) { return truth ? splat(1) : splat(0); }
 void operate(const Block &block, int operation, const int *&code) {
     if (operation == COMBINE) return combine(block, code);
     if (operation == MATRIX_PRODUCT) return matrix_product(block, code);
-    if (operation == FUNCTION) return apply_named(block, code);
+    if (operation == FUNCTION) return apply_functions(block, code);
     const Entry x = block.entry(code), y = block.entry(code);
     if (operation == MULTIPLY) {
         const Entry out = block.entry(code);

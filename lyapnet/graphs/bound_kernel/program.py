@@ -14,7 +14,7 @@ from lyapnet.graphs.taylor import monomials
 OPERATIONS = {
     name: code
     for code, name in enumerate((
-        "combine", "matrix_product", "multiply", "function", "where", "no_wider", "sign", "positive", "negation",
+        "combine", "matrix_product", "multiply", "functions", "where", "no_wider", "sign", "positive", "negation",
         "conjunction",
     ))
 }  # fmt: skip
@@ -85,6 +85,7 @@ class Program:
         self._numbers: list[float] = []
         self._number: dict[float | bytes, int] = {}
         self._instructions: list[list[int]] = []
+        self._functions: dict[Entry, list[int]] = {}
         self._spare = 3 * (len(self.monomials) + 4)
         self.supports: list[Support] = []
         self.constants: dict[Entry, float] = {}
@@ -140,7 +141,15 @@ class Program:
         a = self.supports[x]
         powers = self._table(a, a, support), self._table(support, a, support), self._placing(x, support)
         parameters = self._at(p), self._at(q)
-        return self._emit("function", support, FUNCTIONS[name], x, behind=(*parameters, *powers))
+        key = (name, x, *parameters)
+        if key not in self._known:
+            self._known[key] = self._new(support)
+            if x not in self._functions:  # those of one form share its range, and some its powers
+                self._functions[x] = [OPERATIONS["functions"], x, 0]
+                self._instructions.append(self._functions[x])
+            self._functions[x][2] += 1
+            self._functions[x] += [FUNCTIONS[name], self._known[key], *parameters, *powers]
+        return self._known[key]
 
     def matrix_product(self, row: Sequence[Entry], weight: Tensor) -> list[Entry]:
         """A row times a constant matrix."""

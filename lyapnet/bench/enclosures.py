@@ -12,7 +12,7 @@ from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import box_form, interval_form
 from lyapnet.types import Value
 
-MEAN_VALUE = "mean value"
+MEAN_VALUE, COMPILED = "mean value", "quadratic, compiled"
 Sides = tuple[Tensor, Tensor]
 Enclosure = Callable[[Tensor, Tensor], Sides]
 """Boxes (lower, upper) of (t, x), (boxes, 1 + n) each ↦ (lower, upper) bounds of c on them, (boxes,) each."""
@@ -25,7 +25,13 @@ def affine(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
 
 def quadratic(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
     """Forms of second degree, as the certifier has them: what cancels in second order cancels in the bounds."""
-    return lambda lower, upper: bounded.bounds(lower, upper)[0]
+    return lambda lower, upper: bounded.image(box_form(lower, upper, bounded.degree))[0].interval()
+
+
+def compiled(bounded: BoundedFunction, sample: Sides) -> Enclosure | None:
+    """The same by machine code, as the certifier has them in a long search; None where there is none."""
+    kernel = bounded.kernel(*(side[None] for side in sample))
+    return None if kernel is None else lambda lower, upper: kernel.forms(lower, upper)[0].interval()
 
 
 def interval(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
@@ -71,7 +77,8 @@ def enclosure(name: str, c: Value, sample: Sides) -> Enclosure:
 
 
 def enclosures_of(c: Value, sample: Sides, say: Callable[[str], Any]) -> dict[str, Enclosure]:
-    """All enclosures of c, which is traced once; those of its gradient are left out where that has no bounds.
+    """All enclosures of c, which is traced once; those of its gradient are left out where that has no bounds, and
+    machine code where there is none.
 
     Args:
         say: called with the reason why one is left out: training never needs the gradient of c.
@@ -85,7 +92,8 @@ def enclosures_of(c: Value, sample: Sides, say: Callable[[str], Any]) -> dict[st
             found[name] = build(bounded, c, sample)
         except UsageError as error:
             say(f"{name} is left out, for the gradient of c: {error}")
-    return found
+    machine_code = compiled(bounded, sample)
+    return found if machine_code is None else {**found, COMPILED: machine_code}
 
 
 def _traced(c: Value, sample: Sides) -> BoundedFunction:

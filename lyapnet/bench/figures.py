@@ -41,7 +41,7 @@ def certify_bench(bounds: Sequence[Tightness], proofs: Sequence[Attempt]) -> Fig
 
 
 def _draw_tightness(axes: Axes, rows: Sequence[Tightness]) -> None:
-    for row in rows:
+    for row in (row for row in rows if row.enclosure in ENCLOSURE_STYLES):
         color, marker, line = ENCLOSURE_STYLES[row.enclosure]
         label = f"{row.enclosure}: excess ∝ side^{row.order:.2f}"
         axes.loglog(row.sides, row.factors, line, color=color, marker=marker, markersize=5, label=label)

@@ -80,18 +80,22 @@ class BoundedFunction:
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
         """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.
 
-        Machine code takes over once there are many boxes on the CPU, if there is any.
+        Once there are many boxes on the CPU, machine code takes over, if there is any.
         """
-        kernel = self._kernel(lower, upper) if lower.device.type == "cpu" else None
-        return self.image(box_form(lower, upper, self.degree)) if kernel is None else kernel.forms(lower, upper)
+        if lower.device.type == "cpu":
+            wide = tuple(wide_axes(lower, upper).tolist())
+            self._seen[wide] += len(lower)
+            kernel = self.kernel(lower, upper) if self._seen[wide] > MANY else None
+            if kernel is not None:
+                return kernel.forms(lower, upper)
+        return self.image(box_form(lower, upper, self.degree))
 
-    def _kernel(self, lower: Corners, upper: Corners) -> BoundKernel | None:
-        """The kernel for boxes with a width along the same axes as these, once MANY of them were bounded."""
+    def kernel(self, lower: Corners, upper: Corners) -> BoundKernel | None:
+        """Machine code for boxes with a width along the same axes as these; None where there is none."""
         wide = tuple(wide_axes(lower, upper).tolist())
-        self._seen[wide] += len(lower)
-        if self._seen[wide] > MANY and wide not in self._kernels:
+        if wide not in self._kernels:
             self._kernels[wide] = kernel_of(self._nodes, self._constants, lower.shape[-1], wide, self.degree)
-        return self._kernels.get(wide)
+        return self._kernels[wide]
 
     def image(self, box: TaylorForm) -> list[TaylorForm]:
         """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""

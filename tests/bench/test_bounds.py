@@ -11,7 +11,7 @@ from lyapnet import cli
 from lyapnet.bench import enclosures
 from lyapnet.bench import tightness as tightness_of
 from lyapnet.bench.conditions import condition_of_chain, condition_of_network
-from lyapnet.bench.enclosures import ENCLOSURES, MEAN_VALUE, enclosure, enclosures_of
+from lyapnet.bench.enclosures import COMPILED, ENCLOSURES, MEAN_VALUE, enclosure, enclosures_of
 from lyapnet.bench.proofs import METHODS, attempt, growth
 from lyapnet.bench.tightness import order, random_boxes, range_widths, tightness
 from lyapnet.errors import UsageError
@@ -70,6 +70,9 @@ def test_the_interval_of_a_product_lies_between_products_of_ends():
     assert [float(side) for side in unknown] == [-math.inf, math.inf]
 
 
+needs_compiler = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+
+
 @pytest.fixture(scope="module")
 def case():
     return condition_of_network()
@@ -89,7 +92,7 @@ def outside(case, enclose, lower, upper):
     return int(((value < low[:, None]) | (value > high[:, None]) | low[:, None].isnan()).sum())
 
 
-@pytest.mark.parametrize("name", ENCLOSURES)
+@pytest.mark.parametrize("name", [*ENCLOSURES, pytest.param(COMPILED, marks=needs_compiler)])
 def test_conditions_lie_within_every_enclosure(case, enclosed, name):
     for side in (1.0, 0.3, 0.05, 1e-3, 1e-6, 0.0):
         assert outside(case, enclosed[name], *random_boxes(case, side, 50)) == 0
@@ -117,7 +120,7 @@ def test_orders_of_the_excess(case, enclosed):
     for row in rows.values():
         assert min(row.factors) >= 1
         assert row.boxes_per_second > 0
-        assert rows["quadratic"].factors[0] <= row.factors[0]
+        assert rows["quadratic"].factors[0] <= row.factors[0] * (1 + 1e-9)
     assert rows["quadratic"].factors[-1] < rows["affine"].factors[-1]
     assert rows["quadratic"].order > 1.9
 
@@ -196,7 +199,7 @@ def test_a_gradient_without_rules_leaves_the_mean_value_form_out(monkeypatch):
             (slope,) = torch.autograd.grad(torch.nn.functional.softplus(y).sum(), y, create_graph=True)
         return slope + t
 
-    assert list(enclosures_of(c, sample(), said.append)) == ["quadratic", "affine", "interval"]
+    assert enclosures_of(c, sample(), said.append).keys() - {COMPILED} == {"quadratic", "affine", "interval"}
     assert "aten.lt" in said[0]
 
 

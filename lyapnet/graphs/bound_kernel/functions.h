@@ -283,6 +283,13 @@ struct Square {
     M defined(V, V) const { return always(); }
 };
 
+struct Absolute {
+    static constexpr bool SMOOTH = false;
+    Jet jet(V v) const { return {{absolute(v), v > 0 ? splat(1) : (v < 0 ? splat(-1) : splat(0))}}; }
+    int stationary(V, V, V, V *at) const { return at[0] = splat(0), 1; }
+    M defined(V, V) const { return always(); }
+};
+
 // v above 0 and a multiple of v below
 struct Leaky {
     static constexpr bool SMOOTH = false;

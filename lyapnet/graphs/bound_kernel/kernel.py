@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lyapnet.errors import CompilationError, one_line
 from lyapnet.files import digest_of_file, write_atomically
-from lyapnet.graphs.bound_kernel.program import Program
-from lyapnet.graphs.bound_kernel.rules import written
+from lyapnet.graphs.bound_kernel.program import Entry, Program
+from lyapnet.graphs.bound_kernel.writing import written
 from lyapnet.graphs.compilation import cache_folder, has_compiler, require_own
 from lyapnet.graphs.taylor import TaylorForm
 from lyapnet.types import Corners
@@ -40,14 +41,12 @@ class BoundKernel:
         CompilationError: there is no machine code.
     """
 
-    def __init__(
-        self, nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int
-    ):
+    def __init__(self, nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int):
         if len(wide) > MOST_AXES:
             raise NotImplementedError(f"more than {MOST_AXES} axes")
         program = Program(axes, wide, degree)
         results = written(program, nodes, constants)
-        self._program = program.assembled([entry for y in results for entry in _entries(y)])
+        self._program = program.assembled([Entry(k) for y in results for k in y.entries.flatten().tolist()])
         self._shapes = [y.shape for y in results]
         self._terms, self._dimension = len(program.monomials), program.dimension
 
@@ -133,14 +132,20 @@ def _compile(file: Path) -> None:
 
 def file_of_library() -> Path:
     """Where the machine code is kept: by its source, how it is compiled, and the instructions of the CPU."""
-    parts = [platform.machine(), sorted(torch.cpu.get_capabilities().items()), FLAGS, *(p.read_bytes() for p in SOURCES)]
+    parts = [
+        platform.machine(),
+        sorted(torch.cpu.get_capabilities().items()),
+        FLAGS,
+        *(p.read_bytes() for p in SOURCES),
+    ]
     return cache_folder() / f"bounds_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
 
 
-def _entries(forms: Any) -> list[Any]:
-    from lyapnet.graphs.bound_kernel.program import Entry
-
-    return [Entry(k) for k in forms.entries.flatten().tolist()]
+def elementary(which: int, points: Tensor) -> Tensor:
+    """eˣ (0), eˣ − 1 (1) or log(1 + x) (2) at points, as machine code computes them for bounds."""
+    values = points.double().clone()
+    library().lyapnet_elementary(which, ctypes.c_void_p(values.data_ptr()), ctypes.c_long(values.numel()))
+    return values
 
 
 def _address(array: np.ndarray) -> ctypes.c_void_p:

@@ -86,7 +86,7 @@ void matrix_product(const Block &block, const int *&code) {
     }
 }
 
-enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, LEAKY, CLAMP };
+enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, ABSOLUTE, LEAKY, CLAMP };
 
 void apply_one(
     const Block &block, const Powers &powers, int function, const Entry &x, const Range &ends, const Entry &out, double p,
@@ -104,6 +104,7 @@ void apply_one(
         case COS: return apply(block, powers, x, ends, out, Cos{});
         case TAN: return apply(block, powers, x, ends, out, Tan{});
         case SQUARE: return apply(block, powers, x, ends, out, Square{});
+        case ABSOLUTE: return apply(block, powers, x, ends, out, Absolute{});
         case LEAKY: return apply(block, powers, x, ends, out, Leaky{p});
         case CLAMP: return apply(block, powers, x, ends, out, Clamp{p, q});
     }

@@ -21,11 +21,11 @@ OPERATIONS = {
 FUNCTIONS = {
     name: code
     for code, name in enumerate((
-        "exp", "log", "log1p", "sqrt", "reciprocal", "sigmoid", "softplus", "sin", "cos", "tan", "square", "leaky",
-        "clamp",
+        "exp", "log", "log1p", "sqrt", "reciprocal", "sigmoid", "softplus", "sin", "cos", "tan", "square", "absolute",
+        "leaky", "clamp",
     ))
 }  # fmt: skip
-LINEAR = {"tan", "square", "leaky", "clamp"}  # functions that are bounded by a line in forms of any degree
+LINEAR = {"tan", "square", "absolute", "leaky", "clamp"}  # functions that are bounded by a line in forms of any degree
 
 Support = tuple[int, ...]  # the numbers of the monomials that a form can have, rising; the constant is one of them
 CONSTANT: Support = (0,)
@@ -124,12 +124,14 @@ class Program:
         if x in self.constants or y in self.constants:
             x, y = (y, x) if x in self.constants else (x, y)
             return self.scale(x, self.constants[y])
-        if x == y and self.degree == 1:
-            return self.function("square", x)
         x, y = min(x, y), max(x, y)
         a, b = self.supports[x], self.supports[y]
         support = self._product(a, b)
         return self._emit("multiply", support, x, y, behind=(self._table(a, b, support),))
+
+    def square(self, x: Entry) -> Entry:
+        """x²."""
+        return self.function("square", x) if self.degree == 1 else self.multiply(x, x)
 
     def function(self, name: str, x: Entry, p: float = 0.0, q: float = 0.0) -> Entry:
         """f(x), with its parameters."""

@@ -17,6 +17,7 @@ from lyapnet.bench.tightness import order, random_boxes, range_widths, tightness
 from lyapnet.errors import UsageError
 from lyapnet.graphs import elementary_functions, taylor
 from lyapnet.graphs.bounds import RULES, BoundedFunction
+from lyapnet.graphs.compilation import has_compiler
 from tests.functions import FUNCTIONS, SMOOTH, box, points_in, without_remainder
 
 

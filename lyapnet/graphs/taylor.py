@@ -3,8 +3,8 @@
 Rounding. Forms enclose the values of real arithmetic on the given float64 numbers. Every operation here adds to its
 remainder a bound of its own rounding errors: a multiple of ε = 2⁻⁵² times the magnitudes that entered it, at least
 twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. Two things are taken on
-trust: that torch's elementary functions err by at most 8 ε (1.2 ε is the most that was seen, against mpmath), and that
-nothing underflows by more than TINY.
+trust: that the elementary functions of torch, and of the C library where lyapnet.graphs.bound_kernel uses them, err by
+at most 8 ε (1.2 ε is the most that was seen of torch's, against mpmath), and that nothing underflows by more than TINY.
 
 Sources: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004, for the first
 degree; Neumaier, "Taylor forms: use and limits", Reliable Computing 2003, for higher ones. The remainder here is one

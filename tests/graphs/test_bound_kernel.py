@@ -66,6 +66,19 @@ def test_bounds_of_whole_functions_are_those_of_the_interpreter(name, degree):
         assert inside < 1e-10
 
 
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_functions_of_one_number_do_not_disturb_each_other(degree):
+    """The range and the powers of an argument are shared, but of those that are not defined on all of it."""
+
+    def function(t, x):
+        y = x[0] + t * x[1]
+        return torch.sigmoid(y), torch.log(y), torch.nn.functional.softplus(y), torch.sin(y), torch.exp(y)
+
+    forms, others = both(function, *random_boxes(120, 0), degree)
+    assert max(differences(forms, others)) < 1e-10
+    assert forms[2].radius.isfinite().all()
+
+
 @pytest.mark.parametrize("operation", CASES.keys() - WITHOUT_A_RULE, ids=str)
 def test_no_value_lies_outside(operation):
     """The twin: bounds made 20 % narrower are caught."""

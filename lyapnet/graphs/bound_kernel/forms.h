@@ -103,7 +103,8 @@ void between(const Block &block, const Entry &out, V low, V high) {
 // taylor.multiply, up to `finish`
 void multiply(const Block &block, const int *product, const Entry &x, const Entry &y, const Entry &out) {
     const V ax = absolute(x.terms[0]) + block.spread(x), by = absolute(y.terms[0]) + block.spread(y);
-    const V rx = x.radius(), ry = y.radius(), rounding = (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry);
+    const V rx = x.radius(), ry = y.radius();
+    const V rounding = (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry);
     V radius = ax * ry + by * rx + rx * ry + rounding + TINY;
     for (int k = 0; k < out.support->count; k++) {
         V sum = splat(0);
@@ -241,9 +242,10 @@ struct Sigmoidal {  // what the sigmoid and the softplus of one form share
 template <class F>
 void apply(const Block &block, const Powers &powers, const Sigmoidal &shared, const Entry &out, const F &f) {
     const Argument &of = shared.of;
+    const Logistic &low = shared.low, &high = shared.high;
     const Jet jet = f.jet(shared.middle);
-    if (block.degree == 2) expanded<2>(powers, of, jet, f.template range<3>(of.lo, of.hi, shared.low, shared.high), out);
-    else expanded<3>(powers, of, jet, f.template range<4>(of.lo, of.hi, shared.low, shared.high), out);
+    if (block.degree == 2) expanded<2>(powers, of, jet, f.template range<3>(of.lo, of.hi, low, high), out);
+    else expanded<3>(powers, of, jet, f.template range<4>(of.lo, of.hi, low, high), out);
     settle(block, out, of.known, 6);
 }
 
@@ -258,7 +260,9 @@ Truth truth_of(const Block &block, const Entry &x) {
 }
 
 // branches.where; the support of the result holds those of both
-void where(const Block &block, const Truth &is, const int *const placings[2], const Entry &x, const Entry &y, const Entry &out) {
+void where(
+    const Block &block, const Truth &is, const int *const placings[2], const Entry &x, const Entry &y, const Entry &out
+) {
     const int count = out.support->count;
     V *mine = block.spare, *other = mine + count, apart = splat(0);
     for (int i = 0; i < 2 * count; i++) mine[i] = splat(0);

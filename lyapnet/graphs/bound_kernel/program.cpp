@@ -89,8 +89,8 @@ void matrix_product(const Block &block, const int *&code) {
 enum Function { EXP, LOG, LOG1P, SQRT, RECIPROCAL, SIGMOID, SOFTPLUS, SIN, COS, TAN, SQUARE, ABSOLUTE, LEAKY, CLAMP };
 
 void apply_one(
-    const Block &block, const Powers &powers, int function, const Entry &x, const Range &ends, const Entry &out, double p,
-    double q
+    const Block &block, const Powers &powers, int function, const Entry &x, const Range &ends, const Entry &out,
+    double p, double q
 ) {
     switch (function) {
         case EXP: return apply(block, powers, x, ends, out, Exp{});
@@ -132,6 +132,7 @@ void apply_functions(const Block &block, const int *&code) {
             else apply(block, powers, *shared, out, Softplus{});
         } else {
             apply_one(block, powers, function, x, ends, out, p, q);
+            shared.reset();  // whose powers lay where those of this one do now
         }
         if (function == SIGMOID || function == SOFTPLUS)
             out.radius() += ends.high > p ? splat(q) : splat(0);  // bound_rules._loosened_above
@@ -167,14 +168,17 @@ void operate(const Block &block, int operation, const int *&code) {
         return no_wider(block, x, y, low, block.numbers[*code++]);
     }
     const Range ends = interval(block, x);
-    if (operation == SIGN) return between(block, y, one(ends.low > 0) - one(ends.low < 0), one(ends.high > 0) - one(ends.high < 0));
-    if (operation == POSITIVE) return between(block, y, one(ends.low > 0), one(ends.high > 0));
+    const V low = one(ends.low > 0), high = one(ends.high > 0);
+    if (operation == SIGN) return between(block, y, low - one(ends.low < 0), high - one(ends.high < 0));
+    if (operation == POSITIVE) return between(block, y, low, high);
     const Truth truth = truth_of(block, x);  // NEGATION
     between(block, y, one(~truth.possible), one(~truth.certain));
 }
 
 // taylor.box_form, of the boxes in the lanes
-void read_boxes(const Block &block, const int *&code, const double *lower, const double *upper, long first, long boxes) {
+void read_boxes(
+    const Block &block, const int *&code, const double *lower, const double *upper, long first, long boxes
+) {
     const int axes = *code++;
     for (int axis = 0; axis < axes; axis++) {
         const Entry y = block.entry(code);

@@ -52,6 +52,8 @@ READS = {  # the parameters of registered systems that f and g read
     "pendulum": ["mass", "length", "gravity"],
     "reacher": ["a1", "a2", "a3"],
     "planar_quadrotor": ["mass", "inertia", "arm", "gravity"],
+    "path_tracking": ["speed", "length", "radius"],
+    "van_der_pol": ["damping"],
 }
 
 

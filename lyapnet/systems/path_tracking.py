@@ -33,4 +33,5 @@ class PathTracking(ControlAffineSystem):
         return torch.stack([self.speed * torch.sin(theta), -turning], -1)
 
     def g(self, x: State) -> InputMatrix:
-        return x.new_tensor([[0.0], [self.speed / self.length]]).expand(*x.shape[:-1], 2, 1)
+        zero = torch.zeros_like(x[..., 0])
+        return torch.stack([zero, zero + self.speed / self.length], -1)[..., None]

@@ -184,11 +184,17 @@ def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> C
     return member
 
 
-def check_members(family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State) -> None:
+def check_members(
+    family: FamilySystem,
+    build: Callable[[Mapping[str, float]], ControlAffineSystem],
+    z: State,
+    called: str = "parameters of a family",
+) -> None:
     """Hold f and g of a family, at some states (b, n + k), against systems that are built with their parameters.
 
     Args:
         build: a system from the values of the parameters in f.
+        called: what messages call the parameters.
 
     Raises:
         UsageError: f or g reads no such number, or not it alone, or does not take it as a tensor.
@@ -197,7 +203,7 @@ def check_members(family: FamilySystem, build: Callable[[Mapping[str, float]], C
     if unread := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
         known = [name for name, value in vars(family.system).items() if type(value) in (int, float)]
         raise UsageError(
-            f"Expected parameters of a family among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "
+            f"Expected {called} among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "
             f"{unread[0]}; write self.{unread[0]} = {unread[0]} in its __init__, and read it in f and g."
         )
     try:

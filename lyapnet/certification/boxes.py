@@ -1,6 +1,6 @@
 """Boxes of points (t, x): many at once, sorted, cut in two."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -76,6 +76,17 @@ def roots(lower: Corners, upper: Corners, key: float = float("-inf")) -> Boxes:
 def single(lower: Corner, upper: Corner, key: float = float("-inf")) -> Boxes:
     """One box."""
     return roots(lower[None], upper[None], key)
+
+
+def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -> tuple[Corners, Corners]:
+    """A box in about so many alike, cut across some of its axes: those that have a width."""
+    lower, upper, wide = lower[None], upper[None], [axis for axis in axes if upper[axis] > lower[axis]]
+    each = max(1, round(count ** (1 / max(1, len(wide)))))
+    for axis in wide:
+        ends = torch.linspace(float(lower[0, axis]), float(upper[0, axis]), each + 1, dtype=lower.dtype)
+        lower, upper = (side.repeat_interleave(each, 0) for side in (lower, upper))
+        lower[:, axis], upper[:, axis] = ends[:-1].repeat(len(lower) // each), ends[1:].repeat(len(upper) // each)
+    return lower, upper
 
 
 class CutTree:

@@ -168,14 +168,14 @@ def searched(question: Question, frontier: Boxes, budget: Budget) -> Search:
 PROBES = 12  # boxes of a chunk that are cut along every axis
 
 
-def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor) -> Tensor:
-    """For each chosen box, the axis along which a cut lowers the excess of its first result most.
+def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor, result: int = 0) -> Tensor:
+    """For each chosen box, the axis along which a cut lowers the excess of one result most, the first by default.
 
     A linear part is bounded exactly on a box of any size: where an inequality holds and is not proved yet, what the
     bounds have beyond it is in the way. About Σ_k m_k w_k² of it is the widths'; m is measured on a few boxes.
 
     Args:
-        form: the first result on the boxes.
+        form: that result on the boxes.
         chosen: (boxes,) truths.
     """
     widths, excess = boxes.upper - boxes.lower, form.excess.nan_to_num(nan=1e100, posinf=1e100)
@@ -185,7 +185,7 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
     axes = torch.arange(widths.shape[-1])
     probes = boxes[some.repeat_interleave(len(axes))]
     lower, upper, *_ = probes.halves(axes.repeat(len(some)))
-    halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[0].excess
+    halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[result].excess
     drop = excess[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
     m = (drop.clamp_min(0) / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
     # the linear part and the widths decide where the excess does not
@@ -213,16 +213,20 @@ class LeastValue(Question):
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         f, w = self.bounded.forms(boxes.lower, boxes.upper)
-        f_low, w_low = f.interval()[0], w.interval()[0]
+        (f_low, f_high), w_low = f.interval(), w.interval()[0]
         t, x = boxes.center[:, 0], boxes.center[:, 1:]
         with torch.no_grad():
             at, inside = self.function(t, x), self.where(t, x) <= self.level
         self.best = min(self.best, _least(at[inside]))
-        close = self.best - self.tolerance * max(abs(self.best), self.unit) if self.best < torch.inf else torch.inf
+        room = self.tolerance * max(abs(self.best), self.unit) if self.best < torch.inf else 0.0
+        close = self.best - room
         possible, done = w_low <= self.level, f_low >= min(close, self.enough)
         self.found = min(self.found, _least(f_low[possible & done]))
         boxes, chosen = boxes._replace(key=f_low), possible & ~done
-        return boxes[chosen], axis_to_cut(self.bounded, f, boxes, chosen)
+        axis, known = axis_to_cut(self.bounded, f, boxes, chosen), (f_high - f_low <= room)[chosen]
+        if bool(known.any()):  # of these it is open whether they count
+            axis = torch.where(known, axis_to_cut(self.bounded, w, boxes, chosen, 1), axis)
+        return boxes[chosen], axis
 
 
 def _least(values: PerBox) -> float:

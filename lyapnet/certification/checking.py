@@ -16,6 +16,7 @@ from lyapnet.certification.funnel import sound_claim
 from lyapnet.certification.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
 from lyapnet.certification.kept_regions import kept_region
 from lyapnet.certification.least_cost import DEGREE, RiseCondition, lower_claim
+from lyapnet.certification.plants import plants_of
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.region import region_claim
@@ -166,9 +167,10 @@ def _region(controller: Controller, path: Path, budget: Budget, report: Report) 
             f"Expected a proof that has come to a region in {str(path)!r}, got one that has not; go on with lyapnet "
             f"certify region CKPT --keep {shlex.quote(str(path))} and the same options."
         )
+    plants = plants_of(controller, kept.parameters) if kept.parameters else None
     claim = region_claim(
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
-        kept.disturbance,
+        kept.disturbance, plants,
     )  # fmt: skip
     reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is beyond what was tried"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds

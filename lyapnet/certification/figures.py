@@ -159,10 +159,12 @@ def region(
         if paths is not None:
             x, y = (numpy_of(paths[..., k]) for k in pair)
             name = f"closed loops under u(0, x){', not pushed' if claim.disturbance is not None else ''}"
+            name += "" if claim.plants is None else ", each of another plant"
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
             handles.setdefault("closed loops", line)
     legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
     what = "region of attraction" if claim.disturbance is None else "region, however pushed"
+    what += "" if claim.plants is None else " of each plant"
     share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the {what}"
     proved = claim.rho > -float("inf")
     figure.suptitle(f"{claim.verdict}: {share if proved else 'no region proved'}", fontsize=9)

@@ -1,5 +1,7 @@
 """What the file of a region's proof proposes to prove again."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +23,7 @@ class KeptRegion(NamedTuple):
     path: Path
     decay: float  # λ in 1/s
     states: Box  # D; without width along states that nothing depends on
+    parameters: dict[str, list[float]]  # the ends of P by name; empty where it is about one plant
     contracting: tuple[Box, Tensor] | None  # (B, Y); none with a disturbance
     disturbance: State | None  # w
     hole: float  # c
@@ -28,11 +31,21 @@ class KeptRegion(NamedTuple):
     rho: float  # the level that is proved, as it says
     seconds: float  # of the search
 
-    def require(self, decay: float, states: Box, disturbance: State | None) -> None:
-        """Refuse another λ, D or w than those of the file."""
-        same = self.states.lower.equal(states.lower) and self.states.upper.equal(states.upper)
-        if self.decay != decay or not same:
+    def require(self, decay: float, states: Box, disturbance: State | None, parameters: Sequence[str] = ()) -> None:
+        """Refuse another λ, D, P or w than those of the file.
+
+        Args:
+            states, disturbance: beside the ends of P, and zeros.
+            parameters: their names, in order.
+        """
+        n = states.dimension - len(parameters)
+        D, P = ([side.tolist() for side in (states.lower[part], states.upper[part])]
+                for part in (slice(None, n), slice(n, None)))  # fmt: skip
+        if self.parameters != dict(zip(parameters, map(list, zip(*P, strict=True)), strict=True)):
+            raise UsageError(f"Expected the parameters of {str(self.path)!r}, got others; {NEW_FILE}.")
+        if self.decay != decay or [self.states.lower.tolist(), self.states.upper.tolist()] != D:
             raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
+        disturbance = None if disturbance is None else disturbance[:n]
         kept, given = (None if w is None else w.tolist() for w in (self.disturbance, disturbance))
         if kept != given:
             raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
@@ -59,14 +72,31 @@ def kept_region(path: Path) -> KeptRegion:
     with refusing(path):
         of, wanted, _ = content["of"]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64) for side in ("lower", "upper"))
+        n = len(lower) - 1 - len(of.get("parameters", []))
+        ranges = _ranges(of.get("parameters", []), lower[1 + n :].tolist(), upper[1 + n :].tolist())
         numbers = of["decay"], of["hole"], wanted, content["proved"], content["seconds"]
         decay, hole, wanted, rho, seconds = (float(number) for number in numbers)
         w, contracting = None, None
         if "disturbance" in of:
-            w = torch.tensor(of["disturbance"], dtype=torch.float64)
+            w = torch.tensor(of["disturbance"], dtype=torch.float64)[:n]
             if not bool((w > 0).any()):
                 raise ValueError("a disturbance that is none")
         else:
             lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
             contracting = Box(lowest, highest), Y
-        return KeptRegion(path, decay, Box(lower[1:], upper[1:]), contracting, w, hole, wanted, rho, seconds)
+        D = Box(lower[1 : 1 + n], upper[1 : 1 + n])
+        return KeptRegion(path, decay, D, ranges, contracting, w, hole, wanted, rho, seconds)
+
+
+def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:
+    """The ends of P by name.
+
+    Raises:
+        ValueError: they are none.
+    """
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError("names that are none")
+    ranges = {name: [low, high] for name, low, high in zip(names, lower, upper, strict=True)}
+    if len(ranges) < len(names) or not all(-math.inf < low <= high < math.inf for low, high in ranges.values()):
+        raise ValueError("parameters that are none")
+    return ranges

@@ -1,6 +1,6 @@
 """What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -97,6 +97,23 @@ def without(states: Box, left_out: Sequence[int]) -> Box:
     lower, upper = states.lower.double(), states.upper.double()
     seen = torch.tensor([i not in left_out for i in range(states.dimension)])
     return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
+
+
+def at_centre(states: Box, axes: Iterable[int]) -> Box:
+    """The slice of a box in the middle of some axes."""
+    chosen = torch.tensor([i in axes for i in range(states.dimension)])
+    return Box(*(torch.where(chosen, states.center, side) for side in (states.lower, states.upper)))
+
+
+def first_of(states: Box, n: int) -> Box:
+    """A box of the first n states."""
+    return Box(states.lower[:n], states.upper[:n])
+
+
+def beside(box: Box, states: Box) -> Box:
+    """A box of the first states with the ends of another along all others: the constants of a system."""
+    n = box.dimension
+    return Box(torch.cat([box.lower, states.lower[n:]]), torch.cat([box.upper, states.upper[n:]]))
 
 
 def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:

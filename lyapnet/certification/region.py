@@ -4,16 +4,12 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
 
-from lyapnet.certification.boxes import faces
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum
-from lyapnet.certification.condition import DecreaseCondition, own_constraints
+from lyapnet.certification.condition import own_constraints
 from lyapnet.certification.contraction import Contraction, contraction_around
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.certification.funnel import (
@@ -26,9 +22,11 @@ from lyapnet.certification.funnel import (
     setting_of,
     share_of,
 )
-from lyapnet.certification.kept_regions import REMEDY, KeptRegion, kept_region
-from lyapnet.certification.preconditions import over_time
+from lyapnet.certification.kept_regions import KeptRegion, kept_region
+from lyapnet.certification.plants import Plants
+from lyapnet.certification.preconditions import at_centre, first_of
 from lyapnet.certification.proof import Progress, Proof
+from lyapnet.certification.receding_decrease import RecedingDecrease
 from lyapnet.certification.ultimate_bound import extent_of, ultimate_level
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.constraints import Constraints, names_of
@@ -37,7 +35,7 @@ from lyapnet.errors import UsageError
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
-from lyapnet.types import Corner, Corners, PerState, Points, State, Time, Value
+from lyapnet.types import Corner, Corners, Points, State, Value
 
 PER_HORIZON = 0.01  # λT, unless it is given
 
@@ -65,6 +63,9 @@ class RegionClaim:
     {x ∈ D: V(x) ≤ c} within ln(ρ/c)/λ, and stays there: practical stability, with c as the ultimate bound. No
     equilibrium is claimed, nor that any closed loop goes to the goal. {x ∈ D: V(x) ≤ c} lies in the box `extent`.
 
+    With plants, all of that holds for ẋ = F(x; p) with every constant p of a box P, where u and V see x alone: one set
+    and one V for all p at once, and one equilibrium for each p, in the hole, within `contraction.offset` of the goal.
+
     Outside B, F may jump: V̇ ≤ … holds of every value between, so that it is about Filippov's solutions.
 
     States that neither f, g, nor V and u depend on are left out: D is all of ℝ along them, and nothing is said of where
@@ -91,6 +92,7 @@ class RegionClaim:
     disturbance: State | None = None  # w in units of ẋ, (n,); None where nothing is pushed
     extent: Box | None = None  # around {x ∈ D: V(x) ≤ c}, with a disturbance and where ρ ≥ c; 0 along states left out
     ultimate_share: float = math.nan  # of D in {x ∈ D: V(x) ≤ c}; an upper bound
+    plants: Plants | None = None  # P; None where it is about one plant
 
     @property
     def entered_within(self) -> float:
@@ -102,11 +104,24 @@ class RegionClaim:
     @property
     def counterexample(self) -> Counterexample | None:
         """Where V does not fall, of lowest V."""
+        found = self._failure
+        return None if found is None else found._replace(x=found.x[: self.states.dimension])
+
+    @property
+    def failing_plant(self) -> dict[str, float]:
+        """The parameters with which it does not."""
+        if self._failure is None or self.plants is None:
+            return {}
+        return dict(zip(self.plants.nominal, self._failure.x[self.states.dimension :], strict=True))
+
+    @property
+    def _failure(self) -> Counterexample | None:
+        """The counterexample in (x, p)."""
         return None if self.proof is None else self.proof.counterexample
 
     @property
     def undecided(self) -> Points:
-        """Centres (t, x) of boxes that remain; all of them lie above ρ."""
+        """Centres (t, x), or (t, x, p), of boxes that remain; all of them lie above ρ."""
         return torch.zeros(0, 1 + self.states.dimension) if self.proof is None else self.proof.undecided
 
     @property
@@ -128,15 +143,20 @@ class RegionClaim:
         if self.disturbance is not None:
             return None if self.hole > 0 else (
                 "no levels c < ρ were found between which V(0, ·) falls whatever the pushes, so that nothing is left: "
-                "allow a smaller --disturbance, or a smaller --decay"
+                f"allow a smaller --disturbance, or a smaller --decay{self._or_narrow}"
             )  # fmt: skip
+        plants = "" if self.plants is None else " of all plants"
         if self.contraction is None and not self.slowest < 0:
             return (
-                f"u(0, x) does not hold the goal: linearised, an eigenvalue has the real part {self.slowest:.3g} 1/s; "
-                "weigh every state, train on a longer horizon, or from states all around the goal"
+                f"u(0, x) does not hold the goal{plants}: linearised, an eigenvalue has the real part "
+                f"{self.slowest:.3g} 1/s; weigh every state, train on a longer horizon, or from states all around the "
+                f"goal{self._or_narrow}"
             )
         if self.contraction is None:
-            return "no box around the goal was found on which u(0, x) is seen to contract, in the time for it"
+            return (
+                f"no box around the goal was found on which u(0, x){plants} is seen to contract, in the time for it"
+                f"{self._or_narrow}"
+            )
         if not self.hole > 0:
             return "V(0, ·) is not above 0 around the goal, or not seen to be in the time for it"
         return None
@@ -147,18 +167,23 @@ class RegionClaim:
         if self.verdict == "falsified" and self.disturbance is not None:
             return (
                 "V(0, ·) does not fall at the rate λ there, at a level above c, under the worst push: allow a smaller "
-                "--disturbance, or a smaller --decay"
+                f"--disturbance, or a smaller --decay{self._or_narrow}"
             )
         if self.verdict == "falsified":
             return (
                 "V(0, ·) does not fall at the rate λ there under u(0, ·): train on a longer horizon, or from states "
-                "all around it, or allow a smaller --decay"
+                f"all around it, or allow a smaller --decay{self._or_narrow}"
             )
         if self.proof is not None and self.proof.remaining_volume > 0:
             return "undecided boxes are left: allow more seconds; beside another equilibrium some always are"
         if self.rim <= self.wanted:
             return "the region meets the boundary of D or a constraint, as far as bounds tell: choose a larger set"
         return "V(0, ·) does not fall close to what X₀ needs"
+
+    @property
+    def _or_narrow(self) -> str:
+        """What else may help, where it is about a box of parameters."""
+        return "" if self.plants is None else ", or narrow --parameter"
 
     @property
     def volume(self) -> float:
@@ -175,72 +200,6 @@ class RegionClaim:
         return math.prod(w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out)
 
 
-class RecedingDecrease(DecreaseCondition):
-    """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially.
-
-    With a disturbance V̇ is at its worst, V_xᵀ(f + g u(0, x)) + Σ_i w_i |∂V/∂x_i|.
-    """
-
-    proves, partial = "region", True
-
-    def __init__(self, closed_loop: ClosedLoop, decay: float, disturbance: State | None = None):
-        super().__init__(closed_loop, 1.0, 0.0, disturbance=disturbance)
-        if not 0 < decay < math.inf:
-            raise UsageError(f"Expected decay > 0, got {decay}; give it in 1/s.")
-        self.decay, self.hole, self.around = decay, 0.0, None
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        B, w = self.around, self.disturbance
-        around = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
-        pushed = {} if w is None else {"disturbance": w.tolist()}
-        return {"decay": self.decay, "hole": self.hole, **around, **pushed}
-
-    def open_hole(
-        self, around: Contraction, seen: Sequence[int], level: float, budget: Budget, proposed: float | None = None
-    ) -> None:
-        """Ask nothing in {x ∈ B: V < c}, with c below V on the boundary of B, and at most a level.
-
-        Args:
-            proposed: the c that alone is tried.
-        """
-        rim = minimum(self.V, *faces(*over_time(around.box, 0.0), [1 + i for i in seen]), budget)
-        self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
-        if proposed is not None and not self.hole < rim:
-            raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
-        self.constraints = OutsideTheHole(self.V, around.box, self.hole)
-
-    def open_everywhere(self, level: float) -> None:
-        """Ask nothing in {x ∈ D: V < c}, where pushes may lift V."""
-        self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
-
-    def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
-        value, slope = self.V.value_and_state_gradient(t, x)
-        fall = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
-        if self.disturbance is not None:
-            fall = fall + self.worst_push(slope)
-        return fall + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), fall
-
-
-class OutsideTheHole(Constraints):
-    """h(x) > 0 where x ∈ B, or D without one, and V(0, x) < c: there V need not fall."""
-
-    names = ("outside the hole",)
-
-    def __init__(self, V: torch.nn.Module, box: Box | None, level: float):
-        super().__init__()
-        self.V, self.level, self.axes = V, level, []
-        if box is None:
-            return
-        ends = zip(box.center.tolist(), box.widths.tolist(), strict=True)
-        self.axes = [(i, middle, width / 2) for i, (middle, width) in enumerate(ends) if width > 0]
-
-    def forward(self, x: State) -> Tensor:
-        below = self.level - self.V(x.new_zeros(()), x)
-        within = [1 - 1e-9 - (x[..., i] - middle).abs() / reach for i, middle, reach in self.axes]
-        return reduce(torch.minimum, within, below)[..., None]
-
-
 def region_claim(
     closed_loop: ClosedLoop,
     problem: Problem,
@@ -252,6 +211,7 @@ def region_claim(
     keep: Path | None = None,
     replay: bool = False,
     disturbance: State | None = None,
+    plants: Plants | None = None,
 ) -> RegionClaim:
     """The largest region of attraction of the receding law that is a sublevel set of V(0, ·), as the budget allows.
 
@@ -262,6 +222,7 @@ def region_claim(
         states: D, around X₀; by default a box around {V(0, ·) ≤ max over X₀}.
         report, keep, replay: of prove. B, Y, c and ρ are those of the file that goes on, proved anew by bounds.
         disturbance: w, (n,): the claim is about every ẋ = F + w(t) with |w_i(t)| ≤ w_i; with w = 0 it is as without.
+        plants: P: the claim is about each of these plants under the law and V of the one plant.
 
     Raises:
         UsageError: λ, w or D do not fit, it is about a family, or the closed loop has an operator without a rule; or
@@ -271,33 +232,46 @@ def region_claim(
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if problem.system.constants:
         raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
+    n, names = problem.system.n, [] if plants is None else list(plants.nominal)
     decay = PER_HORIZON / problem.horizon.duration if decay is None else decay
-    w = _pushes(disturbance, problem)
-    condition = RecedingDecrease(copied(closed_loop).requires_grad_(False), decay, w)
+    w, loop = _pushes(disturbance, problem), copied(closed_loop).requires_grad_(False)
+    if plants is not None:
+        loop, problem = plants.all_of(loop, problem)
+        states, w = states and plants.around(states), None if w is None else plants.pushed(w)
+    condition = RecedingDecrease(loop, decay, w, names)
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
     setting = setting_of(condition, problem, 0.0, states, budget)
     left_out, X0, wanted, D, domain, sides, _ = setting
-    seen = [i for i in range(X0.dimension) if i not in left_out]
+    seen = [i for i in range(n) if i not in left_out]
+    if any(i >= n for i in left_out):
+        raise UsageError("Expected parameters that f or g depends on, got one that hides it; leave it out.")
     _require_inside(D, goal, seen)
     if kept is not None:
-        kept.require(decay, D, w)
+        kept.require(decay, D, w, names)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
     contraction, slowest, level = _open(condition, goal, setting, seen, rim, budget, kept)
-    proof, rho, extent, ultimate = None, -math.inf, None, math.nan
+    proof, rho = None, -math.inf
     if condition.hole > 0:
         proof = proof_within(
             condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay
         )
         rho = proof.level if proof.level >= condition.hole else rho
-    if w is not None and rho > -math.inf:
-        extent = extent_of(condition.V, D, condition.hole, _half(budget))
-        ultimate = 1 - share_of(lambda t, x: -condition.V(t, x), D.lower, D.upper, -condition.hole, _half(budget))
+    extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _end(condition, D, n, budget)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
-        decay, D, rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
+        decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
-        left_out, names_of(problem.constraints), w, extent, ultimate,
+        left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants,
     )  # fmt: skip
+
+
+def _end(condition: RecedingDecrease, states: Box, n: int, budget: Budget) -> tuple[Box, float]:
+    """(a box around {x ∈ D: V ≤ c}, the share of D in it, at most)."""
+    one = at_centre(states, range(n, states.dimension))  # V is the same for all plants
+    extent = extent_of(condition.V, one, condition.hole, _half(budget))
+    return first_of(extent, n), 1 - share_of(
+        lambda t, x: -condition.V(t, x), one.lower, one.upper, -condition.hole, _half(budget)
+    )
 
 
 def _pushes(disturbance: State | None, problem: Problem) -> State | None:
@@ -333,7 +307,7 @@ def _open(
     contraction, slowest = contraction_around(condition.closed_loop, goal, setting.states, seen, seconds, proposed)
     level = just_below(rim) if kept is None else kept.level(contraction is not None, rim)
     if contraction is not None:
-        condition.open_hole(contraction, seen, level, for_levels(budget), kept and kept.hole)
+        condition.open_hole(contraction, setting.states, seen, level, for_levels(budget), kept and kept.hole)
     return contraction, slowest, level
 
 

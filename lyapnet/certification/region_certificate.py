@@ -13,9 +13,11 @@ from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
 from lyapnet.certification.condition import DecreaseCondition
+from lyapnet.certification.plants import parse_parameters, plants_of
 from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.proof import Progress
-from lyapnet.certification.region import OutsideTheHole, RecedingDecrease, RegionClaim, region_claim
+from lyapnet.certification.receding_decrease import OutsideTheHole, RecedingDecrease
+from lyapnet.certification.region import RegionClaim, region_claim
 from lyapnet.certification.sound_certificate import (
     however_pushed,
     listed,
@@ -28,6 +30,7 @@ from lyapnet.contracts import copied
 from lyapnet.controller import Controller
 from lyapnet.policy import ValuePolicy
 from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.types import Corner
 
 NEARLY = 0.999  # of the least V on the boundary of D: a region that comes so close is as large as D lets it be
@@ -36,7 +39,7 @@ PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the re
 
 class RegionCertificate(Certificate):
     """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium; with a
-    disturbance, to a smaller set around the goal, which none leaves.
+    disturbance, to a smaller set around the goal, which none leaves. With plants, that is so for each of them.
     """
 
     kind: ClassVar[str] = "region"
@@ -52,6 +55,8 @@ class RegionCertificate(Certificate):
         "rho": "largest ρ proved",
         "rim": "V(0, ·) on the boundary of D and of constraints, at least",
         "decay": "λ, 1/s",
+        "parameters": "parameters of the plant, constant, anywhere in",
+        "nominal_parameters": "those that V and u were made for",
         "disturbance": "disturbances, at most",
         "ultimate_level": "c, V(0, ·) from some time on, at most",
         "ultimate_volume": "volume of {V(0, ·) ≤ c}, at most",
@@ -79,11 +84,20 @@ class RegionCertificate(Certificate):
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
         """The condition in plain arithmetic, {0} × D, and the level up to which it was to hold."""
         claim = self.claim
-        condition = RecedingDecrease(copied(self.controller.closed_loop), claim.decay, claim.disturbance)
+        loop, states, w = self._loop, claim.states, claim.disturbance
+        if claim.plants is not None:
+            states, w = claim.plants.around(states), None if w is None else claim.plants.pushed(w)
+        condition = RecedingDecrease(loop, claim.decay, w)
         if claim.hole > 0:
             around = None if claim.contraction is None else claim.contraction.box
             condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
-        return condition, over_time(claim.states, 0.0), claim.rim
+        return condition, over_time(states, 0.0), claim.rim
+
+    @property
+    def _loop(self) -> ClosedLoop:
+        """The closed loop in float64; of all plants, where the claim is about several."""
+        own, plants = copied(self.controller.closed_loop), self.claim.plants
+        return own if plants is None else plants.all_of(own, copied(self.controller.problem))[0]
 
     def numbers(self) -> dict[str, Any]:
         claim, names, found = self.claim, self.controller.system.state_names, self.claim.counterexample
@@ -93,7 +107,10 @@ class RegionCertificate(Certificate):
             "contraction_rate": B.rate, "equilibrium_offset": B.offset,
             "contraction_coordinates": B.coordinates.tolist(), "contraction_fingerprint": B.fingerprint,
         }  # fmt: skip
+        plants = claim.plants
         pushed = {} if claim.disturbance is None else {"disturbance": self.pushes}
+        if plants is not None:
+            pushed |= {"parameters": plants.ranges, "nominal_parameters": dict(plants.nominal)}
         if claim.extent is not None:
             pushed |= {
                 "ultimate_level": claim.hole, "ultimate_volume": claim.ultimate_volume,
@@ -109,7 +126,9 @@ class RegionCertificate(Certificate):
             "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
             "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
             "constraints": list(claim.constraints) if proved else [],
-            "counterexample": found and {"x": found.x, "condition": found.condition, "V": found.height},
+            "counterexample": found and {
+                "x": found.x, **claim.failing_plant, "condition": found.condition, "V": found.height
+            },
             "seconds": claim.seconds, **around, **pushed, **searched,
             **({"origin": self._origin} if self._origin else {}),
         }  # fmt: skip
@@ -123,8 +142,8 @@ class RegionCertificate(Certificate):
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         origin = f" {self._origin}" * bool(self._origin)
         return (
-            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)} The volume of the region is "
-            f"at least {claim.volume:.6g}, in the units of the states; it holds at "
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)}{self._of_plants} The "
+            f"volume of the region is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
             f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
             f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
@@ -133,11 +152,16 @@ class RegionCertificate(Certificate):
     def _end(self, kept: str) -> str:
         """What the region is, and where closed loops end."""
         claim, B, pushed = self.claim, self.claim.contraction, however_pushed(self.pushes)
+        plants, equilibrium = "for this model", "one equilibrium exponentially, for ever,"
+        if claim.plants is not None:
+            ends = ", ".join(f"{name} ∈ [{low!r}, {high!r}]" for name, (low, high) in claim.plants.ranges.items())
+            plants = f"for each plant of this model with constant {ends}"
+            equilibrium = "one equilibrium of their plant exponentially, for ever,"
         if B is not None:
             return (
-                f"is a region of attraction of the receding law u(0, x), proved in continuous time for this model: no "
-                f"closed loop that starts in it leaves it{kept}, and all go to one equilibrium exponentially, for "
-                f"ever, which is within {B.offset:.3g} of the goal (in the norm of x)."
+                f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants}: no "
+                f"closed loop that starts in it leaves it{kept}, and all go to {equilibrium} "
+                f"which is within {B.offset:.3g} of the goal (in the norm of x)."
             )
         assert claim.extent is not None
         names, (lower, upper) = (
@@ -147,12 +171,20 @@ class RegionCertificate(Certificate):
         seen = [i for i in range(len(names)) if i not in claim.left_out]
         within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
         return (
-            f"is never left under the receding law u(0, x), proved in continuous time for this model, {pushed}: no "
+            f"is never left under the receding law u(0, x), proved in continuous time {plants}, {pushed}: no "
             f"closed loop that starts in it leaves it{kept}, and each comes to {{x ∈ D: V(0, x) ≤ c}}, c = "
             f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
             f"ultimate bound). That set lies in {within}. That closed loops come closer to the goal, or to rest, is "
             f"not claimed."
         )
+
+    @property
+    def _of_plants(self) -> str:
+        """What u and V know of the plants."""
+        if self.claim.plants is None:
+            return ""
+        made_for = ", ".join(f"{name} = {value!r}" for name, value in self.claim.plants.nominal.items())
+        return f" u and V are those made for {made_for}: they are not told which plant it is."
 
     @property
     def pushes(self) -> dict[str, float]:
@@ -168,13 +200,16 @@ class RegionCertificate(Certificate):
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction
         rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
+        each = ""
+        if claim.plants is not None:
+            each = f", for each p = ({', '.join(claim.plants.nominal)}) ∈ P = {[*claim.plants.ranges.values()]}"
         inside = f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''}"
         if self.pushes:
             c = repr(claim.hole) if claim.hole > 0 else "c"
             w = ", ".join(f"w({name}) = {w!r}" for name, w in self.pushes.items())
             return [
                 f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
-                f"at each x ∈ D with {c} ≤ V ≤ {rho}",
+                f"at each x ∈ D with {c} ≤ V ≤ {rho}{each}",
                 inside,
             ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
@@ -182,10 +217,10 @@ class RegionCertificate(Certificate):
         Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
             f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
-            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}",
+            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{each}",
             f"{inside},  V > {hole} > 0 on the boundary of {box}",
             f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
-            f"continuous; {Y}",
+            f"continuous{each}; {Y}",
         ]
 
     def of_the_verdict(self) -> str:
@@ -196,7 +231,8 @@ class RegionCertificate(Certificate):
             f"(closed loops may {'stay in it' if self.pushes else 'go to the goal'} even so)",
             "unknown": self.claim.reason,
         }[self.verdict]
-        where = "" if found is None else f" At x = {listed(found.x)} it fails by {found.condition:.3g}."
+        plant = "".join(f", {name} = {value:.6g}" for name, value in self.claim.failing_plant.items())
+        where = "" if found is None else f" At x = {listed(found.x)}{plant} it fails by {found.condition:.3g}."
         but = f" but for {{V < {self.claim.hole!r}}}" if self.pushes and self.claim.hole > 0 else ""
         return (
             f"The verdict is on the claim that a sublevel set on which V falls so{but} holds all of X₀: {why}.{where}"
@@ -210,20 +246,26 @@ class RegionCertificate(Certificate):
         )
 
     def _paths(self) -> Tensor | None:
-        """Closed loops of the receding law over T from states just inside a region of two, (times, k, n)."""
+        """Closed loops of the receding law over T from states just inside a region of two, (times, k, n); each of a
+        plant of its own, where it is about several.
+        """
         claim, loop, horizon = self.claim, self.controller.closed_loop, self.controller.horizon
-        if claim.states.dimension - len(claim.left_out) != 2:  # elsewhere they would not lie in the slice
+        n, generator = claim.states.dimension, stream(0, CERTIFICATION)
+        if n - len(claim.left_out) != 2:  # elsewhere they would not lie in the slice
             return None
-        x = claim.states.sample(20_000, stream(0, CERTIFICATION)).to(claim.states.lower)
+        x = claim.states.sample(20_000, generator).to(claim.states.lower)
         t = x.new_zeros(())
         with torch.no_grad():
             share = self.controller.V(t, x) / claim.rho
             x0 = x[(share <= 1) & (share > 1 - EDGE)][:PATHS]
             if not len(x0):
                 return None
+            if claim.plants is not None:
+                loop = self._loop
+                x0 = torch.cat([x0, claim.plants.box.sample(len(x0), generator).to(x0)], -1)
             times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
             paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
-        return torch.as_tensor(paths)
+        return torch.as_tensor(paths)[..., :n]
 
 
 def region_certificate(
@@ -237,6 +279,7 @@ def region_certificate(
     keep: str | None = None,
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
+    parameter: Sequence[str] | None = None,
     *,
     started: float | None = None,
 ) -> RegionCertificate:
@@ -249,6 +292,7 @@ def region_certificate(
         disturbance: STATE=w for each ẋ_i that is pushed by at most w.
         keep: a file in which the proof is kept, and from which it goes on.
         report: is told how far the proof is.
+        parameter: NAME=lower:upper for each parameter of the plant that may lie anywhere between.
         started: time.monotonic() from which the seconds count; now if None.
     """
     budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
@@ -256,9 +300,11 @@ def region_certificate(
         controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
         stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
         disturbance=parse_disturbance(disturbance or (), controller),
+        plants=plants_of(controller, parse_parameters(parameter)) if parameter else None,
     )  # fmt: skip
     options = {
         "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
+        "disturbance": list(disturbance or ()) or None, "parameter": list(parameter or ()) or None, "keep": keep,
+        "seed": seed,
     }  # fmt: skip
     return RegionCertificate(controller, claim, options)

@@ -1,9 +1,11 @@
 """Where pushes that do not fade keep closed loops: the level of V above which it falls whatever they are."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from lyapnet.certification.boxes import Boxes, single
+from lyapnet.certification.boxes import Boxes, pieces, single
 from lyapnet.certification.branch_and_bound import Budget, Question, axis_to_cut, minimum, searched
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.preconditions import at_time
@@ -14,6 +16,7 @@ from lyapnet.types import Corner, PerState, State, Time, Value
 SAMPLES, SCALES = 5_000, 10  # states of D, and boxes that are drawn from, each half as large around the goal
 ROOM = 0.01  # above the highest level at which V may rise, and around a hull: bounds decide nothing on the very edge
 FEW = 0.003  # of what is below the highest level: what falls between two levels by chance
+PIECES = 16  # of the box of the constants, about
 LEAST = 1e-6  # of the levels that are tried, where V rises nowhere
 
 
@@ -23,14 +26,16 @@ def ultimate_level(
     """The least c that is found with V̇ + λV ≤ 0 at c ≤ V ≤ some ρ, 1 % above it; 0 where there is none.
 
     Samples say between which two levels the condition is to hold. Under the middle of these, the highest V at which it
-    may fail is bounded from above. Whether it holds from there on is for a proof to say.
+    may fail is bounded from above, on pieces of the constants' box. Whether it holds from there on is for a proof to
+    say.
 
     Args:
         condition: V̇ + λV, at V > 0.
-        domain: {0} × D.
+        domain: {0} × D, and the box of the constants.
         level: no ρ is higher.
     """
-    between = _longest_fall(condition, domain, goal, level)
+    constants = condition.closed_loop.system.constants
+    between = _longest_fall(condition, domain, goal, level, constants)
     if between is None:
         return 0.0
     V, middle = condition.V, sum(between) / 2
@@ -39,16 +44,20 @@ def ultimate_level(
         """At most 0 where the condition fails under the middle, or is 0."""
         return torch.maximum(-condition(t, x), V(t, x) - middle)
 
-    lower, upper = (side[None] for side in domain)
+    lower, upper = pieces(*domain, [1 + i for i in constants], PIECES)
     highest = -minimum(lambda t, x: -V(t, x), lower, upper, budget, possible, 0.0)
     return min(middle, max((1 + ROOM) * highest, LEAST * middle))
 
 
 def _longest_fall(
-    condition: DecreaseCondition, domain: tuple[Corner, Corner], goal: State, level: float
+    condition: DecreaseCondition,
+    domain: tuple[Corner, Corner],
+    goal: State,
+    level: float,
+    constants: Sequence[int],
 ) -> tuple[float, float] | None:
     """The two levels between which V falls at all samples and there is most of D; None where that is little."""
-    x, weight = _samples(*domain, goal)
+    x, weight = _samples(*domain, goal, constants)
     with torch.no_grad():
         t = x.new_zeros(len(x))
         value, falls = condition.height(t, x), condition(t, x) < 0
@@ -61,12 +70,14 @@ def _longest_fall(
     return (float(rises[above - 1]), float(rises[above])) if enough else None
 
 
-def _samples(lower: Corner, upper: Corner, goal: State) -> tuple[Tensor, Tensor]:
+def _samples(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]) -> tuple[Tensor, Tensor]:
     """(x, weights): states of D, and of boxes ever smaller around the goal, where levels are close to each other."""
     share = torch.rand(SAMPLES, len(goal), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     x = lower[1:] + (upper - lower)[1:] * share
     scales = 0.5 ** torch.arange(SCALES, dtype=torch.float64)
-    return (goal + scales[:, None, None] * (x - goal)).reshape(-1, len(goal)), scales.repeat_interleave(SAMPLES)
+    closer = goal + scales[:, None, None] * (x - goal)
+    closer[..., [*constants]] = x[:, [*constants]].expand(SCALES, -1, -1)
+    return closer.reshape(-1, len(goal)), scales.repeat_interleave(SAMPLES)
 
 
 def extent_of(V: Value, states: Box, level: float, budget: Budget) -> Box:

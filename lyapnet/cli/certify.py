@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup, TyperOption
 
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.options import Debug, Given, Parameter, of_a_controller
 from lyapnet.cli.refining import refined, require_refinable
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.sizes import THREADS
@@ -278,6 +278,7 @@ def region(
             metavar="STATE=W",
         ),
     ] = None,
+    parameter: Parameter = None,
     keep: Keep = None,
     refine: Refine = 0,
     seed: Seed = 0,
@@ -290,8 +291,9 @@ def region(
     begun = time.monotonic()
     require_refinable(refine, overrides, keep, given)
     several = any("," in each for each in disturbance or ())
-    if refine and (several or value or law):
-        raise UsageError("Expected --refine with one checkpoint and one disturbance, got several or --value; drop it.")
+    if refine and (several or value or law or parameter):
+        got = "--parameter" if parameter else "several or --value"
+        raise UsageError(f"Expected --refine with one checkpoint and one disturbance, got {got}; drop it.")
     if several and (keep is not None or report is not None):
         raise UsageError("Expected one disturbance with --keep or --report, got several; name one for each.")
     from lyapnet.certification.disturbances.regions import regions_under_pushes
@@ -308,16 +310,18 @@ def region(
     if several:
         controller = given.load()
         with proof_progress(notes, "region") as progress:
-            regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress)
+            regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress, parameter)
         return _show_several(regions, given, as_json, figure)
 
     def certified(path: Path, started: float | None = None) -> Any:
         started, found = started or time.monotonic(), given.of(path)
         controller = found.load()
         with proof_progress(notes, "region") as progress:
-            certificate = region_certificate(controller, *options, disturbance, keep, seed, progress, started=started)
-        _show(certificate, found, as_json)
-        return certificate
+            made = region_certificate(
+                controller, *options, disturbance, keep, seed, progress, parameter, started=started
+            )
+        _show(made, found, as_json)
+        return made
 
     given, certificate = refined(given, certified, refine, overrides, begun)
     return _write(certificate, given, as_json, figure, report)

@@ -25,6 +25,13 @@ At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
 ]
+Parameter = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A parameter of the plant that may lie anywhere between; u and V stay. May be given again.",
+        metavar="NAME=LOWER:UPPER",
+    ),
+]
 OWN = {
     "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",
     "constraints": "constraints", "program": "a program",

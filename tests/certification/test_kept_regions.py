@@ -11,7 +11,7 @@ from lyapnet.certification.checking import check, kept_funnel
 from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.funnel import setting_of
 from lyapnet.certification.kept_regions import KeptRegion
-from lyapnet.certification.region import OutsideTheHole, RecedingDecrease
+from lyapnet.certification.receding_decrease import OutsideTheHole, RecedingDecrease
 from lyapnet.certification.region_certificate import region_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.certification.two_sided_certificate import two_sided_certificate
@@ -307,7 +307,7 @@ def test_a_funnel_is_no_region(kept, tmp_path):
     assert check(about, funnel)["of"] == "sound"
 
 
-def believing_c(self, around, seen, level, budget, proposed=None):
+def believing_c(self, around, states, seen, level, budget, proposed=None):
     self.around, self.hole = around, proposed
     self.constraints = OutsideTheHole(self.V, around.box, proposed)
 

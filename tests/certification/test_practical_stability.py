@@ -12,7 +12,7 @@ from lyapnet.certification.checking import check
 from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.disturbances.regions import parse_pushes, regions_under_pushes
 from lyapnet.certification.funnel import setting_of
-from lyapnet.certification.region import RecedingDecrease
+from lyapnet.certification.receding_decrease import RecedingDecrease
 from lyapnet.certification.region_certificate import RegionCertificate, region_certificate
 from lyapnet.cli import main
 from lyapnet.constraints import StateLimits

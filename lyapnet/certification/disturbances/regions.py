@@ -46,6 +46,7 @@ def regions_under_pushes(
     device: str = "cpu",
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
+    parameter: Sequence[str] | None = None,
 ) -> RegionsUnderPushes:
     """The claims for STATE=w,w,…, each within its own seconds; all else is as of one region.
 
@@ -54,7 +55,9 @@ def regions_under_pushes(
     """
     state, pushes = parse_pushes(disturbance, controller)
     certificates = [
-        region_certificate(controller, decay, set, seconds, workers, device, [f"{state}={w!r}"], None, seed, report)
+        region_certificate(
+            controller, decay, set, seconds, workers, device, [f"{state}={w!r}"], None, seed, report, parameter
+        )
         for w in pushes
     ]
     return RegionsUnderPushes(controller, state, pushes, certificates)

@@ -243,18 +243,15 @@ def region_claim(
     setting = setting_of(condition, problem, 0.0, states, budget)
     left_out, X0, wanted, D, domain, sides, _ = setting
     seen = [i for i in range(n) if i not in left_out]
-    if any(i >= n for i in left_out):
-        raise UsageError("Expected parameters that f or g depends on, got one that hides it; leave it out.")
-    _require_inside(D, goal, seen)
+    _require_inside(D, goal, seen, left_out, n)
     if kept is not None:
         kept.require(decay, D, w, names)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
     contraction, slowest, level = _open(condition, goal, setting, seen, rim, budget, kept)
     proof, rho = None, -math.inf
     if condition.hole > 0:
-        proof = proof_within(
-            condition, domain, level, budget, generator=generator, report=report, keep=keep, replay=replay
-        )
+        options = {"generator": generator, "report": report, "keep": keep, "replay": replay}
+        proof = proof_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _end(condition, D, n, budget)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
@@ -316,8 +313,10 @@ def _half(budget: Budget) -> Budget:
     return Budget(budget.left / 2, chunk=budget.chunk)
 
 
-def _require_inside(states: Box, goal: State, seen: Sequence[int]) -> None:
-    """Refuse a D that has not the goal in its interior."""
+def _require_inside(states: Box, goal: State, seen: Sequence[int], left_out: Sequence[int], n: int) -> None:
+    """Refuse a D that has not the goal in its interior, and parameters, which follow n states, that are left out."""
+    if any(i >= n for i in left_out):
+        raise UsageError("Expected parameters that f or g depends on, got one that hides it; leave it out.")
     for i in seen:
         if not states.lower[i] < goal[i] < states.upper[i]:
             raise UsageError(

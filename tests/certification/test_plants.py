@@ -23,7 +23,6 @@ from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem, DoubleIntegrator, Pendulum
 from tests.certification.planted import cost, riccati, stationary
 from tests.problems import Formula, problem_of
-from tests.runs import tiny_checkpoint
 
 LAMBDA = 0.01 / 2  # 1 % of 1/T
 K0 = 2.0  # u = −K0 x of V = x² with R = ½, g = 1
@@ -93,9 +92,9 @@ def spring():
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """Volumes are not what most tests are about; few sizes of B."""
+    """Volumes are not what these tests are about; one size of B, as these laws are linear."""
     monkeypatch.setattr(region, "share_of", lambda *_: 0.5)
-    monkeypatch.setattr(contraction, "SIZES", 3)
+    monkeypatch.setattr(contraction, "SIZES", 1)
 
 
 def claimed(controller, ranges, states=None, boxes=3000, **options):
@@ -108,8 +107,9 @@ def claimed(controller, ranges, states=None, boxes=3000, **options):
 
 @cache
 def springs():
-    """Of mass 0.9 to 1.1 and stiffness −½ to ½."""
-    return claimed(spring(), {"mass": [0.9, 1.1], "stiffness": [-0.5, 0.5]})
+    """0.9 of the stiffness with which V = xᵀPx falls."""
+    stiff, soft = (edge(lambda k: excess(1.0, k), 0.0, far) for far in (9.0, -9.0))
+    return claimed(spring(), {"stiffness": [0.9 * soft, 0.9 * stiff]})
 
 
 # Closed forms
@@ -139,8 +139,7 @@ def edge(function, inside, outside):
 
 
 def test_of_two_states_the_largest_interval_is_that_of_the_matrix_inequality():
-    stiff, soft = (edge(lambda k: excess(1.0, k), 0.0, far) for far in (9.0, -9.0))
-    assert claimed(spring(), {"stiffness": [0.95 * soft, 0.95 * stiff]}).verdict == "certified"
+    assert springs().verdict == "certified"
     mass = edge(lambda m: excess(m, 0.0), 1.0, 9.0)
     assert claimed(spring(), {"mass": [1.0, 1.01 * mass]}).rho == -math.inf
 
@@ -151,7 +150,6 @@ def test_where_the_equilibrium_moves_it_says_how_far():
     assert claim.verdict == "certified"
     assert 0.2 / 3 <= claim.contraction.offset < 1.01 * 0.2 / 3
     assert claim.hole > (0.2 / (3 - LAMBDA / 2)) ** 2
-    assert claimed(leaky(), {"drift": [-0.1, 9.0]}).rho == -math.inf, "it rests outside of D"
 
 
 def test_with_pushes_the_ultimate_bound_is_that_of_the_worst_plant():
@@ -170,8 +168,8 @@ def words(controller, claim):
 
 
 def test_without_width_the_claim_is_that_of_the_one_plant():
-    one, other = claimed(spring(), {}), claimed(spring(), {"mass": [1.0, 1.0]})
-    assert other.plants.ranges == {"mass": [1.0, 1.0]}
+    one, other = claimed(leaky(), {}), claimed(leaky(), {"gain": [1.0, 1.0]})
+    assert other.plants.ranges == {"gain": [1.0, 1.0]}
     for name in ("rho", "hole", "rim", "wanted", "slowest"):
         assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-6)
     assert (other.verdict, other.proof.boxes) == (one.verdict, one.proof.boxes) == ("certified", one.proof.boxes)
@@ -182,21 +180,19 @@ def test_without_width_the_claim_is_that_of_the_one_plant():
 
 
 def test_no_plant_leaves_and_each_goes_to_the_goal():
-    """From the region's edge, at the corners of P and in it."""
+    """From the region's edge, at the ends of P and in it."""
     claim, about = springs(), spring()
-    assert claim.verdict == "certified"
     angle = torch.linspace(0, 2 * math.pi, 25)
     x = torch.stack([angle.cos(), angle.sin()], -1)
     V, t = about.V, torch.zeros(())
     x = x * (claim.rho / V(t, x)).sqrt()[:, None] * (1 - 1e-9)
     box = claim.plants.box
     p = torch.cat([box.corners(), box.sample(8, torch.Generator().manual_seed(0))])
-    x, p = (part.reshape(-1, 2) for part in torch.broadcast_tensors(x[:, None], p[None]))
-    mass, stiffness = p.unbind(-1)
-    before, dt = V(t, x), 1e-2
-    for _ in range(2500):
+    x, stiffness = x.repeat_interleave(len(p), 0), p[:, 0].repeat(len(x))
+    before, dt = V(t, x), 2e-2
+    for _ in range(5000):
         force = -(x @ torch.from_numpy(riccati())[1]) - stiffness * x[:, 0]
-        x = x + dt * torch.stack([x[:, 1], force / mass], -1)
+        x = x + dt * torch.stack([x[:, 1], force], -1)
         assert (V(t, x) <= before.clamp(min=1e-12)).all()
         before = V(t, x)
     assert x.norm(dim=-1).max() < 1e-5
@@ -291,8 +287,8 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     assert (result["verdict"], result["reason"], result["rho"]) == ("certified", None, certificate.result["rho"])
     assert result["parameters"] == {"gain": [2.0, 3.0]}
     whole = path.read_bytes()
-    for others, of in ((["gain=2:3.1"], "parameters"), ([], "parameters"), (["decay=2:3"], "parameters")):
-        with pytest.raises(UsageError, match=f"Expected the {of} of .*, got others; take another file"):
+    for others in (["gain=2:3.1"], []):
+        with pytest.raises(UsageError, match=r"Expected the parameters of .*, got others; take another file"):
             region_certificate(at, **{**options, "parameter": others}, keep=str(path))
     for name, (change, word) in EDITS.items():
         path.write_bytes(whole)
@@ -393,18 +389,11 @@ def test_a_set_of_other_states_and_a_family_are_refused():
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (["mass=0.9:1.1"], "Expected DoubleIntegrator.f or g to read mass"),
-        (
-            ["mass=0.9:1.1", "--refine", "1"],
-            "Expected --refine with one checkpoint and one disturbance, got --parameter",
-        ),
+        ([], "Expected DoubleIntegrator.f or g to read mass"),
+        (["--refine", "1"], "Expected --refine with one checkpoint and one disturbance, got --parameter"),
+        (["--disturbance", "velocity=0,1"], "Expected DoubleIntegrator.f or g to read mass"),
     ],
 )
-def test_the_command_says_so_in_a_line(options, expected, checkpoint, capsys):
-    assert main(["certify", "region", str(checkpoint), "--parameter", *options]) == 2
+def test_the_command_says_so_in_a_line(options, expected, capsys):
+    assert main(["certify", "region", "zoo:double_integrator", "--parameter", "mass=0.9:1.1", *options]) == 2
     assert expected in capsys.readouterr().err
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    return tiny_checkpoint(tmp_path_factory.mktemp("logs"))

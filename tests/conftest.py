@@ -3,7 +3,6 @@
 import functools
 import inspect
 import os
-from collections import Counter
 
 os.environ["MPLBACKEND"] = "Agg"
 
@@ -13,23 +12,25 @@ import pytest
 import torch
 
 CHECKED_CALLS = 50  # of each function in each file; with all of them the tests take three times as long
-_calls = Counter()
+_calls: dict[int, list[int]] = {}  # [number] of each piece of code
 
 
 def _checked_at_first(typechecker):
     """jaxtyping's decorator, in effect for the first calls of a function in each file of tests."""
 
     def decorate(function):
-        if not inspect.isfunction(function):
-            return _jaxtyped(function, typechecker=typechecker)
+        if inspect.isclass(function):
+            if "__dataclass_params__" in vars(function):  # whose fields are what its __init__ takes
+                function.__init__ = decorate(function.__init__)
+            return function
         if function.__name__ == "__torch_function__":  # of a mode, through which users' errors pass: no line of theirs
             return function
+        count = _calls.setdefault(id(function.__code__), [0])
 
         @functools.wraps(function)
         def call(*arguments, **options):
-            _calls[function.__code__] += 1
-            few = _calls[function.__code__] <= CHECKED_CALLS
-            return (checked() if few else function)(*arguments, **options)
+            count[0] += 1
+            return (checked() if count[0] <= CHECKED_CALLS else function)(*arguments, **options)
 
         # Only when called: a function within a function is made anew each time, and most of these are not checked.
         checked = functools.cache(lambda: _jaxtyped(function, typechecker=typechecker))
@@ -69,7 +70,8 @@ def _cache(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def _checked_anew():
-    _calls.clear()
+    for count in _calls.values():
+        count[0] = 0
     _float64_and_seed_0()  # for what a file makes once
 
 

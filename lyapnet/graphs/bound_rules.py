@@ -1,5 +1,6 @@
 """Rules for bounds: what each operator of a graph does with Taylor forms."""
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -139,7 +140,12 @@ def _negate(x: TaylorForm) -> TaylorForm:
 @rule(aten.sum.default, aten.sum.dim_IntList)
 def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
     """Σ x over some axes; remainders add."""
-    return _rearranged(lambda y: y.sum(dim or None, keepdim), x.rounded(x.shape.numel()))
+    x, rank = x.rounded(x.shape.numel()), len(x.shape)
+    if not rank:
+        return x
+    axes = [axis % rank for axis in dim or range(rank)]
+    radius = x.radius.sum([axis + 1 for axis in axes], keepdim)
+    return x.with_parts(x.terms.sum([axis + 2 for axis in axes], keepdim), radius)
 
 
 @rule(aten.mean.default, aten.mean.dim)
@@ -248,6 +254,29 @@ def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) 
     return [forms[0].with_parts(y.unflatten(0, counts), r) for y, r in zip(terms, radius, strict=True)]
 
 
+def _along(function: Callable[..., Any], new: int = 0) -> Rule:
+    """As _arranging, of an operator that takes an axis and may add one: without the detour through vmap."""
+
+    def arrange(x: TaylorForm, dim: int = 0, *rest: Any) -> TaylorForm:
+        axis = dim % (len(x.shape) + new)
+        return x.with_parts(function(x.terms, axis + 2, *rest), function(x.radius, axis + 1, *rest))
+
+    return arrange
+
+
+def _expand(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
+    x = x.as_rank(len(size))
+    return x.with_parts(x.terms.expand(-1, -1, *size), x.radius.expand(-1, *size))
+
+
+def _view(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
+    if -1 in size:  # which torch does not know of no boxes
+        others = -math.prod(size)
+        size = [x.shape.numel() // others if length == -1 else length for length in size]
+    counts = x.terms.shape[:2]
+    return x.with_parts(x.terms.reshape(*counts, *size), x.radius.reshape(*counts[1:], *size))
+
+
 def _joining(function: Callable[..., Any]) -> Rule:
     """As _arranging, of a list in which constants stand beside forms."""
 
@@ -263,14 +292,16 @@ ARRANGEMENTS: dict[Any, Rule] = {
     **{
         operation: _arranging(operation)
         for operation in (
-            aten.expand.default, aten.permute.default, aten.t.default, aten.transpose.int,
-            aten.unsqueeze.default, aten.squeeze.default, aten.squeeze.dim, aten.squeeze.dims, aten.select.int,
-            aten.slice.Tensor, aten.index.Tensor, aten.select_backward.default, aten.unbind.int,
+            aten.permute.default, aten.t.default, aten.transpose.int, aten.squeeze.default, aten.squeeze.dim,
+            aten.squeeze.dims, aten.index.Tensor, aten.select_backward.default, aten.unbind.int,
             aten.slice_backward.default, aten.split.Tensor, aten.flip.default,
             aten.diagonal.default, aten.diag_embed.default,
         )
     },
-    **{operation: _arranging(aten.reshape.default) for operation in (aten.view.default, aten._unsafe_view.default)},
+    **{operation: _along(operation) for operation in (aten.select.int, aten.slice.Tensor)},
+    aten.unsqueeze.default: _along(aten.unsqueeze.default, new=1),
+    **dict.fromkeys((aten.view.default, aten._unsafe_view.default), _view),
+    aten.expand.default: _expand,
     aten.cat.default: _joining(aten.cat.default),
     aten.stack.default: _joining(aten.stack.default),
     operator.getitem: operator.getitem,

@@ -9,8 +9,8 @@ import torch
 from lyapnet.certification import Budget, kept_proofs, region_claim
 from lyapnet.certification.checking import check, kept_funnel
 from lyapnet.certification.condition import bounded_condition
-from lyapnet.certification.funnel import setting_of
 from lyapnet.certification.kept_regions import KeptRegion
+from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.receding_decrease import OutsideTheHole, RecedingDecrease
 from lyapnet.certification.region_certificate import region_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
@@ -31,7 +31,7 @@ def V_of(factor=1.0):
 
 def claimed(path, boxes=4000, V=None, decay=None, states=D):
     V = V_of() if V is None else V
-    return region_claim(loop_of(V, ABOUT), ABOUT, decay, states, Budget(100, boxes, chunk=32), keep=path)
+    return region_claim(loop_of(V, ABOUT), ABOUT, decay, states, Budget(100, boxes, chunk=256), keep=path)
 
 
 def checked(path, V=None):
@@ -66,7 +66,7 @@ def of_itself(content):
     of = content["of"][0]
     states = Box(of["lower"][1:], of["upper"][1:]).double()
     condition = RecedingDecrease(loop_of(V_of(), ABOUT).double().requires_grad_(False), of["decay"])
-    domain = setting_of(condition, ABOUT, 0.0, states, Budget(5)).domain
+    domain = over_time(states, 0.0)
     condition.hole = of["hole"]
     condition.constraints = OutsideTheHole(condition.V, Box(*map(torch.tensor, of["box"])), condition.hole)
     of["fingerprint"] = bounded_condition(condition, domain).fingerprint

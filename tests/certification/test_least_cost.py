@@ -39,7 +39,7 @@ def problem(controls=None, cost=None, system=None):
 def claimed(V=None, about=None, beta=0.95, delta=0.02, states=None, boxes=6000, **options):
     about = about or problem()
     loop = ClosedLoop(about, HJBPolicy(about, stationary(riccati()) if V is None else V))
-    return lower_claim(loop, about, beta, delta, states, Budget(100, boxes, chunk=256), **options)
+    return lower_claim(loop, about, beta, delta, states, Budget(100, boxes, chunk=512), **options)
 
 
 @cache
@@ -175,7 +175,7 @@ def test_r_has_to_be_positive_definite_where_it_is_asked():
         problem(cost=cost),
     )  # fmt: skip
     domain = torch.tensor([0.0, 0.2, -0.5]), torch.tensor([DURATION, 1.0, 0.5])
-    proof = prove(condition, domain, 1.0, Budget(5, 3000, chunk=256))
+    proof = prove(condition, domain, 1.0, Budget(5, 3000, chunk=512))
     assert proof.verdict != "certified"
 
 
@@ -268,7 +268,7 @@ def test_about_a_target():
     box = Box(target + X0().lower, target + X0().upper).double()
     about = problem_of(DoubleIntegrator(), cost, STEPS, DURATION / STEPS, box)
     V = Formula(lambda t, x: optimum(x - target) + 0 * t)
-    claim = lower_claim(ClosedLoop(about, HJBPolicy(about, V)), about, 0.95, 0.02, budget=Budget(100, 6000, chunk=256))
+    claim = lower_claim(ClosedLoop(about, HJBPolicy(about, V)), about, 0.95, 0.02, budget=Budget(100, 6000, chunk=512))
     assert claim.verdict == "certified"
     assert claim.everywhere
     assert claim.level == pytest.approx(plain_claim().level, rel=1e-2)

@@ -11,7 +11,7 @@ from lyapnet.certification import Budget, kept_proofs, region, region_claim
 from lyapnet.certification.checking import check
 from lyapnet.certification.condition import bounded_condition
 from lyapnet.certification.disturbances.regions import parse_pushes, regions_under_pushes
-from lyapnet.certification.funnel import setting_of
+from lyapnet.certification.preconditions import over_time
 from lyapnet.certification.receding_decrease import RecedingDecrease
 from lyapnet.certification.region_certificate import RegionCertificate, region_certificate
 from lyapnet.cli import main
@@ -236,7 +236,7 @@ def of_itself(of):
     """Sets the fingerprint to that of what the changed file says, as its author could."""
     w = torch.tensor(of["disturbance"])
     condition = RecedingDecrease(loop_of(stationary(riccati()), problem()).requires_grad_(False), of["decay"], w)
-    domain = setting_of(condition, problem(), 0.0, Box(of["lower"][1:], of["upper"][1:]).double(), Budget(5)).domain
+    domain = over_time(Box(of["lower"][1:], of["upper"][1:]).double(), 0.0)
     condition.open_everywhere(of["hole"])
     of["fingerprint"] = bounded_condition(condition, domain).fingerprint
 

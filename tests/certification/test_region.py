@@ -41,7 +41,7 @@ def loop_of(V, about):
 def claimed(V=None, about=None, states=D, boxes=4000, seconds=100, **options):
     about = about or problem()
     return region_claim(loop_of(stationary(riccati()) if V is None else V, about), about, None, states,
-                        Budget(seconds, boxes, chunk=128), **options)  # fmt: skip
+                        Budget(seconds, boxes, chunk=512), **options)  # fmt: skip
 
 
 @cache
@@ -128,7 +128,7 @@ def test_a_law_that_leaves_further_out_is_falsified():
     system = Linear([[-1.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
     V = Formula(lambda t, x: x[..., 0] ** 2 + x[..., 1] ** 2 - x[..., 1] ** 4 / 2 + 0 * t)
     about = problem_of(system, cost(), 100, 0.02, Box([-1.5, -1.5], [1.5, 1.5]))
-    claim = region_claim(loop_of(V, about), about, None, Box([-2.0, -2.0], [2.0, 2.0]), Budget(100, 2000, chunk=128))
+    claim = region_claim(loop_of(V, about), about, None, Box([-2.0, -2.0], [2.0, 2.0]), Budget(100, 2000, chunk=512))
     assert claim.verdict != "certified"
     assert claim.rho < 0.5, "V at (0, 1), beyond which V falls as |x₂| grows"
 

@@ -42,7 +42,7 @@ def files(folder, V=None, u=None, config=CONFIG):
 
 
 def claimed(controller, boxes=4000, seconds=60.0, states=D):
-    budget = Budget(seconds, boxes, chunk=128)
+    budget = Budget(seconds, boxes, chunk=512)
     return region_claim(controller.closed_loop, controller.problem, None, states, budget)
 
 

@@ -259,6 +259,14 @@ def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     assert float(learner.V.scale) < 0.3 * float(everywhere)
 
 
+@pytest.fixture
+def few_optima(monkeypatch):
+    """For what does not ask how good a start is."""
+    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+
+
+@pytest.mark.usefixtures("few_optima")
 def test_a_checkpoint_is_loaded_with_its_tail(tmp_path):
     own = CHAIN | {"logs": str(tmp_path), "trainer": {"accelerator": "cpu"}}
     run = train(config_from_plain(own, ["training.iterations=1", "training.warmup=0", "rollout.compile=off"]))

@@ -296,7 +296,7 @@ def test_one_false_side_is_enough_for_no_certificate():
     """V = 0.9 J* is too low to pay for its law, V = 1.1 J* too high for the optimum."""
     for factor in (0.9, 1.1):
         V = Formula(lambda t, x, factor=factor: factor * optimum(x) + 0 * t)
-        certificate = two_sided_certificate(Controller(problem(), V), 0.97, 0.02, seconds=8.0)
+        certificate = two_sided_certificate(Controller(problem(), V), 0.97, 0.02, seconds=4.0)
         assert certificate.verdict != "certified"
 
 

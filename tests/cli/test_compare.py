@@ -80,11 +80,11 @@ def test_the_whole_comparison(tmp_path):
     require_complete(tmp_path, compared(tmp_path, "--workers", "2"), tasks, LEARNED, unclipped=3)
 
 
-def test_planners_stand_beside_what_learns(smoke):
-    said = compared(smoke[0], "--tasks", "double_integrator", "--methods", "lqr,mpc_100", "--workers", "2")
-    assert said.returncode == 0, said.stderr
+def test_planners_stand_beside_what_learns(smoke, compare):
+    status, out, err = compare("--tasks", "double_integrator", "--methods", "lqr,mpc_100", "--workers", "2")
+    assert status == 0, err
     for name in ("LQR", "MPC (100 %)", "lyapnet", "PPO (tuned)"):
-        assert name in said.stdout
+        assert name in out
     by_method = {result.method: result for result in results_of(smoke[0])}
     for method in ("lqr", "mpc_100"):
         result = by_method[method]

@@ -49,10 +49,10 @@ def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) ->
             raise UsageError(
                 "Expected V to be one function of (t, x), got another one than at first; read nothing else."
             )
-        _check_parts(condition.closed_loop, t, x)
+        check_parts(condition.closed_loop, t, x)
 
 
-def _check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
+def check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
     """Refuse a closed loop that runs as another one than its parts say, and a cost below 0, at some states."""
     system, u = loop.system, loop.policy(t, x)
     parts = torch.cat([system.f(x) + apply(system.g(x), u), loop.cost.running(x, u)[..., None]], -1)

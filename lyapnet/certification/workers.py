@@ -11,8 +11,10 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map_only
 
 from lyapnet.certification.boxes import Boxes
 from lyapnet.errors import UsageError
@@ -41,6 +43,39 @@ def bounding(question: Any, workers: int) -> Iterator[Callable[[Bounding, Iterab
             yield partial(_shared_out, pool, question)
         except BrokenProcessPool as error:
             raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+
+
+@contextmanager
+def answering(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any, ...]]], Iterable[Any]]]:
+    """question.of(*asked) for each of a list of arguments, by so many processes, copies of this one; as `bounding`.
+
+    Raises:
+        UsageError: a worker was killed, of too little memory perhaps.
+    """
+    if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
+        yield lambda asked: (question.of(*each) for each in asked)
+        return
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
+        try:
+            yield lambda asked: map(_as_tensors, pool.map(_answer, map(_as_arrays, asked)))
+        except BrokenProcessPool as error:
+            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+
+
+def _answer(asked: Any) -> Any:
+    """The answer of a worker's question, as arrays."""
+    (question,) = _own
+    with torch.no_grad():
+        return _as_arrays(question.of(*_as_tensors(asked)))
+
+
+def _as_arrays(data: Any) -> Any:
+    return tree_map_only(Tensor, lambda part: part.numpy(), data)
+
+
+def _as_tensors(data: Any) -> Any:
+    return tree_map_only(np.ndarray, torch.from_numpy, data)
 
 
 def _shared_out(

@@ -1,4 +1,4 @@
-"""lyapnet certify sampled | statistical | sound | region | check."""
+"""lyapnet certify sampled | statistical | sound | region | tube | check."""
 
 import json
 import math
@@ -6,19 +6,35 @@ import re
 import shlex
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from typer.core import TyperGroup, TyperOption
+from typer.core import TyperGroup
 
+from lyapnet.cli.claims import (
+    AsJson,
+    Device,
+    Disturbance,
+    FigureFile,
+    Keep,
+    Law,
+    Overrides,
+    Radius,
+    Refine,
+    ReportFolder,
+    Seconds,
+    Seed,
+    States,
+    Value,
+    Workers,
+    number,
+)
 from lyapnet.cli.options import Debug, Given, Parameter, of_a_controller
 from lyapnet.cli.refining import refined, require_refinable
 from lyapnet.errors import UsageError, did_you_mean
-from lyapnet.sizes import THREADS
 
 DEFAULT = "statistical"
 
@@ -74,50 +90,6 @@ def certify() -> None:
     """
 
 
-def _number(holds: Callable[[float], bool], expected: str, remedy: str, help: str) -> Any:
-    """A number of which more than its type is expected."""
-
-    def checked(parameter: TyperOption, value: float | None) -> float | None:
-        if value is not None and not holds(value):
-            raise UsageError(f"Expected {parameter.opts[0]} {expected}, got {value:g}; {remedy}.")
-        return value
-
-    return typer.Option(help=help, callback=checked)
-
-
-Radius = Annotated[
-    float | None,
-    _number(
-        lambda r: 0 <= r < math.inf, "≥ 0", "give it in the norm of x",
-        "Success at T needs ‖x(T) − goal‖ within it; not asked for if none.",
-    ),
-]  # fmt: skip
-States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:upper,…; found if none.", metavar="BOX")]
-Seconds = Annotated[
-    float, _number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
-]  # fmt: skip
-Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
-Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
-Disturbance = Annotated[
-    list[str] | None,
-    typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
-]
-Value = Annotated[
-    Path | None,
-    typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
-]
-Law = Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")]
-Overrides = Annotated[list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")]
-Refine = Annotated[int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
-Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
-ReportFolder = Annotated[
-    Path | None, typer.Option(help="Write report.md, report.json and the figure there.", metavar="FOLDER")
-]
-
-
 @app.command()
 @of_a_controller
 def sampled(
@@ -149,11 +121,11 @@ def statistical(
     samples: Annotated[int, typer.Option(min=1, help="Initial states to draw.")] = 10_000,
     confidence: Annotated[
         float,
-        _number(lambda c: 0 < c < 1, "strictly between 0 and 1", "for example 0.999999", "Confidence of the bound."),
+        number(lambda c: 0 < c < 1, "strictly between 0 and 1", "for example 0.999999", "Confidence of the bound."),
     ] = 1 - 1e-6,
     share: Annotated[
         float,
-        _number(lambda p: 0 < p <= 1, "in (0, 1]", "for example 0.99", "Share of X₀ that the verdict is about."),
+        number(lambda p: 0 < p <= 1, "in (0, 1]", "for example 0.99", "Share of X₀ that the verdict is about."),
     ] = 0.99,
     radius: Radius = None,
     seed: Seed = 0,
@@ -184,14 +156,14 @@ def sound(
     overrides: Overrides = None,
     alpha: Annotated[
         float,
-        _number(
+        number(
             lambda a: 0 < a <= 1, "in (0, 1]", "V can pay for no more than the whole running cost",
             "Share of ℓ that V pays for.",
         ),
     ] = 0.95,
     delta: Annotated[
         float | None,
-        _number(
+        number(
             lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second",
             "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
         ),
@@ -260,7 +232,7 @@ def region(
     overrides: Overrides = None,
     decay: Annotated[
         float | None,
-        _number(
+        number(
             lambda d: 0 < d < math.inf, "> 0", "give it in 1/s",
             "λ, at which V(0, ·) has to fall, in 1/s; 1 % of 1/T if none.",
         ),
@@ -325,6 +297,35 @@ def region(
 
     given, certificate = refined(given, certified, refine, overrides, begun)
     return _write(certificate, given, as_json, figure, report)
+
+
+@app.command()
+@of_a_controller
+def tube(
+    given: Given,
+    radius: Radius = None,
+    seconds: Seconds = 60.0,
+    workers: Workers = 1,
+    seed: Seed = 0,
+    as_json: AsJson = False,
+    figure: FigureFile = None,
+    report: ReportFolder = None,
+    debug: Debug = False,
+) -> None:
+    """Where all closed loops from X₀ go up to T, and what they cost: proved."""
+    begun = time.monotonic()
+    from lyapnet.certification.report import require_writable
+    from lyapnet.certification.tables import proof_progress
+    from lyapnet.certification.tubes.certificate import tube_certificate
+
+    require_writable(figure, report)
+    controller = given.load()
+    with proof_progress(Console(stderr=True, highlight=False, markup=False), "tube") as progress:
+        certificate = tube_certificate(
+            controller, radius, seconds, workers, seed, progress, started=begun
+        )  # fmt: skip
+    _show(certificate, given, as_json)
+    _write(certificate, given, as_json, figure, report)
 
 
 @app.command()

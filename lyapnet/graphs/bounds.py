@@ -12,7 +12,7 @@ in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the
 import copy
 import hashlib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import torch
@@ -24,6 +24,7 @@ from torch.utils._pytree import tree_map_only
 from lyapnet.errors import LyapnetError, UsageError, one_line
 from lyapnet.graphs import taylor
 from lyapnet.graphs.bound_kernel.kernel import BoundKernel, kernel_of
+from lyapnet.graphs.bound_kernel.program import Support, of_boxes
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
 from lyapnet.graphs.simplification import with_known_truths, without_copies
 from lyapnet.graphs.taylor import TaylorForm, box_form, wide_axes
@@ -73,8 +74,8 @@ class BoundedFunction:
         self._nodes = list(with_known_truths(without_copies(self.graph.graph)).nodes)
         self._fold_constants()
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
-        self._seen: Counter[tuple[int, ...]] = Counter()  # boxes, by the axes along which they have a width
-        self._kernels: dict[tuple[int, ...], BoundKernel | None] = {}
+        self._seen: Counter[Hashable] = Counter()  # boxes, by the axes along which they have a width; and forms
+        self._kernels: dict[Hashable, BoundKernel | None] = {}
         self.forms(lower[None], upper[None])  # an operator without a rule is found here
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
@@ -94,11 +95,27 @@ class BoundedFunction:
         """Machine code for boxes with a width along the same axes as these; None where there is none."""
         wide = tuple(wide_axes(lower, upper).tolist())
         if wide not in self._kernels:
-            self._kernels[wide] = kernel_of(self._nodes, self._constants, lower.shape[-1], wide, self.degree)
+            self._kernels[wide] = self._kernel_of(of_boxes(lower.shape[-1], wide), len(wide))
         return self._kernels[wide]
 
-    def image(self, box: TaylorForm) -> list[TaylorForm]:
-        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none."""
+    def _kernel_of(self, inputs: Sequence[Support], dimension: int) -> BoundKernel | None:
+        return kernel_of(self._nodes, self._constants, inputs, dimension, self.degree)
+
+    def image(self, box: TaylorForm, supports: Sequence[Support] | None = None) -> list[TaylorForm]:
+        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none.
+
+        Args:
+            supports: the numbers of the terms that each entry of the form may have, rising, if that is known: for many
+                such forms on the CPU machine code takes over.
+        """
+        if supports is not None and box.radius.device.type == "cpu":
+            key = (box.dimension, *supports)
+            self._seen[key] += len(box.radius)
+            if self._seen[key] > MANY:
+                if key not in self._kernels:
+                    self._kernels[key] = self._kernel_of(supports, box.dimension)
+                if (kernel := self._kernels[key]) is not None:
+                    return kernel.image(box)
         inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
         values: dict[Node, Any] = dict(self._constants)
         for node in self._nodes:

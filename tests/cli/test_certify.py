@@ -83,7 +83,7 @@ def test_tables(checkpoint, capsys):
 
 
 REFUSED = [
-    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, region, got 'certain'"),
+    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, region, tube, got 'certain'"),
     ("certify sound --set=1,2", "Expected --set as lower:upper"),
     ("certify sound --set=-0.5:0.5,-2:2", "Expected a set around X₀"),
     ("certify sound --set=-2:2", "Expected a set of 2 states, got 1"),
@@ -100,7 +100,7 @@ REFUSED = [
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
     (
         "certify sond",
-        "Expected sampled, statistical, sound, region, check or a checkpoint, got 'sond'; did you mean sound?",
+        "Expected sampled, statistical, sound, region, tube, check or a checkpoint, got 'sond'; did you mean sound?",
     ),
     ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),

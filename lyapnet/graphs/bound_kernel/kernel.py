@@ -18,7 +18,7 @@ from torch import Tensor
 
 from lyapnet.errors import CompilationError, one_line
 from lyapnet.files import digest_of_file, write_atomically
-from lyapnet.graphs.bound_kernel.program import Entry, Program
+from lyapnet.graphs.bound_kernel.program import Entry, Program, Support
 from lyapnet.graphs.bound_kernel.writing import written
 from lyapnet.graphs.compilation import cache_folder, has_compiler, require_own
 from lyapnet.graphs.taylor import TaylorForm
@@ -30,21 +30,23 @@ MOST_AXES = 16  # as in forms.h
 
 
 class BoundKernel:
-    """(lower, upper) ↦ the forms of a graph's results, for boxes with a width along the same axes.
+    """The forms of a graph's results, for boxes with a width along the same axes, or for forms of the same supports.
 
     Args:
         nodes, constants: of the graph, and the values of those that do not depend on the point.
-        axes, wide, degree: of Program.
+        inputs, dimension, degree: of Program.
 
     Raises:
         NotImplementedError: an operation has no rule here.
         CompilationError: there is no machine code.
     """
 
-    def __init__(self, nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int):
-        if len(wide) > MOST_AXES:
+    def __init__(
+        self, nodes: Sequence[Any], constants: dict[Any, Any], inputs: Sequence[Support], dimension: int, degree: int
+    ):
+        if dimension > MOST_AXES:
             raise NotImplementedError(f"more than {MOST_AXES} axes")
-        program = Program(axes, wide, degree)
+        program = Program(inputs, dimension, degree)
         results = written(program, nodes, constants)
         self._program = program.assembled([Entry(k) for y in results for k in y.entries.flatten().tolist()])
         self._shapes = [y.shape for y in results]
@@ -52,13 +54,20 @@ class BoundKernel:
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
         """The results on boxes (boxes, 1 + n), one form each."""
-        program, boxes = self._program, len(lower)
-        lower, upper = lower.contiguous(), upper.contiguous()
+        return self._run(len(lower), lower.contiguous(), upper.contiguous())
+
+    def image(self, given: TaylorForm) -> list[TaylorForm]:
+        """The results of numbers in forms, (boxes, inputs); what they have beyond their supports is not looked at."""
+        parts = torch.cat([given.terms.movedim(0, -1), given.radius[..., None]], -1)
+        return self._run(len(parts), parts.contiguous(), None)
+
+    def _run(self, boxes: int, lower: Tensor, upper: Tensor | None) -> list[TaylorForm]:
+        program = self._program
         sizes = [shape.numel() for shape in self._shapes]
         results = torch.zeros(sum(sizes), self._terms + 1, boxes, dtype=torch.float64)
         failed = library().lyapnet_bound(
             *(_address(part) for part in (program.tables, program.code, program.numbers)),
-            *(ctypes.c_void_p(side.data_ptr()) for side in (lower, upper)),
+            *(ctypes.c_void_p(side.data_ptr() if side is not None else None) for side in (lower, upper)),
             *map(ctypes.c_long, (boxes, program.arena, program.spare)), ctypes.c_void_p(results.data_ptr()),
         )  # fmt: skip
         if failed:
@@ -71,11 +80,11 @@ class BoundKernel:
 
 
 def kernel_of(
-    nodes: Sequence[Any], constants: dict[Any, Any], axes: int, wide: Sequence[int], degree: int
+    nodes: Sequence[Any], constants: dict[Any, Any], inputs: Sequence[Support], dimension: int, degree: int
 ) -> BoundKernel | None:
     """A kernel; None where an operation has no rule, or there is no machine code."""
     try:
-        return BoundKernel(nodes, constants, axes, wide, degree) if has_library() else None
+        return BoundKernel(nodes, constants, inputs, dimension, degree) if has_library() else None
     except NotImplementedError:
         return None
 

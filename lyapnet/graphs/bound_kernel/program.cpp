@@ -1,5 +1,5 @@
 // A function's operations on Taylor forms as a flat program, run on one block of boxes after another: all forms of a
-// block stay in the cache. Programs are written by lyapnet/graphs/bound_program.py.
+// block stay in the cache. Programs are written by program.py.
 
 #include "forms.h"
 
@@ -194,6 +194,21 @@ void read_boxes(
     }
 }
 
+// Forms (boxes, inputs, terms and radius) that are given
+void read_forms(const Block &block, const int *&code, const double *given, long first, long boxes) {
+    const int inputs = *code++, row = block.terms + 1;
+    for (int input = 0; input < inputs; input++) {
+        const Entry y = block.entry(code);
+        for (int lane = 0; lane < LANES; lane++) {
+            const long box = first + lane < boxes ? first + lane : boxes - 1;
+            const double *const form = given + (box * inputs + input) * row;
+            for (int i = 0; i < y.support->count; i++) y.terms[i][lane] = form[y.support->at[i]];
+            y.radius()[lane] = form[block.terms];
+        }
+        block.finish(y, 0);
+    }
+}
+
 // (results, terms and radius, boxes)
 void write_results(const Block &block, const int *&code, double *results, long first, long boxes) {
     const long here = boxes - first < LANES ? boxes - first : LANES;
@@ -227,7 +242,8 @@ void read_tables(Block &block, const int *tables) {
 
 }  // namespace
 
-// Runs a program on boxes (boxes, axes) each; `results` holds zeros.
+// Runs a program on boxes (boxes, axes) each, or on the forms in `lower` where there is no `upper`; `results` holds
+// zeros.
 extern "C" int lyapnet_bound(
     const int *tables, const int *code, const double *numbers, const double *lower, const double *upper, long boxes,
     long arena, long spare, double *results
@@ -246,7 +262,10 @@ extern "C" int lyapnet_bound(
     }
     for (long first = 0; first < boxes; first += LANES) {
         const int *at = code;
-        read_boxes(block, at, lower, upper, first, boxes);
+        if (upper)
+            read_boxes(block, at, lower, upper, first, boxes);
+        else
+            read_forms(block, at, lower, first, boxes);
         for (int count = *at++; count > 0; count--) {
             const int operation = *at++;
             operate(block, operation, at);

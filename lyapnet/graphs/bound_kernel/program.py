@@ -31,6 +31,11 @@ Support = tuple[int, ...]  # the numbers of the monomials that a form can have, 
 CONSTANT: Support = (0,)
 
 
+def of_boxes(axes: int, wide: Sequence[int]) -> list[Support]:
+    """The supports of the numbers of a box, of which those along wide axes have an ε each."""
+    return [(0, 1 + wide.index(k)) if k in wide else CONSTANT for k in range(axes)]
+
+
 class Entry(int):
     """The form of one number: its place in the list of a program's forms."""
 
@@ -68,13 +73,12 @@ class Program:
     """Operations on the forms of single numbers, no two of them alike.
 
     Args:
-        axes: 1 + n.
-        wide: those along which boxes have a width, each with its ε.
-        degree: of the forms.
+        inputs: the support of each number that the function is of.
+        dimension, degree: of the forms.
     """
 
-    def __init__(self, axes: int, wide: Sequence[int], degree: int):
-        self.degree, self.dimension = degree, len(wide)
+    def __init__(self, inputs: Sequence[Support], dimension: int, degree: int):
+        self.degree, self.dimension = degree, dimension
         self.monomials = monomials(self.dimension, degree)
         number = {powers: k for k, powers in enumerate(self.monomials)}
         self._place = [[number.get(tuple(sorted(a + b)), -1) for b in self.monomials] for a in self.monomials]
@@ -90,7 +94,7 @@ class Program:
         self.supports: list[Support] = []
         self.constants: dict[Entry, float] = {}
         self.constant(0.0)
-        self.inputs = [self._new((0, 1 + wide.index(k)) if k in wide else CONSTANT) for k in range(axes)]
+        self.inputs = [self._new(support) for support in inputs]
 
     def constant(self, value: float) -> Entry:
         """The form of a number that is the same everywhere."""

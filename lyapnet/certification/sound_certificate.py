@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import torch
+from torch import Tensor
 
 from lyapnet.certification import figures
 from lyapnet.certification.branch_and_bound import Budget
@@ -297,7 +298,13 @@ class Compared(NamedTuple):
 
 
 def compared_to_optima(controller: Controller, claim: SoundClaim, seconds: float = math.inf) -> Compared:
-    """The guaranteed cost of states of X₀ inside a funnel, held against their optima.
+    """The guaranteed cost of states of X₀ inside a funnel, held against their optima."""
+    x0, value, guaranteed = states_inside(controller, claim)
+    return Compared(value, guaranteed, optima_of(controller, x0, seconds))
+
+
+def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> Tensor | None:
+    """The optimum of the first of some states; None where there are no states or no oracle, or it takes longer.
 
     A search by IPOPT takes fewer states, and the controller's help.
     """
@@ -307,14 +314,11 @@ def compared_to_optima(controller: Controller, claim: SoundClaim, seconds: float
         if done < total and time.monotonic() > end:
             raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
 
-    x0, value, guaranteed = states_inside(controller, claim)
     if not len(x0):
-        return Compared(value, guaranteed, None)
+        return None
     try:
         oracle = oracle_of(controller.problem, controller.method)
-        if not isinstance(oracle, RiccatiOracle):
-            x0 = x0[:SEARCHED]
-        optimum = oracle.solve(x0, controller.rollout(x0).u, in_time).cost.double()
+        some = x0 if isinstance(oracle, RiccatiOracle) else x0[:SEARCHED]
+        return oracle.solve(some, controller.rollout(some).u, in_time).cost.double()
     except OracleError:
-        optimum = None
-    return Compared(value, guaranteed, optimum)
+        return None

@@ -10,18 +10,15 @@ from lyapnet.certification.certificates import FROZEN, Certificate
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.sound_certificate import (
     COMPARED,
-    SEARCHED,
     listed,
+    optima_of,
 )
 from lyapnet.certification.tables import floored
 from lyapnet.certification.tubes import figures
 from lyapnet.certification.tubes.tube import TubeClaim, tube_claim
 from lyapnet.controller import Controller
-from lyapnet.errors import OracleError
 from lyapnet.evaluation.optimality import ratio_of_means
-from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.random_streams import CERTIFICATION, stream
-from lyapnet.types import PerState, State
 
 
 class Compared:
@@ -32,20 +29,7 @@ class Compared:
         low, high = claim.bounds_of_cost(x0)
         inside = high.isfinite()
         self.x0, self.low, self.high = x0[inside], low[inside], high[inside]
-        self.optimum: PerState | None = None
-        end = time.monotonic() + seconds
-
-        def in_time(done: int, total: int) -> None:
-            if done < total and time.monotonic() > end:
-                raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
-
-        if len(self.x0):
-            try:
-                oracle = oracle_of(controller.problem, controller.method)
-                some: State = self.x0 if isinstance(oracle, RiccatiOracle) else self.x0[:SEARCHED]
-                self.optimum = oracle.solve(some, controller.rollout(some).u, in_time).cost.double()
-            except OracleError:
-                self.optimum = None
+        self.optimum = optima_of(controller, self.x0, seconds)
 
     @property
     def ratio(self) -> float | None:

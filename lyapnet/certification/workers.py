@@ -25,6 +25,20 @@ _own: list[Any] = []  # of a worker: the question that it was begun with
 
 
 @contextmanager
+def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]:
+    """So many copies of this process that have a question; None where there is one, or none can be made."""
+    if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
+        yield None
+        return
+    context = multiprocessing.get_context("fork")
+    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
+        try:
+            yield pool
+        except BrokenProcessPool as error:
+            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+
+
+@contextmanager
 def bounding(question: Any, workers: int) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
     """A `map` of question.undecided over chunks of boxes, by so many processes, copies of this one.
 
@@ -34,15 +48,8 @@ def bounding(question: Any, workers: int) -> Iterator[Callable[[Bounding, Iterab
     Raises:
         UsageError: a worker was killed, of too little memory perhaps.
     """
-    if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
-        yield map
-        return
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
-        try:
-            yield partial(_shared_out, pool, question)
-        except BrokenProcessPool as error:
-            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+    with _copies(question, workers) as pool:
+        yield map if pool is None else partial(_shared_out, pool, question)
 
 
 @contextmanager
@@ -52,15 +59,11 @@ def answering(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any,
     Raises:
         UsageError: a worker was killed, of too little memory perhaps.
     """
-    if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
-        yield lambda asked: (question.of(*each) for each in asked)
-        return
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(workers, context, initializer=_begin, initargs=(question,)) as pool:
-        try:
+    with _copies(question, workers) as pool:
+        if pool is None:
+            yield lambda asked: (question.of(*each) for each in asked)
+        else:
             yield lambda asked: map(_as_tensors, pool.map(_answer, map(_as_arrays, asked)))
-        except BrokenProcessPool as error:
-            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
 
 
 def _answer(asked: Any) -> Any:

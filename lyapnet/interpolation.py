@@ -137,6 +137,7 @@ class SmoothCurve(nn.Module):
     WIDTH = 1.5 / 24  # w
     SCALES = (0.025, 0.05, 0.1, 0.2, 0.4)  # of T, that are tried for s
     RIDGE = 1e-9  # of Σ a² beside Σ error², in units of y
+    BETWEEN = 8  # points for each interval of the nodes, on a cubic spline: no step is finer than what it is fitted to
 
     def __init__(self, duration: float, shape: Sequence[int]):
         super().__init__()
@@ -151,27 +152,44 @@ class SmoothCurve(nn.Module):
 
     def _rises(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
         """What each a_k is multiplied with."""
+        return self._risen(t, scale) - torch.sigmoid(-self.STEPS / self.WIDTH).to(t)
+
+    def _risen(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
+        """σ((τ − τ_k)/w)."""
         left = torch.log(1 + (self.duration - t) / scale) / torch.log(1 + self.duration / scale)
-        steps = self.STEPS.to(left)
-        return torch.sigmoid((left[..., None] - steps) / self.WIDTH) - torch.sigmoid(-steps / self.WIDTH)
+        return torch.sigmoid((left[..., None] - self.STEPS.to(left)) / self.WIDTH)
 
     @torch.no_grad()
     def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
-        """Become the curve closest to these points by least squares, the last of them at T, which it passes."""
-        t, y = nodes.double(), values.double().flatten(1)
+        """Become the curve closest by least squares, in y and dy/dτ, to a cubic spline through these points.
+
+        It passes the last of them, at T.
+        """
+        spline = CubicSpline(nodes.double().cpu(), values.double().cpu().flatten(1))
+        t = _refined(nodes.double().cpu(), self.BETWEEN)
+        y, y_t = (torch.from_numpy(spline(t, order)) for order in (0, 1))
         end, unit = y[-1], y.abs().amax(0).clamp_min(torch.finfo(y.dtype).tiny)
         best = math.inf
         for share in self.SCALES:
             scale = torch.tensor(share * self.duration, dtype=torch.float64)
-            rises = self._rises(t, scale)
-            gram = rises.mT @ rises + self.RIDGE * torch.eye(rises.shape[-1]).to(rises)
-            weights = torch.linalg.solve(gram, rises.mT @ ((y - end) / unit))
-            error = float((rises @ weights - (y - end) / unit).square().sum())
+            t_tau = -(self.duration - t + scale) * torch.log(1 + self.duration / scale)
+            risen = self._risen(t, scale)
+            rows = torch.cat([self._rises(t, scale), risen * (1 - risen) / self.WIDTH])
+            wanted = torch.cat([y - end, t_tau[:, None] * y_t]) / unit
+            gram = rows.mT @ rows + self.RIDGE * torch.eye(rows.shape[-1]).to(rows)
+            weights = torch.linalg.solve(gram, rows.mT @ wanted)
+            error = float((rows @ weights - wanted).square().sum())
             if not error >= best:  # as it is, too, where numbers are none
                 best = error
                 self.scale.copy_(scale)
                 self.weights.copy_((weights * unit).unflatten(-1, self.end.shape))
         self.end.copy_(values[-1])
+
+
+def _refined(nodes: Tensor, parts: int) -> Tensor:
+    """The nodes with each interval in so many parts."""
+    shares = torch.arange(parts) / parts
+    return torch.cat([(nodes[:-1, None] + shares * nodes.diff()[:, None]).flatten(), nodes[-1:]])
 
 
 def _furthest_from(nodes: Tensor, values: Tensor, kept: list[int]) -> int:

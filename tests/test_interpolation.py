@@ -161,6 +161,20 @@ def test_a_smooth_curve_follows_a_solution_of_riccatis_equation_and_its_slope():
     assert coarse > 50 * rate
 
 
+def test_the_slope_at_the_end_is_right_where_y_settles_there_within_few_nodes():
+    """A damped rate is forgotten within 0.05 s, five of the nodes; also between them, where no value was given."""
+
+    def y(t):
+        return torch.exp(20 * (t - 0.8)) + torch.cos(2 * t)
+
+    curve, t = SmoothCurve(0.8, [1]), torch.linspace(0, 0.8, 81)
+    curve.take(t, y(t)[:, None])
+    at = torch.linspace(0, 0.8, 1000).requires_grad_()
+    (slope,) = torch.autograd.grad(curve(at).sum(), at)
+    expected = 20 * torch.exp(20 * (at.detach() - 0.8)) - 2 * torch.sin(2 * at.detach())
+    assert_close(slope, expected, rtol=0, atol=0.03)
+
+
 def test_a_smooth_curve_takes_constants_as_they_are_and_few_nodes():
     curve = SmoothCurve(2.0, [3])
     curve.take(torch.linspace(0, 2, 5), torch.tensor([[0.0, -3.0, 1e-30]]).expand(5, 3))

@@ -39,7 +39,7 @@ class LostStates(Callback):
         each = zip(with_loggers(trainer, pl_module), data.of_each, x0.reshape(-1, *x0.shape[-2:]), found, strict=True)
         for (_, loggers), its, states, by in each:
             lost = (by > EXCESS).cpu()
-            its.lost = torch.cat([states[lost], its.lost])[:KEPT]
+            its.lost = torch.cat([states.cpu()[lost], its.lost])[:KEPT]  # batches are drawn on the CPU
             log_scalars(trainer, loggers, {"lost_fraction/val": lost.double().mean()})
 
 

@@ -77,6 +77,11 @@ class PointwiseConfig:
     )
     points: int = option(512, "Points in each step.", at_least=2)
     region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
+    floor: float | None = option(
+        None,
+        "Share of the mean ℓ below which violations count as absolute ones; null: 0.01, of a stationary V 1e-4.",
+        above=0,
+    )
     counterexamples: str | None = option(
         None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
     )

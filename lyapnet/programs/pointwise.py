@@ -24,9 +24,8 @@ class PointwiseCondition:
         Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
-    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ one per cent of the batch's mean running and whole cost (denominators are
-    detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V there is no end, and ℓ₀
-    is 10⁻⁴ of the mean.
+    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ a share (`floor`) of the batch's mean running and whole cost (denominators
+    are detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V there is no end.
 
     The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
     half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
@@ -40,6 +39,8 @@ class PointwiseCondition:
         weight: of the term.
         points: drawn and sought in each step.
         further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
+        floor: share of the mean cost below which violations count as absolute ones; 1 %, or 10⁻⁴ of a stationary V. A
+            certificate that allows δ beside (1 − α) ℓ asks for no more than δ/(1 − α) near the goal.
     """
 
     closed_loop: ClosedLoop
@@ -52,6 +53,7 @@ class PointwiseCondition:
     weight: float
     points: int
     further: Float[Tensor, "k columns"] | None
+    floor: float
 
     def __init__(
         self,
@@ -61,6 +63,7 @@ class PointwiseCondition:
         weight: float = 1.0,
         points: int = 512,
         further: Float[Tensor, "k columns"] | None = None,
+        floor: float | None = None,
     ):
         V = rollout.closed_loop.V
         if V is None:
@@ -69,6 +72,7 @@ class PointwiseCondition:
         self.duration, self.stationary = rollout.problem.horizon.duration, rollout.problem.horizon.stationary
         self.program, self.region = program, region
         self.weight, self.points, self.further = weight, points, further
+        self.floor = (LEAST if self.stationary else FLOOR) if floor is None else floor
 
     @property
     def goal(self) -> State:
@@ -83,8 +87,7 @@ class PointwiseCondition:
             mean_cost: J̄ of the closed loops of the step.
             largest_value: the largest V(0, x₀) among them.
         """
-        floor = (LEAST if self.stationary else FLOOR) * mean_cost.detach()
-        return self.condition(generator, floor, CEILING * largest_value.detach())
+        return self.condition(generator, self.floor * mean_cost.detach(), CEILING * largest_value.detach())
 
     def condition(self, generator: torch.Generator, floor: Tensor, ceiling: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step, of which those with V above a ceiling do not count."""

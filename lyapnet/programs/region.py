@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lyapnet.networks import kept_states
 from lyapnet.programs.base import Program
-from lyapnet.programs.pointwise import LEAST, PointwiseCondition
+from lyapnet.programs.pointwise import PointwiseCondition
 from lyapnet.programs.terms import hinge, terminal_hinge
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, State, ValuePath
@@ -76,7 +76,7 @@ class RegionCondition(PointwiseCondition):
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step; of the closed loops it needs the mean cost alone."""
         level = -torch.logsumexp(-SOFTNESS * self._log_value(self._boundary(generator)), 0) / SOFTNESS
-        failing = self.condition(generator, LEAST * mean_cost.detach(), CEILING * level.detach().exp())
+        failing = self.condition(generator, self.floor * mean_cost.detach(), CEILING * level.detach().exp())
         inside = self.region.sample(2 * self.points, generator).to(mean_cost)
         return failing + self.program.growth * torch.sigmoid(SHARPNESS * (self._log_value(inside) - level)).mean()
 

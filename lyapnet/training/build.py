@@ -91,7 +91,7 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
     reach = torch.tensor(extent, dtype=torch.float64).to(goal)
     region = Box(goal - reach, goal + reach)
     further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(goal)
-    return made(rollout, program, region, weight, options.points, further)
+    return made(rollout, program, region, weight, options.points, further, options.floor)
 
 
 def _points_of(path: Path, n: int) -> Tensor:

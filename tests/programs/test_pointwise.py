@@ -28,12 +28,12 @@ def riccati():
 def of(quadratic):
     """The condition of V = xᵀPx with φ = xᵀQ_T x; margin None for the value program."""
 
-    def build(P, margin=None, Q_T=None, further=None):
+    def build(P, margin=None, Q_T=None, further=None, floor=None):
         cost = QuadraticCost(Q, [[1.0]], riccati() if Q_T is None else Q_T)
         problem = problem_of(DoubleIntegrator(), cost, steps=20, dt=DURATION / 20)
         rollout = Rollout(problem, HJBPolicy(problem, quadratic(P)))
         program = ValueProgram() if margin is None else LyapunovProgram(margin=margin)
-        return PointwiseCondition(rollout, program, Box([-1.0, -2.0], [1.0, 2.0]), points=POINTS, further=further)
+        return PointwiseCondition(rollout, program, Box([-1.0, -2.0], [1.0, 2.0]), 1.0, POINTS, further, floor)
 
     return build
 
@@ -42,7 +42,7 @@ def value(condition, seed=0, largest=LARGEST):
     return condition(stream(seed), MEAN_COST, largest)
 
 
-def by_hand(x, P, margin, Q_T, ceiling=torch.inf, unit_of=None):
+def by_hand(x, P, margin, Q_T, ceiling=torch.inf, unit_of=None, floor=0.01):
     """Both penalties at each state, from matrices: V̇ = 2xᵀP(Ax + Bu) and ℓ = xᵀQx + u² with u = −BᵀPx.
 
     They are relative to the ℓ under the law of `unit_of`, which is P itself unless another matrix is given.
@@ -50,12 +50,12 @@ def by_hand(x, P, margin, Q_T, ceiling=torch.inf, unit_of=None):
     P, unit_P = ((M + M.mT) / 2 for M in map(torch.as_tensor, (P, P if unit_of is None else unit_of)))
     rows = []
     for y in x:
-        unit = y @ Q @ y + (B.T @ unit_P @ y).square().sum() + 0.01 * MEAN_COST / DURATION
+        unit = y @ Q @ y + (B.T @ unit_P @ y).square().sum() + floor * MEAN_COST / DURATION
         u = -B.T @ P @ y
         V, running, terminal = y @ P @ y, y @ Q @ y + u @ u, y @ Q_T @ y
         rate = 2 * y @ P @ (A @ y + B @ u)
         condition = (rate + (1 + (margin or 0.0)) * running) / unit
-        end = (terminal - V) / (terminal + 0.01 * MEAN_COST)
+        end = (terminal - V) / (terminal + floor * MEAN_COST)
         both = torch.stack([condition, end])
         rows.append((both.square() if margin is None else both.clamp_min(0)) * (ceiling >= V))
     return torch.stack(rows, -1)
@@ -81,6 +81,16 @@ def test_formulas_by_hand(of, margin):
     expected = by_hand(chosen(condition, WRONG, margin), WRONG, margin, torch.eye(2)).mean(-1).sum()
     assert_close(value(condition).detach(), expected)
     assert expected > 0.1
+
+
+def test_near_the_goal_violations_count_by_the_floor(of):
+    condition = of(WRONG, 0.2, torch.eye(2), floor=0.3)
+    _, x = condition.draw(stream(0))
+    worst = by_hand(x, WRONG, 0.2, torch.eye(2), floor=0.3)[0].topk(POINTS // 2).indices
+    x = torch.cat([x[worst], x[: POINTS - len(worst)]])
+    expected = by_hand(x, WRONG, 0.2, torch.eye(2), floor=0.3).mean(-1).sum()
+    assert_close(value(condition).detach(), expected)
+    assert expected < 0.7 * value(of(WRONG, 0.2, torch.eye(2)))
 
 
 def test_a_hinge_forgives_what_the_square_does_not(of):

@@ -30,6 +30,7 @@ class Budget:
         chunk: boxes that are bounded at once by each worker.
         frontier: undecided boxes that are kept; beyond, those of highest key are given up.
         workers: processes.
+        ray: the address of a cluster of which so many cores bound the boxes of a proof, in place of processes here.
         device: where the boxes of a proof are bounded, "cpu" or "cuda"; a GPU by one process, in chunks that fill it.
     """
 
@@ -39,6 +40,7 @@ class Budget:
     frontier: int = 1_000_000
     workers: int = 1
     device: str = "cpu"
+    ray: str | None = None
     started: float = field(default_factory=time.monotonic)
     stop: Stop = field(default_factory=Stop)  # asked by the user
 
@@ -48,7 +50,7 @@ class Budget:
                 f"Expected chunk, frontier and workers ≥ 1, got {self.chunk}, {self.frontier} and {self.workers}."
             )
         if self.device != "cpu":
-            _require_device(self.device, self.workers)
+            _require_device(self.device, self.workers, self.ray)
 
     @property
     def at_once(self) -> int:
@@ -70,7 +72,7 @@ class Budget:
         return max(0.0, self.seconds - self.elapsed)
 
 
-def _require_device(device: str, workers: int) -> None:
+def _require_device(device: str, workers: int, ray: str | None) -> None:
     """Refuse a device that is not there, or that several processes would share."""
     try:
         torch.empty(0, device=device)
@@ -80,6 +82,8 @@ def _require_device(device: str, workers: int) -> None:
         ) from error
     if workers > 1:
         raise UsageError(f"Expected one worker on {device}, got {workers}; leave --workers out.")
+    if ray is not None:
+        raise UsageError(f"Expected --device {device} or --ray, got both; cores of a cluster bound boxes.")
 
 
 ON_DEVICE = 65_536  # boxes that fill a GPU

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from lyapnet.certification.counterexamples import Counterexample, find_counterex
 from lyapnet.certification.kept_proofs import KeptProof, Standing, about
 from lyapnet.certification.verdict import Verdict
 from lyapnet.certification.workers import bounding
+from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner, Points
 
@@ -104,7 +106,8 @@ def prove(
     def standing() -> Standing:
         return Standing(search, question.level, question.worst, earlier + budget.elapsed)
 
-    with bounding(question, budget.workers) as run:
+    anew = partial(bounded_again, condition, (lower, upper), degree, bounded.fingerprint)
+    with bounding(question, budget.workers, budget.ray, anew) as run:
         for _ in search.rounds(question, budget, run):
             if kept is not None and budget.elapsed > saved + KEEP_EVERY:
                 kept.write(standing())
@@ -118,6 +121,23 @@ def prove(
         -torch.inf if question.settled else end.proved, wanted, end.worst, search.boxes, end.seconds,
         search.frontier.share(lower, upper), search.frontier.center[:KEPT], bounded.fingerprint,
     )  # fmt: skip
+
+
+def bounded_again(
+    condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int, fingerprint: str
+) -> "WhereItHolds":
+    """The same question on another machine, where the condition is traced anew.
+
+    Raises:
+        UsageError: something else was traced there.
+    """
+    bounded = bounded_condition(condition, domain, degree)
+    if bounded.fingerprint != fingerprint:
+        raise UsageError(
+            f"Expected what is proved ({fingerprint[:16]}) on each machine of the cluster, got something else "
+            f"({bounded.fingerprint[:16]}); install the same lyapnet, torch and code there."
+        )
+    return WhereItHolds(condition, bounded, torch.inf, True)
 
 
 @dataclass

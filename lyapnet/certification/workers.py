@@ -1,14 +1,16 @@
-"""Processes that bound boxes side by side: threads of one process wait for each other."""
+"""Processes, or cores of a cluster, that bound boxes side by side: threads of one process wait for each other."""
 
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,8 @@ from torch import Tensor
 from torch.utils._pytree import tree_map_only
 
 from lyapnet.certification.boxes import Boxes
-from lyapnet.errors import UsageError
+from lyapnet.cluster import connected
+from lyapnet.errors import UsageError, one_line
 
 Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
 
@@ -39,17 +42,55 @@ def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]
 
 
 @contextmanager
-def bounding(question: Any, workers: int) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
+def bounding(
+    question: Any, workers: int, ray: str | None = None, anew: Callable[[], Any] | None = None
+) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
     """A `map` of question.undecided over chunks of boxes, by so many processes, copies of this one.
 
     They see the question as it was at the beginning, and its `level` as it is. One worker is this process itself, and
     so it is where processes cannot be copied.
 
+    Args:
+        ray: the address of a cluster of which so many cores bound boxes, in place of this machine.
+        anew: makes the question there.
+
     Raises:
-        UsageError: a worker was killed, of too little memory perhaps.
+        UsageError: a worker was killed, of too little memory perhaps, or there is no such cluster.
     """
+    if ray is not None:
+        with connected(ray) as cluster, _elsewhere(cluster, anew, workers) as ask:
+            yield partial(_shared_out, ask, question)
+        return
     with _copies(question, workers) as pool:
-        yield map if pool is None else partial(_shared_out, pool, question)
+        yield map if pool is None else partial(_shared_out, partial(pool.map, _undecided), question)
+
+
+@contextmanager
+def _elsewhere(cluster: Any, anew: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
+    """A `map` of _undecided by cores of a cluster, whose machines find modules where this one does."""
+    places = {"PYTHONPATH": os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])}
+    actor = cluster.remote(num_cpus=1, runtime_env={"env_vars": places})(_Elsewhere)
+    pool = cluster.util.ActorPool([actor.remote(anew) for _ in range(workers)])
+    try:
+        yield lambda asked: map(_own_copy, pool.map(lambda worker, each: worker.undecided.remote(each), asked))
+    except cluster.exceptions.RayError as error:
+        raise UsageError(f"Expected workers of the cluster that live on, got {one_line(error)}") from error
+
+
+class _Elsewhere:
+    """A worker on another machine."""
+
+    def __init__(self, anew: Callable[[], Any]):
+        torch.set_num_threads(1)
+        _own[:] = [anew()]
+
+    def undecided(self, asked: tuple[Any, ...]) -> tuple[Any, ...]:
+        return _undecided(_own_copy(asked))
+
+
+def _own_copy(data: Any) -> Any:
+    """Arrays that may be written to, of those that a cluster shares."""
+    return tree_map_only(np.ndarray, np.copy, data)
 
 
 @contextmanager
@@ -82,10 +123,10 @@ def _as_tensors(data: Any) -> Any:
 
 
 def _shared_out(
-    pool: ProcessPoolExecutor, question: Any, _: Bounding, chunks: Iterable[Boxes]
+    ask: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
 ) -> Iterator[tuple[Boxes, Tensor]]:
     asked = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
-    for *parts, axis in pool.map(_undecided, asked):
+    for *parts, axis in ask(asked):
         yield Boxes(*map(torch.from_numpy, parts)), torch.from_numpy(axis)
 
 

@@ -1,10 +1,8 @@
 """Jobs side by side: in processes of this machine, or on a Ray cluster. Each is a command of its own."""
 
 import contextlib
-import logging
 import os
 import signal
-import socket
 import subprocess
 import threading
 import time
@@ -14,9 +12,9 @@ from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
-from urllib.parse import urlsplit
 
-from lyapnet.errors import UsageError, one_line
+from lyapnet.cluster import connected
+from lyapnet.errors import one_line
 
 LOG = "job.log"
 ASKED_EVERY = 1.0  # seconds, whether a job that runs is still wanted
@@ -113,26 +111,15 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
     """The outcomes as they come, of a Ray cluster whose machines share this folder; a core for each job.
 
     Args:
-        address: where the cluster is, as ray.init takes it: auto, local, or ray://host:port.
+        address: where the cluster is, as of lyapnet.cluster.connected.
         begun: called with each job that is handed over.
 
     Raises:
         UsageError: Ray is not installed, or there is no cluster at the address.
     """
-    try:
-        import ray
-        from ray.exceptions import RayError
-    except ImportError as error:
-        raise UsageError("Expected Ray for --ray, got none; pip install 'lyapnet[ray]'.") from error
-    _require_listening(address)
-    try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
-    except Exception as error:  # ConnectionError, or one of its many own
-        line = one_line(error)
-        raise UsageError(f"Expected a Ray cluster at {address!r}, got {type(error).__name__}: {line}") from error
-    remote: Any = ray.remote(num_cpus=1, max_retries=0)(_run_in)
-    waiting: dict[Any, J] = {}
-    try:
+    with connected(address) as ray:
+        remote: Any = ray.remote(num_cpus=1, max_retries=0)(_run_in)
+        waiting: dict[Any, J] = {}
         for job in jobs:
             begun(job)
             waiting[remote.remote(job, Path.cwd())] = job
@@ -141,28 +128,14 @@ def run_on_ray(jobs: Sequence[J], address: str, begun: Callable[[J], Any]) -> It
             job = waiting.pop(ended)
             try:
                 yield Outcome(job, *ray.get(ended))
-            except RayError as error:  # a machine was lost: the others go on
+            except ray.exceptions.RayError as error:  # a machine was lost: the others go on
                 yield Outcome(job, 0.0, one_line(error))
-    finally:
-        ray.shutdown()
 
 
 def _run_in(job: Runnable, place: Path) -> tuple[float, str]:
     """run_process in a working directory, in a process that does nothing else."""
     with contextlib.chdir(place):
         return run_process(job)
-
-
-def _require_listening(address: str) -> None:
-    """Refuse host:port where nothing listens: ray.init tries for minutes."""
-    place = urlsplit(address if "://" in address else f"//{address}")
-    if place.hostname and place.port:
-        try:
-            socket.create_connection((place.hostname, place.port), timeout=5).close()
-        except OSError as error:
-            raise UsageError(
-                f"Expected a Ray cluster at {address!r}, got {error.strerror or error}; run ray start --head there."
-            ) from error
 
 
 def run_process(job: Runnable, started: Callable[[subprocess.Popen], Any] = lambda process: None) -> tuple[float, str]:

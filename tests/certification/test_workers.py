@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import threading
 
 import pytest
@@ -11,6 +12,7 @@ from lyapnet.certification import Budget, DecreaseCondition, prove
 from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import Question
 from lyapnet.certification.condition import bounded_condition
+from lyapnet.certification.proof import WhereItHolds, bounded_again
 from lyapnet.certification.workers import bounding
 from lyapnet.errors import UsageError
 from tests.certification.planted import domain, loop, riccati
@@ -67,6 +69,43 @@ def test_a_worker_that_is_killed_is_one_line():
     with pytest.raises(UsageError, match="Expected workers that live on, got one killed"), bounding(question, 2) as run:
         list(run(question.undecided, chunks()))
     assert threading.active_count() < 20
+
+
+def test_another_machine_bounds_the_same_or_nothing():
+    """The condition goes there as bytes, and is traced anew: the same boxes to the last bit, or one line."""
+    pickle = pytest.importorskip("cloudpickle")
+    condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
+    bounded = bounded_condition(condition, domain(), 1)
+    question = WhereItHolds(condition, bounded, torch.inf, True)
+    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, bounded.fingerprint)
+    boxes, rounds = single(*domain()), 0
+    while len(boxes.key):
+        rounds += 1
+        (here, axis), (other, same) = question.undecided(boxes), there.undecided(boxes)
+        assert torch.equal(here.lower, other.lower)
+        assert torch.equal(axis, same)
+        boxes = here.halves(axis) if len(axis) else here
+    assert rounds > 3
+    with pytest.raises(UsageError, match="install the same lyapnet, torch and code there"):
+        bounded_again(DecreaseCondition(loop(riccati()), 0.9, 0.03), domain(), 1, bounded.fingerprint)
+
+
+@pytest.mark.slow
+def test_a_cluster_proves_the_same():
+    pytest.importorskip("ray")
+    condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
+    proof = prove(condition, domain(), 10.0, Budget(100, chunk=64, workers=2, ray="local"))
+    alone = prove(condition, domain(), 10.0, Budget(100, chunk=64, workers=2))
+    assert (proof.verdict, proof.boxes, proof.level) == (alone.verdict, alone.boxes, alone.level)
+    assert proof.verdict == "certified"
+
+
+def test_a_cluster_that_is_not_there_is_told_at_once():
+    pytest.importorskip("ray")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+    with pytest.raises(UsageError, match="Connection refused; run ray start"):
+        prove(DecreaseCondition(loop(riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, ray=address))
 
 
 def test_a_device_that_is_not_there_is_one_line():

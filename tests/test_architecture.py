@@ -21,7 +21,7 @@ LEVELS = (
         "tables",
         "types",
     },
-    {"constraints", "contracts", "cost", "files", "horizon", "schema", "sets", "sizes", "systems"},
+    {"cluster", "constraints", "contracts", "cost", "files", "horizon", "schema", "sets", "sizes", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
     {"policy"},

@@ -74,9 +74,8 @@ def prove(
 ) -> Proof:
     """Prove c ≤ 0 and Ẇ ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
-    Counterexamples are sought first, by samples and by ascent from the worst of them, then boxes of lowest W are
-    bounded. A box is dropped where both hold on all of it, or W > level or some h > 0 on all of it, and else cut in
-    two. A counterexample that turns up among their centres lowers the level, and the search goes on under it.
+    Counterexamples are sought first, by samples and ascent, then boxes of lowest W are bounded: dropped where both hold
+    on all of them, or W > level, or some h > 0, and else cut in two. A counterexample among centres lowers the level.
 
     Args:
         condition, degree: in float64, and of the forms that bound it.

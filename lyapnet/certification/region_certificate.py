@@ -281,6 +281,7 @@ def region_certificate(
     report: Callable[[Progress], None] | None = None,
     parameter: Sequence[str] | None = None,
     *,
+    ray: str | None = None,
     started: float | None = None,
 ) -> RegionCertificate:
     """The region of attraction of a controller's receding law.
@@ -293,9 +294,11 @@ def region_certificate(
         keep: a file in which the proof is kept, and from which it goes on.
         report: is told how far the proof is.
         parameter: NAME=lower:upper for each parameter of the plant that may lie anywhere between.
+        ray: of Budget.
         started: time.monotonic() from which the seconds count; now if None.
     """
-    budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
+    begun = time.monotonic() if started is None else started
+    budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
     claim = region_claim(
         controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
         stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
@@ -304,7 +307,7 @@ def region_certificate(
     )  # fmt: skip
     options = {
         "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "disturbance": list(disturbance or ()) or None, "parameter": list(parameter or ()) or None, "keep": keep,
-        "seed": seed,
+        "ray": ray, "disturbance": list(disturbance or ()) or None, "parameter": list(parameter or ()) or None,
+        "keep": keep, "seed": seed,
     }  # fmt: skip
     return RegionCertificate(controller, claim, options)

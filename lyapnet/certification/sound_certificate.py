@@ -192,6 +192,7 @@ def sound_certificate(
     seed: int = 0,
     report: Callable[[Progress], None] | None = None,
     *,
+    ray: str | None = None,
     started: float | None = None,
 ) -> SoundCertificate:
     """The sound claim about a controller.
@@ -205,9 +206,11 @@ def sound_certificate(
         disturbance: STATE=w for each ẋ_i that is pushed by at most w.
         keep: a file in which an unfinished proof is kept.
         report: is told how far the proof is.
+        ray: of Budget.
         started: time.monotonic() from which the seconds count; now if None.
     """
-    budget = Budget(seconds, workers=workers, device=device, started=time.monotonic() if started is None else started)
+    begun = time.monotonic() if started is None else started
+    budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
     claim = sound_claim(
         controller.closed_loop, controller.problem, alpha,
         default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
@@ -216,7 +219,7 @@ def sound_certificate(
     )  # fmt: skip
     options = {
         "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
+        "ray": ray, "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
     }  # fmt: skip
     return SoundCertificate(controller, claim, options)
 

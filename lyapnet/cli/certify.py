@@ -2,9 +2,6 @@
 
 import json
 import math
-import re
-import shlex
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -12,10 +9,11 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from typer.core import TyperGroup
 
+from lyapnet.cli.by_kind import ByKind
 from lyapnet.cli.claims import (
     AsJson,
+    Delta,
     Device,
     Disturbance,
     FigureFile,
@@ -23,61 +21,20 @@ from lyapnet.cli.claims import (
     Law,
     Overrides,
     Radius,
+    Ray,
     Refine,
     ReportFolder,
     Seconds,
     Seed,
     States,
+    TwoSided,
     Value,
     Workers,
     number,
 )
 from lyapnet.cli.options import Debug, Given, Parameter, of_a_controller
 from lyapnet.cli.refining import refined, require_refinable
-from lyapnet.errors import UsageError, did_you_mean
-
-DEFAULT = "statistical"
-
-
-class ByKind(TyperGroup):
-    """A group of commands, one for each kind of claim; what names none of them is for the default one.
-
-    For one version `certify CKPT --kind KIND` is read as `certify KIND CKPT`, with a note.
-    """
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if args[:1] != ["--help"]:
-            args = self._with_kind(args)
-        return super().parse_args(ctx, args)
-
-    def _with_kind(self, args: list[str]) -> list[str]:
-        kind, others = _without_option("--kind", args)
-        if kind is None:  # options may stand before the kind, or none: those of the group itself are none
-            if args and re.fullmatch(r"\w+", args[0]) and args[0] not in self.commands and not Path(args[0]).exists():
-                hint = did_you_mean(args[0], self.commands, "choose one, or name a file.")
-                raise UsageError(f"Expected {', '.join(self.commands)} or a checkpoint, got {args[0]!r}; {hint}")
-            named = next((argument for argument in args if argument in self.commands), DEFAULT)
-            return [named, *(argument for argument in args if argument != named)]
-        kinds = [name for name in self.commands if name != "check"]
-        if kind not in kinds:
-            raise UsageError(f"Expected --kind as one of {', '.join(kinds)}, got {kind!r}; choose one.")
-        command = shlex.join(["lyapnet", "certify", kind, *others])
-        print(f"note: --kind will be removed in the next version; from now on: {command}", file=sys.stderr)
-        return [kind, *others]
-
-
-def _without_option(name: str, args: list[str]) -> tuple[str | None, list[str]]:
-    """(the last value of an option, the arguments without it)."""
-    value, others, rest = None, [], iter(args)
-    for argument in rest:
-        if argument == name:
-            value = next(rest, "")
-        elif argument.startswith(f"{name}="):
-            value = argument.partition("=")[2]
-        else:
-            others.append(argument)
-    return value, others
-
+from lyapnet.errors import UsageError
 
 app = typer.Typer(cls=ByKind)
 
@@ -161,23 +118,16 @@ def sound(
             "Share of ℓ that V pays for.",
         ),
     ] = 0.95,
-    delta: Annotated[
-        float | None,
-        number(
-            lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second",
-            "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
-        ),
-    ] = None,
+    delta: Delta = None,
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
+    ray: Ray = None,
     device: Device = "cpu",
     disturbance: Disturbance = None,
     keep: Keep = None,
     refine: Refine = 0,
-    two_sided: Annotated[
-        bool, typer.Option("--two-sided", help="Bound the optimum from below, too: no control is cheaper.")
-    ] = False,
+    two_sided: TwoSided = False,
     seed: Seed = 0,
     as_json: AsJson = False,
     figure: FigureFile = None,
@@ -206,18 +156,9 @@ def sound(
         made = two_sided_certificate if two_sided else partial(sound_certificate, disturbance=disturbance)
         with proof_progress(notes, "sound") as progress:
             certificate = made(
-                controller,
-                alpha,
-                delta,
-                states,
-                seconds,
-                workers,
-                device,
-                keep=keep,
-                seed=seed,
-                report=progress,
-                started=started,
-            )
+                controller, alpha, delta, states, seconds, workers, device,
+                keep=keep, seed=seed, report=progress, ray=ray, started=started,
+            )  # fmt: skip
         _show(certificate, found, as_json)
         return certificate
 
@@ -242,6 +183,7 @@ def region(
     states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
+    ray: Ray = None,
     device: Device = "cpu",
     disturbance: Annotated[
         list[str] | None,
@@ -266,8 +208,8 @@ def region(
     if refine and (several or value or law or parameter):
         got = "--parameter" if parameter else "several or --value"
         raise UsageError(f"Expected --refine with one checkpoint and one disturbance, got {got}; drop it.")
-    if several and (keep is not None or report is not None):
-        raise UsageError("Expected one disturbance with --keep or --report, got several; name one for each.")
+    if several and (keep is not None or report is not None or ray is not None):
+        raise UsageError("Expected one disturbance with --keep, --report or --ray, got several; name one for each.")
     from lyapnet.certification.disturbances.regions import regions_under_pushes
     from lyapnet.certification.region_certificate import region_certificate
     from lyapnet.certification.report import require_writable
@@ -290,7 +232,7 @@ def region(
         controller = found.load()
         with proof_progress(notes, "region") as progress:
             made = region_certificate(
-                controller, *options, disturbance, keep, seed, progress, parameter, started=started
+                controller, *options, disturbance, keep, seed, progress, parameter, ray=ray, started=started
             )
         _show(made, found, as_json)
         return made
@@ -304,6 +246,16 @@ def region(
 def tube(
     given: Given,
     radius: Radius = None,
+    two_sided: TwoSided = False,
+    beta: Annotated[
+        float | None,
+        number(
+            lambda b: 0 < b <= 1, "in (0, 1]", "more than V is no bound from below",
+            "With --two-sided: the share of V that bounds the optimum from below; 0.95 if none.",
+        ),
+    ] = None,
+    delta: Delta = None,
+    states: States = None,
     seconds: Seconds = 60.0,
     workers: Workers = 1,
     seed: Seed = 0,
@@ -311,19 +263,26 @@ def tube(
     figure: FigureFile = None,
     report: ReportFolder = None,
     debug: Debug = False,
-) -> None:
+) -> None:  # fmt: skip
     """Where all closed loops from X₀ go up to T, and what they cost: proved."""
     begun = time.monotonic()
     from lyapnet.certification.report import require_writable
+    from lyapnet.certification.sound_certificate import parse_set
     from lyapnet.certification.tables import proof_progress
     from lyapnet.certification.tubes.certificate import tube_certificate
+    from lyapnet.certification.tubes.two_sided import two_sided_tube
 
+    if not two_sided and (beta, delta, states) != (None, None, None):
+        raise UsageError("Expected --beta, --delta and --set with --two-sided, got them alone; they are of that side.")
+    if states is not None:
+        parse_set(states)
     require_writable(figure, report)
     controller = given.load()
+    made = partial(tube_certificate, controller)
+    if two_sided:
+        made = partial(two_sided_tube, controller, 0.95 if beta is None else beta, delta, states)
     with proof_progress(Console(stderr=True, highlight=False, markup=False), "tube") as progress:
-        certificate = tube_certificate(
-            controller, radius, seconds, workers, seed, progress, started=begun
-        )  # fmt: skip
+        certificate = made(radius, seconds, workers, seed, progress, started=begun)
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
 

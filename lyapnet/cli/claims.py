@@ -34,8 +34,24 @@ States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:u
 Seconds = Annotated[
     float, number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
 ]  # fmt: skip
+Delta = Annotated[
+    float | None,
+    number(
+        lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second",
+        "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
+    ),
+]  # fmt: skip
+TwoSided = Annotated[
+    bool, typer.Option("--two-sided", help="Bound the optimum from below, too: no control is cheaper.")
+]
 Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        help="Bound boxes by --workers cores of the Ray cluster there: auto, local, ray://…", metavar="ADDRESS"
+    ),
+]
 Disturbance = Annotated[
     list[str] | None,
     typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),

@@ -121,11 +121,10 @@ class TubeCertificate(Certificate):
         return f"The verdict is on the claim that each closed loop from X₀ is in a proved tube{asked}: {why}."
 
     def figure(self) -> figures.Figure:
-        return figures.tube(self.claim, self.controller, self.compared, self._headline())
+        return figures.tube(self.claim, self.controller, self.compared, f"{self.verdict}: {self._proved()}")
 
-    def _headline(self) -> str:
-        claim = self.claim
-        return f"{claim.verdict}: {floored(claim.volume_share)} of X₀, {len(claim.slack):,} boxes"
+    def _proved(self) -> str:
+        return f"{floored(self.claim.volume_share)} of X₀, {len(self.claim.slack):,} boxes"
 
 
 def tube_certificate(

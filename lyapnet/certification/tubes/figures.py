@@ -8,21 +8,25 @@ from matplotlib.figure import Figure
 
 from lyapnet.certification.tubes.tube import TubeClaim
 from lyapnet.controller import Controller
-from lyapnet.drawing import BLUE, GREY, VERMILION, legend_below, numpy_of
+from lyapnet.drawing import BLUE, GREEN, GREY, VERMILION, legend_below, numpy_of
 from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.types import PerState
 
 SHOWN = 12  # closed loops
 
 
-def tube(claim: TubeClaim, controller: Controller, compared: Any, headline: str) -> Figure:
+def tube(
+    claim: TubeClaim, controller: Controller, compared: Any, headline: str, least: tuple[PerState, str] | None = None
+) -> Figure:
     """Bounds of each state over time with some closed loops, and of the cost over the cost itself.
 
     Args:
         compared: states of X₀ with their bounds and optima.
+        least: bounds of the optimum from below at these states, and which controls they are about.
     """
     labels = controller.system.state_labels
     count = len(claim.seen) + 1
-    columns = min(3, count)
+    columns = 2 if count == 4 else min(3, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(3.3 * columns, 2.5 * rows + 0.6), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
@@ -31,7 +35,7 @@ def tube(claim: TubeClaim, controller: Controller, compared: Any, headline: str)
     for panel, k, i in zip(panels, range(len(claim.seen)), claim.seen, strict=False):
         _draw_state(panel, claim, k, trajectory, i)
         panel.set(xlabel="t (s)", ylabel=labels[i])
-    _draw_cost(panels[count - 1], compared)
+    _draw_cost(panels[count - 1], compared, least)
     for panel in panels[count:]:
         panel.set_visible(False)
     figure.suptitle(headline, fontsize=9)
@@ -54,7 +58,7 @@ def _draw_state(panel: Axes, claim: TubeClaim, k: int, trajectory: Any, i: int) 
         lines[0].set_label("some, simulated by steps of Δt")
 
 
-def _draw_cost(panel: Axes, compared: Any) -> None:
+def _draw_cost(panel: Axes, compared: Any, least: tuple[PerState, str] | None) -> None:
     """Bounds over the middle between them, relative to it, and the optima; nothing where nothing is proved."""
     panel.set(xlabel="cost from x₀, proved", ylabel="relative to it")
     if not len(compared.x0):
@@ -65,10 +69,15 @@ def _draw_cost(panel: Axes, compared: Any) -> None:
     panel.fill_between(x, low, high, color=BLUE, alpha=0.2, linewidth=0)
     panel.plot(x, high, color=BLUE, linewidth=1, label="proved: the closed loop costs at most, and at least")
     panel.plot(x, low, color=BLUE, linewidth=1)
-    telling = middle > 0.1 * middle.mean()  # cheaper states, where any bound is wide, leave the picture
+    lowest = compared.low
+    if least is not None:
+        lowest, whose = least
+        shown = f"proved: {whose} costs at least"
+        panel.plot(x, numpy_of((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=shown)
+    telling = (middle > 0.1 * middle.mean()) & lowest.isfinite()  # where any bound is wide, states leave the picture
     if bool(telling.any()):
-        low, high = (compared.low / middle)[telling].min(), (compared.high / middle)[telling].max()
-        panel.set_ylim(min(0.95, float(low)), max(1.05, float(high)))
+        bottom, top = (lowest / middle)[telling].min(), (compared.high / middle)[telling].max()
+        panel.set_ylim(min(0.95, float(bottom)), max(1.05, float(top)))
     if compared.optimum is not None:
         some = middle[: len(compared.optimum)]
         best = compared.optimum / some

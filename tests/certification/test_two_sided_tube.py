@@ -1,0 +1,99 @@
+"""Tubes from two sides: against Riccati's solution, and V that must not be taken for a bound from below."""
+
+import json
+
+import pytest
+import torch
+
+from lyapnet.certification.tubes.two_sided import two_sided_tube
+from lyapnet.cli import main
+from lyapnet.controller import Controller
+from lyapnet.errors import UsageError
+from tests.certification.planted import X0, riccati, stationary
+from tests.certification.test_least_cost import optimum, problem
+from tests.problems import Formula
+from tests.runs import tiny_checkpoint
+
+BETA, DELTA = 0.98, 0.005
+
+
+def in_continuous_time():
+    """The steps of Runge and Kutta: their optima are those of continuous time to 1e-9."""
+    return problem().in_steps(method="rk4")
+
+
+def both_sides(factor=1.0, beta=BETA, **options):
+    V = Formula(lambda t, x: factor * optimum(x) + 0 * t)
+    return two_sided_tube(Controller(in_continuous_time(), V), beta, DELTA, **options)
+
+
+@pytest.fixture(scope="module")
+def riccatis():
+    return two_sided_tube(Controller(in_continuous_time(), stationary(riccati())), BETA, DELTA)
+
+
+def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
+    """What is left of the ratio is β and δT; a funnel would pay for both once more, from above."""
+    result = riccatis.result
+    assert result["verdict"] == "certified"
+    assert result["holds_for"] == "every control"
+    assert result["optima_between"] == 1
+    mean = float(optimum(X0().sample(4000, torch.Generator().manual_seed(0))).mean())
+    expected = mean / (BETA * mean - DELTA * problem().horizon.duration)
+    assert expected - 1e-3 < result["certified_ratio"] < 1.01 * expected
+    assert result["lower_fingerprint"] != result["fingerprint"]
+
+
+def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
+    """V = 0.8 J* bounds the optimum from below, and its law is not the optimal one."""
+    result = both_sides(0.8, seconds=20).result
+    assert result["verdict"] == "certified"
+    assert result["certified_ratio"] > 1.2 * riccatis.result["certified_ratio"]
+    assert result["optima_between"] == 1
+
+
+def test_a_value_that_is_too_high_is_no_bound():
+    certificate = both_sides(1.1, seconds=6)
+    assert certificate.claim.verdict == "certified", "the tube itself is none the worse"
+    assert certificate.verdict != "certified"
+    assert certificate.result["lower_reason"] is not None
+    assert certificate.result.get("optima_between", 1) == 1
+
+
+def test_one_of_the_sides_alone_is_no_certificate(riccatis):
+    certificate = both_sides(radius=1e-9, seconds=20)
+    assert certificate.below.claim.verdict == "certified"
+    assert certificate.verdict == certificate.claim.verdict != "certified"
+
+
+def test_words_formulas_and_figure_are_about_both(riccatis):
+    words, formulas = riccatis.in_words(), riccatis.in_formulas()
+    assert "a tube, proved" in words
+    assert "every control cost at least" in words
+    assert any("min_u" in formula for formula in formulas)
+    figure = riccatis.figure()
+    shown = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    assert "proved: any control costs at least" in shown
+    assert "from above / from below" in figure.get_suptitle()
+
+
+@pytest.mark.usefixtures("few_seconds_for_levels")
+def test_the_command(capsys, tmp_path):
+    command = ["certify", "tube", str(tiny_checkpoint(tmp_path)), "--two-sided", "--beta", "0.8", "--delta", "0.5"]
+    capsys.readouterr()
+    main([*command, "--seconds", "4", "--json", "--report", str(tmp_path / "r")])
+    result = json.loads(capsys.readouterr().out)
+    assert result["kind"] == "tube"
+    assert {"mean_cost", "lower_level", "holds_for", "beta", "delta"} <= result.keys()
+    assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## Again", 1)[1]
+
+
+@pytest.mark.parametrize("option", ["--beta=0.9", "--delta=0.1", "--set=-1:1,-1:1"])
+def test_what_is_of_the_other_side_is_refused_without_it(option, capsys):
+    assert main(["certify", "tube", "zoo:double_integrator", option]) == 2
+    assert "Expected --beta, --delta and --set with --two-sided" in capsys.readouterr().err
+
+
+def test_a_set_that_is_none_is_refused():
+    with pytest.raises(UsageError, match="Expected"):
+        both_sides(set="-1:1,nonsense")

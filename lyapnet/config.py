@@ -79,7 +79,7 @@ class PointwiseConfig:
     region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
     floor: float | None = option(
         None,
-        "Share of the mean ℓ below which violations count as absolute ones; null: 0.01, of a stationary V 1e-4.",
+        "ℓ₀ and φ₀ of it as shares of J̄/T and J̄; null: 0.01, of a stationary V 1e-4.",
         above=0,
     )
     counterexamples: str | None = option(

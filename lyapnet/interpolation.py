@@ -152,7 +152,7 @@ class SmoothCurve(nn.Module):
 
     def _rises(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
         """What each a_k is multiplied with."""
-        return self._risen(t, scale) - torch.sigmoid(-self.STEPS / self.WIDTH).to(t)
+        return self._risen(t, scale) - torch.sigmoid(-self.STEPS.to(t) / self.WIDTH)
 
     def _risen(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
         """σ((τ − τ_k)/w)."""
@@ -163,8 +163,12 @@ class SmoothCurve(nn.Module):
     def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
         """Become the curve closest by least squares, in y and dy/dτ, to a cubic spline through these points.
 
-        It passes the last of them, at T.
+        It passes the last of them, at T. Of numbers that are none it is none.
         """
+        if not values.isfinite().all():
+            self.end.copy_(values[-1])
+            self.weights.fill_(torch.nan)
+            return
         spline = CubicSpline(nodes.double().cpu(), values.double().cpu().flatten(1))
         t = _refined(nodes.double().cpu(), self.BETWEEN)
         y, y_t = (torch.from_numpy(spline(t, order)) for order in (0, 1))
@@ -179,7 +183,7 @@ class SmoothCurve(nn.Module):
             gram = rows.mT @ rows + self.RIDGE * torch.eye(rows.shape[-1]).to(rows)
             weights = torch.linalg.solve(gram, rows.mT @ wanted)
             error = float((rows @ weights - wanted).square().sum())
-            if not error >= best:  # as it is, too, where numbers are none
+            if error < best:
                 best = error
                 self.scale.copy_(scale)
                 self.weights.copy_((weights * unit).unflatten(-1, self.end.shape))

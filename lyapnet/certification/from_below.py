@@ -31,10 +31,18 @@ class FromBelow:
         "certified_ratio": "certified ratio: guaranteed / least cost, ratio of the means",
         "certified_gap": "largest gap between the two / mean least cost",
         "optima_between": "optima of the steps of Δt between the bounds, share of the states",
+        "seconds": "seconds",
+        "fingerprint": "fingerprint of what was bounded",
+        "lower_fingerprint": "fingerprint from below",
     }
 
     def __init__(self, claim: LowerClaim):
         self.claim = claim
+
+    @classmethod
+    def labels_after(cls, above: Mapping[str, str]) -> dict[str, str]:
+        """The labels of both sides; those of seconds and fingerprints at the end."""
+        return {**{key: label for key, label in above.items() if key not in cls.labels}, **cls.labels}
 
     def verdict(self, above: Verdict) -> Verdict:
         """On both sides."""
@@ -77,10 +85,10 @@ class FromBelow:
         least = self.claim.least_cost(value)
         if optimum is None or not len(value) or not bool(least.isfinite().all()):
             return {}
-        some = slice(len(optimum))
+        some, known = slice(len(optimum)), optimum.isfinite()
         between = (least[some] <= optimum) & (optimum <= guaranteed[some])
         return {
-            "optima_between": float(between.double().mean()),
+            "optima_between": float(between[known].double().mean()) if known.any() else None,
             "lower_cost_ratio": ratio_of_means(least[some], optimum),
         }
 
@@ -91,7 +99,7 @@ class FromBelow:
         if claim.level >= claim.wanted:
             return "e, what βV(T, ·) has beyond φ, or q below 0, leaves nothing: allow more seconds, or lower V there"
         if claim.verdict == "falsified" or claim.counterexample is not None:
-            return "V rises faster than a control pays for: lower β, allow more --delta, or train its residual"
+            return "V rises faster than a control pays for: claim less of V, allow more --delta, or train its residual"
         return "seconds spent: allow more"
 
     def in_words(self) -> str:
@@ -120,7 +128,8 @@ class FromBelow:
         below = {"certified": "it does", "falsified": "it does not", "unknown": "undecided within the budget"}
         return f"And on the claim that the bound from below holds on all of X₀: {below[self.claim.verdict]}.{where}"
 
-    def headline(self, verdict: Verdict, ratio: float | None) -> str:
-        """The first line of a figure of both sides."""
-        means = "" if ratio is None else f": from above / from below {ratio:.3f}, means over X₀"
-        return f"{verdict}{means}"
+    def headline(self, verdict: Verdict, ratio: float | None, numbers: str) -> str:
+        """The title of a figure of both sides."""
+        means = "" if ratio is None else f": from above / from below {ratio:.3f}, means over states of X₀"
+        whose = f"; {self.holds_for}" if self.claim.level > -math.inf else ""
+        return f"{verdict}{means}\n{numbers}{whose}"

@@ -46,7 +46,7 @@ def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     """A hash of every source file in some folders, with their names."""
     found = hashlib.sha256()
     for folder in folders:
-        for path in sorted(folder.rglob("*.py")):
+        for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):
             content = path.read_bytes()
             found.update(f"{folder.name}/{path.relative_to(folder)} {len(content)}\n".encode())
             found.update(content)

@@ -13,7 +13,8 @@ from lyapnet.certification.branch_and_bound import Budget, just_above, minimum
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of
-from lyapnet.certification.preconditions import at_time, require_still
+from lyapnet.certification.ignorable_states import ignorable_states
+from lyapnet.certification.preconditions import at_time, domain_around, require_still, without
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.contracts import copied
@@ -203,6 +204,15 @@ def lower_claim(
         beta, delta, duration, D, level, wanted, seen, excess, everywhere, proof.counterexample, proof.boxes,
         time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint, proof.seconds,
     )  # fmt: skip
+
+
+def require_bound_from_below(closed_loop: ClosedLoop, problem: Problem, beta: float, states: Box | None) -> None:
+    """Refuse at once what lower_claim would refuse: a cost, limits or a set D that do not fit."""
+    condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, 0.0, copied(problem))
+    if states is not None:
+        left_out = ignorable_states(condition.closed_loop, problem.constraints)
+        X0, constants = without(problem.initial_states, left_out), condition.closed_loop.system.constants
+        domain_around(without(states, left_out), X0, condition.duration, left_out, list(constants))
 
 
 def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget) -> float:

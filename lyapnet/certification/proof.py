@@ -14,7 +14,7 @@ from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.certification.condition import DecreaseCondition, bounded_condition
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.certification.kept_proofs import KeptProof, Standing, about
+from lyapnet.certification.kept_proofs import KeptProof, Standing, about, hash_of_sources
 from lyapnet.certification.verdict import Verdict
 from lyapnet.certification.workers import bounding
 from lyapnet.errors import UsageError
@@ -105,8 +105,8 @@ def prove(
     def standing() -> Standing:
         return Standing(search, question.level, question.worst, earlier + budget.elapsed)
 
-    anew = partial(bounded_again, condition, (lower, upper), degree, bounded.fingerprint)
-    with bounding(question, budget.workers, budget.ray, anew) as run:
+    again = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
+    with bounding(question, budget.workers, budget.ray, again) as run:
         for _ in search.rounds(question, budget, run):
             if kept is not None and budget.elapsed > saved + KEEP_EVERY:
                 kept.write(standing())
@@ -122,19 +122,24 @@ def prove(
     )  # fmt: skip
 
 
+def proved_by(bounded: BoundedFunction) -> tuple[str, str, str]:
+    """What is bounded, by which sources of lyapnet, and by which torch."""
+    return bounded.fingerprint, hash_of_sources(), str(torch.__version__)
+
+
 def bounded_again(
-    condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int, fingerprint: str
+    condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int, by: tuple[str, str, str]
 ) -> "WhereItHolds":
     """The same question on another machine, where the condition is traced anew.
 
     Raises:
-        UsageError: something else was traced there.
+        UsageError: something else was traced there, or is bounded by other code.
     """
     bounded = bounded_condition(condition, domain, degree)
-    if bounded.fingerprint != fingerprint:
+    if proved_by(bounded) != by:
         raise UsageError(
-            f"Expected what is proved ({fingerprint[:16]}) on each machine of the cluster, got something else "
-            f"({bounded.fingerprint[:16]}); install the same lyapnet, torch and code there."
+            "Expected the same condition, lyapnet and torch on each machine of the cluster, got others; install the "
+            "same versions, and the same code of yours, there."
         )
     return WhereItHolds(condition, bounded, torch.inf, True)
 

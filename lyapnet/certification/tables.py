@@ -13,7 +13,7 @@ from rich.table import Table
 @contextmanager
 def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
     """A bar in a terminal: how much of [0, T] × D, of D or of X₀ a proof has decided. It is told of Progress."""
-    domain = {"region": "D", "tube": "X₀"}.get(kind, "[0, T] × D")
+    domain = {"region": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(kind, "[0, T] × D")
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),

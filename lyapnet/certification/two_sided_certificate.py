@@ -28,13 +28,7 @@ class TwoSidedCertificate(SoundCertificate):
     """The funnel of a sound certificate with the cost in it, and the optimum from below."""
 
     picture: ClassVar[str] = "two_sided.png"
-    labels: ClassVar[Mapping[str, str]] = {
-        **{key: label for key, label in SoundCertificate.labels.items() if key not in ("seconds", "fingerprint")},
-        **FromBelow.labels,
-        "seconds": "seconds",
-        "fingerprint": "fingerprint of what was bounded",
-        "lower_fingerprint": "fingerprint from below",
-    }
+    labels: ClassVar[Mapping[str, str]] = FromBelow.labels_after(SoundCertificate.labels)
 
     def __init__(self, controller: Controller, claim: SoundClaim, lower: LowerClaim, options: Mapping[str, Any]):
         super().__init__(controller, claim, options)
@@ -67,9 +61,9 @@ class TwoSidedCertificate(SoundCertificate):
     def figure(self) -> figures.Figure:
         value, guaranteed, optimum = self.compared
         least, claim = self.below.claim.least_cost(value), self.claim
-        headline = self.below.headline(self.verdict, self.result.get("certified_ratio"))
-        numbers = f"α = β = {claim.alpha:g}, δ = {claim.delta:.3g}; {self.below.holds_for}"
-        return figures.two_sided(value, guaranteed, least, optimum, f"{headline}\n{numbers}", self.below.whose)
+        numbers = f"α = β = {claim.alpha:g}, δ = {claim.delta:.3g}"
+        headline = self.below.headline(self.verdict, self.result.get("certified_ratio"), numbers)
+        return figures.two_sided(value, guaranteed, least, optimum, headline, self.below.whose)
 
 
 def two_sided_certificate(

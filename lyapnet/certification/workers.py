@@ -20,9 +20,11 @@ from torch.utils._pytree import tree_map_only
 
 from lyapnet.certification.boxes import Boxes
 from lyapnet.cluster import connected
-from lyapnet.errors import UsageError, one_line
+from lyapnet.errors import LyapnetError, UsageError, one_line
 
 Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
+
+PATIENCE = 120  # seconds, in which cores of a cluster are free and have begun
 
 _own: list[Any] = []  # of a worker: the question that it was begun with
 
@@ -43,7 +45,7 @@ def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]
 
 @contextmanager
 def bounding(
-    question: Any, workers: int, ray: str | None = None, anew: Callable[[], Any] | None = None
+    question: Any, workers: int, ray: str | None = None, make_question: Callable[[], Any] | None = None
 ) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
     """A `map` of question.undecided over chunks of boxes, by so many processes, copies of this one.
 
@@ -52,13 +54,13 @@ def bounding(
 
     Args:
         ray: the address of a cluster of which so many cores bound boxes, in place of this machine.
-        anew: makes the question there.
+        make_question: makes it there.
 
     Raises:
         UsageError: a worker was killed, of too little memory perhaps, or there is no such cluster.
     """
     if ray is not None:
-        with connected(ray) as cluster, _elsewhere(cluster, anew, workers) as ask:
+        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as ask:
             yield partial(_shared_out, ask, question)
         return
     with _copies(question, workers) as pool:
@@ -66,23 +68,34 @@ def bounding(
 
 
 @contextmanager
-def _elsewhere(cluster: Any, anew: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
+def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
     """A `map` of _undecided by cores of a cluster, whose machines find modules where this one does."""
+    cores = int(cluster.cluster_resources().get("CPU", 0))
+    if workers > cores:
+        raise UsageError(f"Expected at most the {cores} cores of the cluster, got --workers {workers}; ask for fewer.")
     places = {"PYTHONPATH": os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])}
-    actor = cluster.remote(num_cpus=1, runtime_env={"env_vars": places})(_Elsewhere)
-    pool = cluster.util.ActorPool([actor.remote(anew) for _ in range(workers)])
+    worker = cluster.remote(num_cpus=1, runtime_env={"env_vars": places})(ClusterWorker)
+    them = [worker.remote() for _ in range(workers)]
     try:
-        yield lambda asked: map(_own_copy, pool.map(lambda worker, each: worker.undecided.remote(each), asked))
+        cluster.get([each.begin.remote(make_question) for each in them], timeout=PATIENCE)
+        pool = cluster.util.ActorPool(them)
+        yield lambda asked: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), asked))
+    except cluster.exceptions.GetTimeoutError as error:
+        raise UsageError(
+            f"Expected {workers} free cores of the cluster within {PATIENCE} s, got fewer; ask for fewer --workers."
+        ) from error
     except cluster.exceptions.RayError as error:
+        if isinstance(cause := getattr(error, "cause", None), LyapnetError):
+            raise cause from None
         raise UsageError(f"Expected workers of the cluster that live on, got {one_line(error)}") from error
 
 
-class _Elsewhere:
+class ClusterWorker:
     """A worker on another machine."""
 
-    def __init__(self, anew: Callable[[], Any]):
+    def begin(self, make_question: Callable[[], Any]) -> None:
         torch.set_num_threads(1)
-        _own[:] = [anew()]
+        _own[:] = [make_question()]
 
     def undecided(self, asked: tuple[Any, ...]) -> tuple[Any, ...]:
         return _undecided(_own_copy(asked))

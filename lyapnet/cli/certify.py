@@ -272,8 +272,9 @@ def tube(
     from lyapnet.certification.tubes.certificate import tube_certificate
     from lyapnet.certification.tubes.two_sided import two_sided_tube
 
-    if not two_sided and (beta, delta, states) != (None, None, None):
-        raise UsageError("Expected --beta, --delta and --set with --two-sided, got them alone; they are of that side.")
+    alone = [name for name, value in (("--beta", beta), ("--delta", delta), ("--set", states)) if value is not None]
+    if alone and not two_sided:
+        raise UsageError(f"Expected {alone[0]} with --two-sided, got it alone; add --two-sided, or leave it out.")
     if states is not None:
         parse_set(states)
     require_writable(figure, report)
@@ -281,7 +282,9 @@ def tube(
     made = partial(tube_certificate, controller)
     if two_sided:
         made = partial(two_sided_tube, controller, 0.95 if beta is None else beta, delta, states)
-    with proof_progress(Console(stderr=True, highlight=False, markup=False), "tube") as progress:
+    with proof_progress(
+        Console(stderr=True, highlight=False, markup=False), "two-sided tube" if two_sided else "tube"
+    ) as progress:
         certificate = made(radius, seconds, workers, seed, progress, started=begun)
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)

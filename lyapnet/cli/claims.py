@@ -41,15 +41,13 @@ Delta = Annotated[
         "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
     ),
 ]  # fmt: skip
-TwoSided = Annotated[
-    bool, typer.Option("--two-sided", help="Bound the optimum from below, too: no control is cheaper.")
-]
+TwoSided = Annotated[bool, typer.Option("--two-sided", help="Bound the optimum from below, too.")]
 Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
 Ray = Annotated[
     str | None,
     typer.Option(
-        help="Bound boxes by --workers cores of the Ray cluster there: auto, local, ray://…", metavar="ADDRESS"
+        help="Bound boxes by --workers cores of a Ray cluster: auto, local or ray://host:port.", metavar="ADDRESS"
     ),
 ]
 Disturbance = Annotated[

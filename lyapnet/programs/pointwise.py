@@ -24,8 +24,9 @@ class PointwiseCondition:
         Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
-    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ a share (`floor`) of the batch's mean running and whole cost (denominators
-    are detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V there is no end.
+    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ a share (`floor`) of the batch's mean cost per second and of its mean cost
+    (denominators are detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V
+    there is no end.
 
     The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
     half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
@@ -39,8 +40,8 @@ class PointwiseCondition:
         weight: of the term.
         points: drawn and sought in each step.
         further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
-        floor: share of the mean cost below which violations count as absolute ones; 1 %, or 10⁻⁴ of a stationary V. A
-            certificate that allows δ beside (1 − α) ℓ asks for no more than δ/(1 − α) near the goal.
+        floor: of ℓ₀ and φ₀; 1 %, or 10⁻⁴ of a stationary V. A certificate allows δ beside (1 − α) ℓ: with
+            ℓ₀ ≈ δ/(1 − α) violations weigh as much as they do there.
     """
 
     closed_loop: ClosedLoop

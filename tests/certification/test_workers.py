@@ -8,14 +8,16 @@ import threading
 import pytest
 import torch
 
-from lyapnet.certification import Budget, DecreaseCondition, prove
+from lyapnet.certification import Budget, DecreaseCondition, proof, prove
 from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import Question
 from lyapnet.certification.condition import bounded_condition
-from lyapnet.certification.proof import WhereItHolds, bounded_again
+from lyapnet.certification.least_cost import RiseCondition
+from lyapnet.certification.proof import WhereItHolds, bounded_again, proved_by
 from lyapnet.certification.workers import bounding
 from lyapnet.errors import UsageError
 from tests.certification.planted import domain, loop, riccati
+from tests.certification.test_least_cost import problem
 
 
 class InHalves(Question):
@@ -77,7 +79,7 @@ def test_another_machine_bounds_the_same_or_nothing():
     condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
     bounded = bounded_condition(condition, domain(), 1)
     question = WhereItHolds(condition, bounded, torch.inf, True)
-    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, bounded.fingerprint)
+    there = bounded_again(pickle.loads(pickle.dumps(condition)), domain(), 1, proved_by(bounded))
     boxes, rounds = single(*domain()), 0
     while len(boxes.key):
         rounds += 1
@@ -86,8 +88,10 @@ def test_another_machine_bounds_the_same_or_nothing():
         assert torch.equal(axis, same)
         boxes = here.halves(axis) if len(axis) else here
     assert rounds > 3
-    with pytest.raises(UsageError, match="install the same lyapnet, torch and code there"):
-        bounded_again(DecreaseCondition(loop(riccati()), 0.9, 0.03), domain(), 1, bounded.fingerprint)
+    function, sources, torchs = proved_by(bounded)
+    for other in (("0" * 64, sources, torchs), (function, "0" * 64, torchs), (function, sources, "1.0")):
+        with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
+            bounded_again(condition, domain(), 1, other)
 
 
 @pytest.mark.slow
@@ -100,8 +104,27 @@ def test_a_cluster_proves_the_same():
     assert proof.verdict == "certified"
 
 
+@pytest.mark.slow
+def test_what_a_cluster_cannot_do_is_one_line(monkeypatch):
+    """More workers than it has cores; other code there; and SIGTERM stays with who had it."""
+    pytest.importorskip("ray")
+    condition, asked = RiseCondition(loop(riccati()).requires_grad_(False), 0.9, 0.02, problem()), lambda *_: None
+    before = signal.signal(signal.SIGTERM, asked)
+    try:
+        with pytest.raises(UsageError, match="cores of the cluster, got --workers 5000; ask for fewer"):
+            prove(condition, domain(), 1.0, Budget(60, workers=5000, ray="local"))
+        monkeypatch.setattr(proof, "proved_by", lambda bounded: ("other", "code", "here"))
+        with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
+            prove(condition, domain(), 1.0, Budget(60, ray="local"))
+        assert signal.getsignal(signal.SIGTERM) is asked
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def test_a_cluster_that_is_not_there_is_told_at_once():
     pytest.importorskip("ray")
+    with pytest.raises(UsageError, match="Expected a Ray cluster as auto, local or ray://host:port"):
+        prove(DecreaseCondition(loop(riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, ray="ray://host:abc"))
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
     with pytest.raises(UsageError, match="Connection refused; run ray start"):

@@ -29,6 +29,7 @@ CELLS = 128  # that X₀ is cut into to begin with, about
 AT_ONCE = 128  # cells of a chunk: their tubes take the same steps
 SIMULATED = 256  # closed loops, by which units are chosen
 SMALLEST = 1e-9  # share of X₀ at which a cell is cut no more
+NOTHING_KEPT = "Stopped while certifying: a tube keeps nothing."
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ def tube_claim(
             if report is not None:
                 report(Progress(found.boxes, max(0.0, 1 - found.share), budget.elapsed))
     if budget.stop.asked:
-        raise Interrupted("Stopped while certifying: a tube keeps nothing.", 130)
+        raise Interrupted(NOTHING_KEPT, 130)
     return _claim(controller, about, X0, seen, axes, found, budget, radius)
 
 

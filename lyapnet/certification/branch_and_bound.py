@@ -86,6 +86,7 @@ def _require_device(device: str, workers: int, ray: str | None) -> None:
         raise UsageError(f"Expected --device {device} or --ray, got both; cores of a cluster bound boxes.")
 
 
+AHEAD = 4  # chunks of each of several workers in a round, so that none waits for what is done between rounds
 ON_DEVICE = 65_536  # boxes that fill a GPU
 MARGIN = 1e-9
 """How far "just below" and "just above" are, relative to the number itself.
@@ -144,14 +145,15 @@ class Search:
         return min(self.frontier.least, self.given_up)
 
     def rounds(self, question: Question, budget: Budget, run: Callable[..., Iterable[Any]] = map) -> Iterator[None]:
-        """Bound a chunk for each worker, again and again, until all is decided, settled or the budget is spent.
+        """Bound some chunks for each worker, again and again, until all is decided, settled or the budget is spent.
 
         Args:
             run: maps a function over chunks, as `map` does or lyapnet.certification.workers.
         """
         budget.stop.searching = True
         while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):
-            lowest, rest = self.frontier.first(budget.at_once * budget.workers)
+            ahead = 1 if budget.workers == 1 else AHEAD * budget.workers
+            lowest, rest = self.frontier.first(budget.at_once * ahead)
             self.boxes += len(lowest.key)
             for undecided, axis in run(question.undecided, lowest.split(budget.at_once)):
                 question.look_at(undecided)

@@ -163,7 +163,7 @@ def test_table_names_every_route_and_batch(run):
 @pytest.mark.parametrize(
     ("arguments", "what"),
     [
-        (["--task", "pendulum"], "cartpole_balancing, cartpole_balancing_certified, cartpole_balancing_two_sided, cartpole"),
+        (["--task", "pendulum"], "cartpole_balancing, cartpole_balancing_certified, cartpole_balancing_two_sided"),
         (["--task", "missing.yaml"], "missing.yaml"),
         (["--task", "chain:0"], "chain:8"),
         (["--routes", "discrete,quick"], "'quick'"),

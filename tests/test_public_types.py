@@ -1,16 +1,21 @@
-"""py.typed is kept: every type of the public interface is known, and a user's script is clean under pyright strict."""
+"""py.typed is kept: every type of the public interface is known, and a user's script is clean under pyright strict.
+
+An editable install leads checkers to these types too.
+"""
 
 import json
 import os
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
 
 import lyapnet
 from tests.layout import PACKAGE
+from tests.pages import ROOT
 
 pytest.importorskip("pyright", reason="pyright comes with the development extra")
 
@@ -151,3 +156,25 @@ def test_a_script_of_a_user_is_clean_under_strict_and_a_wrong_argument_is_found(
     assert said["summary"]["filesAnalyzed"] == 2
     found = [(Path(each["file"]).name, each["rule"], each["message"]) for each in said["generalDiagnostics"]]
     assert [each[:2] for each in found] == [("wrong.py", "reportArgumentType")], found
+
+
+def editable_path(project: Path, pyproject: str) -> str:
+    """What an editable install of a project puts into the path file of an environment."""
+    (project / "lyapnet").mkdir(parents=True)
+    shutil.copy(PACKAGE / "__init__.py", project / "lyapnet")
+    for name in ("README.md", "LICENSE"):
+        shutil.copy(ROOT / name, project)
+    (project / "pyproject.toml").write_text(pyproject, encoding="utf-8")
+    command = [sys.executable, "-c", "from setuptools.build_meta import build_editable; build_editable('.')"]
+    subprocess.run(command, cwd=project, capture_output=True, check=True)
+    with zipfile.ZipFile(next(project.glob("*.whl"))) as wheel:
+        (name,) = (name for name in wheel.namelist() if name.endswith(".pth"))
+        return wheel.read(name).decode().strip()
+
+
+def test_an_editable_install_is_a_path_that_checkers_follow(tmp_path):
+    pytest.importorskip("setuptools", minversion="77")
+    pyproject = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    assert editable_path(tmp_path / "ours", pyproject) == str(tmp_path / "ours")
+    (line,) = (line for line in pyproject.splitlines() if line.startswith("package-dir"))
+    assert editable_path(tmp_path / "twin", pyproject.replace(line, "")).startswith("import ")

@@ -9,7 +9,7 @@ from torch import Tensor
 from lyapnet.certification.certificates import FROZEN
 from lyapnet.certification.least_cost import LowerClaim
 from lyapnet.certification.sound_certificate import listed
-from lyapnet.certification.verdict import Verdict
+from lyapnet.certification.verdict import Verdict, time_spent
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.types import PerState
 
@@ -100,7 +100,7 @@ class FromBelow:
             return "e, what βV(T, ·) has beyond φ, or q below 0, leaves nothing: allow more seconds, or lower V there"
         if claim.verdict == "falsified" or claim.counterexample is not None:
             return "V rises faster than a control pays for: claim less of V, allow more --delta, or train its residual"
-        return "seconds spent: allow more"
+        return f"{time_spent(claim.set_up)}: allow more"
 
     def in_words(self) -> str:
         claim = self.claim

@@ -29,7 +29,7 @@ from lyapnet.certification.preconditions import (
     without,
 )
 from lyapnet.certification.proof import Progress, Proof, prove
-from lyapnet.certification.verdict import Verdict, verdict_on
+from lyapnet.certification.verdict import Verdict, time_spent, verdict_on
 from lyapnet.constraints import names_of
 from lyapnet.contracts import copied
 from lyapnet.errors import Interrupted, UsageError, signals_taken
@@ -88,6 +88,7 @@ class SoundClaim:
     crossing: float = float("inf")  # a lower bound of W where a closed loop could come to violate one
     violation: Violation | None = None  # of a closed loop from X₀
     disturbance: State | None = None  # w: it is so for ẋ = f + gu + w(t), |w_i(t)| ≤ w_i, then with Ẇ at its worst
+    set_up: float = 0.0  # seconds of the budget before the first box
 
     @property
     def verdict(self) -> Verdict:
@@ -103,7 +104,7 @@ class SoundClaim:
         if self.verdict != "unknown":
             return None
         if self.remaining_volume > 0:
-            return "seconds spent: allow more, or go on with a kept proof"
+            return f"{time_spent(self.set_up)}: allow more, or go on with a kept proof"
         if self.counterexample is not None:
             return "the condition fails close to what X₀ needs"
         if self.crossing <= self.wanted:
@@ -158,7 +159,7 @@ def sound_claim(
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
     begin = beginning_level(condition, at_time(0.0, x_low, x_high), for_levels(budget), just_above(needed))
     crossing = min(begin, crossing_level(condition, domain, for_levels(budget), just_above(needed)))
-    set_up = time.monotonic() - started
+    set_up, spent = time.monotonic() - started, budget.elapsed
     level = min(needed, just_below(min(rim, crossing)))
     proof = proof_within(
         condition, domain, level, budget,
@@ -174,7 +175,7 @@ def sound_claim(
     return SoundClaim(
         alpha, delta, duration, D, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance,
+        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance, spent,
     )  # fmt: skip
 
 

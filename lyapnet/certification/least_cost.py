@@ -71,6 +71,7 @@ class LowerClaim:
     left_out: list[int]
     fingerprint: str
     proof_seconds: float = 0.0  # those of the boxes alone
+    set_up: float = 0.0  # seconds of the budget before the first box
 
     @property
     def verdict(self) -> Verdict:
@@ -194,6 +195,7 @@ def lower_claim(
         outside = minimum(lambda t, x: cost.terminal(x), *sides, levels, enough=just_above(needed))
         rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
         everywhere = min(outside, rim) >= needed
+    set_up = budget.elapsed
     proof = proof_within(
         condition, domain, needed, budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=DEGREE,
@@ -203,6 +205,7 @@ def lower_claim(
     return LowerClaim(
         beta, delta, duration, D, level, wanted, seen, excess, everywhere, proof.counterexample, proof.boxes,
         time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint, proof.seconds,
+        set_up,
     )  # fmt: skip
 
 

@@ -28,7 +28,7 @@ from lyapnet.certification.preconditions import at_centre, first_of
 from lyapnet.certification.proof import Progress, Proof
 from lyapnet.certification.receding_decrease import RecedingDecrease
 from lyapnet.certification.ultimate_bound import extent_of, ultimate_level
-from lyapnet.certification.verdict import Verdict, verdict_on
+from lyapnet.certification.verdict import Verdict, time_spent, verdict_on
 from lyapnet.constraints import Constraints, names_of
 from lyapnet.contracts import copied
 from lyapnet.errors import UsageError
@@ -93,6 +93,7 @@ class RegionClaim:
     extent: Box | None = None  # around {x ∈ D: V(x) ≤ c}, with a disturbance and where ρ ≥ c; 0 along states left out
     ultimate_share: float = math.nan  # of D in {x ∈ D: V(x) ≤ c}; an upper bound
     plants: Plants | None = None  # P; None where it is about one plant
+    set_up: float = 0.0  # seconds of the budget before the first box
 
     @property
     def entered_within(self) -> float:
@@ -175,7 +176,7 @@ class RegionClaim:
                 f"all around it, or allow a smaller --decay{self._or_narrow}"
             )
         if self.proof is not None and self.proof.remaining_volume > 0:
-            return "undecided boxes are left: allow more seconds; beside another equilibrium some always are"
+            return f"{time_spent(self.set_up)}: allow more; beside another equilibrium some boxes always stay undecided"
         if self.rim <= self.wanted:
             return "the region meets the boundary of D or a constraint, as far as bounds tell: choose a larger set"
         return "V(0, ·) does not fall close to what X₀ needs"
@@ -248,7 +249,7 @@ def region_claim(
         kept.require(decay, D, w, names)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
     contraction, slowest, level = _open(condition, goal, setting, seen, rim, budget, kept)
-    proof, rho = None, -math.inf
+    proof, rho, set_up = None, -math.inf, budget.elapsed
     if condition.hole > 0:
         options = {"generator": generator, "report": report, "keep": keep, "replay": replay}
         proof = proof_within(condition, domain, level, budget, **options)
@@ -259,6 +260,7 @@ def region_claim(
         decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
         left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants,
+        set_up,
     )  # fmt: skip
 
 

@@ -17,3 +17,12 @@ def verdict_on(proved: float, wanted: float, fails: float | None, least: float) 
     if proved >= wanted:
         return "certified"
     return "falsified" if fails is not None and fails <= least else "unknown"
+
+
+def time_spent(set_up: float) -> str:
+    """Why a search ended with boxes undecided.
+
+    Args:
+        set_up: seconds of the budget that had passed before the first box: importing, tracing, D and its levels.
+    """
+    return f"seconds spent, {set_up:.0f} of them before the first box"

@@ -259,8 +259,7 @@ def region_claim(
     return RegionClaim(
         decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
-        left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants,
-        set_up,
+        left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants, set_up,
     )  # fmt: skip
 
 

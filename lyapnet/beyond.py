@@ -69,7 +69,7 @@ class ContinuedPolicy(ValuePolicy):
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None = None):
         if beyond not in (None, *BEYOND):
             raise ValueError(f"Expected beyond as one of {', '.join(BEYOND)}, got {beyond!r}; choose one of them.")
-        regulator = Regulator(problem) if beyond == "riccati" else None
+        regulator = Regulator(problem, spread=True) if beyond == "riccati" else None
         super().__init__(problem, ContinuedValue(policy.V, problem.horizon.duration, beyond, regulator))
         self.policy, self.beyond, self.regulator, self.duration = policy, beyond, regulator, problem.horizon.duration
         self.held: bool = policy.held
@@ -103,6 +103,8 @@ class Regulator(nn.Module):
 
     Args:
         purpose, instead: what asks for it, and what else can be done, for messages.
+        spread: where q does not see every mode that has to be stabilised, pay φ's Hessian besides q, an Nth of it in
+            each of the N steps of T, as a task that weighs its end alone asks to be held there.
 
     Raises:
         ValueError: the goal is no equilibrium, or no linear law stabilises it.
@@ -111,7 +113,9 @@ class Regulator(nn.Module):
     P: Matrix
     K: Float[Tensor, "m n"]
 
-    def __init__(self, problem: Problem, purpose: str = "beyond=riccati", instead: str = "take hold"):
+    def __init__(
+        self, problem: Problem, purpose: str = "beyond=riccati", instead: str = "take hold", spread: bool = False
+    ):
         super().__init__()
         if problem.system.constants:
             raise ValueError(f"Expected a single problem for {purpose}, got a family; {instead} or receding.")
@@ -124,28 +128,22 @@ class Regulator(nn.Module):
         (Q, S), (_, R) = (
             [np.asarray(part) / 2 for part in row] for row in hessian(lambda *z: exact.step(*z)[1], (x, u))
         )
-        counts = (np.eye(len(A)) != A).any(0) | Q.any(0) | S.any(1)
-        A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
         try:
-            if not counts.any():
-                raise ValueError("no state has a part in it")
-            P = solve_discrete_are(A, B, Q, R, s=S)
+            P, K = _stabilising(A, B, Q, S, R)
         except (ValueError, np.linalg.LinAlgError) as error:
-            raise ValueError(
-                f"Expected a goal that a linear law stabilises, and a cost q that sees every mode, for {purpose}, "
-                f"got others ({error}); give Q more weights, or {instead}."
-            ) from error
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
-        slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
-        if slowest >= 1 - STILL:
-            raise ValueError(
-                f"Expected a cost q that sees every mode which does not decay for {purpose}, got a regulator "
-                f"with a factor of {slowest:.9g} in each step; give Q more weights, or {instead}."
-            )
+            Q_T = np.asarray(hessian(exact.cost.terminal, x)) / 2
+            try:
+                if not spread:
+                    raise
+                P, K = _stabilising(A, B, Q + Q_T / exact.horizon.steps, S, R)
+            except (ValueError, np.linalg.LinAlgError):
+                raise ValueError(
+                    f"Expected a goal that a linear law stabilises, and a cost q that sees every mode which does not "
+                    f"decay, for {purpose}, got others ({error}); give Q more weights, or {instead}."
+                ) from error
         self.problem = problem
-        among_all = np.eye(len(counts))[counts]
-        self.register_buffer("P", torch.as_tensor(among_all.T @ P @ among_all).to(problem.goal), persistent=False)
-        self.register_buffer("K", torch.as_tensor(K @ among_all).to(problem.goal), persistent=False)
+        self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
+        self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
 
     def forward(self, x: State) -> Control:
         return self.problem.controls.project(self.problem.rest - apply(self.K, x - self.problem.goal))
@@ -153,6 +151,27 @@ class Regulator(nn.Module):
     def cost(self, x: State) -> PerState:
         """What is left to pay, without limits."""
         return quadratic_form(self.P, x - self.problem.goal)
+
+
+def _stabilising(
+    A: np.ndarray, B: np.ndarray, Q: np.ndarray, S: np.ndarray, R: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """P and K of a step x' = Ax + Bu that costs xᵀQx + 2xᵀSu + uᵀRu.
+
+    Raises:
+        ValueError, LinAlgError: there is none under which all states that count decay.
+    """
+    counts = (np.eye(len(A)) != A).any(0) | Q.any(0) | S.any(1)
+    if not counts.any():
+        raise ValueError("no state has a part in it")
+    A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
+    P = solve_discrete_are(A, B, Q, R, s=S)
+    K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
+    slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
+    if slowest >= 1 - STILL:
+        raise ValueError(f"a regulator with a factor of {slowest:.9g} in each step")
+    among_all = np.eye(len(counts))[counts]
+    return among_all.T @ P @ among_all, K @ among_all
 
 
 class LaterPolicy(ValuePolicy):

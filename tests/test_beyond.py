@@ -9,7 +9,7 @@ from scipy.linalg import solve_discrete_are
 from torch.testing import assert_close
 
 from lyapnet import Controller
-from lyapnet.beyond import BEYOND
+from lyapnet.beyond import BEYOND, Regulator
 from lyapnet.cost import QuadraticCost, TargetCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.afterwards import afterwards, in_plain_data
@@ -154,11 +154,23 @@ def test_where_there_is_no_regulator_it_says_so(system, cost, reason):
         Controller(problem_of(system, cost), Quadratic(torch.eye(system.n)), beyond="riccati")
 
 
-def test_a_mode_that_the_cost_does_not_see_is_no_regulator():
+def test_what_q_does_not_see_is_weighed_as_at_the_end():
+    """The law is that of a q which is an Nth of φ, and brings the state to rest."""
+    system = DoubleIntegrator()
+    end, R = torch.diag(torch.tensor([3.0, 1.0])), [[1.0]]
+    problem = problem_of(system, QuadraticCost(torch.zeros(2, 2), R, end))
+    seen = problem_of(system, QuadraticCost(end / (10 * 0.1), R, end))  # N = 10 steps of 0.1 s
+    assert_close(Regulator(problem, spread=True).K, Regulator(seen).K, rtol=1e-9, atol=0)
+    loop = Controller(problem, Quadratic(torch.eye(2)), beyond="riccati").rollout(0.1 * X, steps=200)
+    assert float(loop.x[-1].abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize(("weight", "spread"), [(0.0, True), (1.0, False)])
+def test_a_mode_that_the_cost_does_not_see_is_no_regulator(weight, spread):
     """scipy has a solution all the same: no gain, and a cart that drifts for ever."""
-    unseen = QuadraticCost(torch.zeros(2, 2), [[1.0]], torch.eye(2))
+    unseen = QuadraticCost(torch.zeros(2, 2), [[1.0]], weight * torch.eye(2))
     with pytest.raises(ValueError, match=r"every mode.*give Q more weights"):
-        Controller(problem_of(DoubleIntegrator(), unseen), Quadratic(torch.eye(2)), beyond="riccati")
+        Regulator(problem_of(DoubleIntegrator(), unseen), spread=spread)
 
 
 @pytest.mark.parametrize("steps", [0, -1])

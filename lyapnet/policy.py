@@ -31,6 +31,7 @@ class ValuePolicy(nn.Module):
 
     held: bool = False  # whether u is made to be held for Δt from t on
     origin: str = ""  # where V and u come from, in words, if they were made elsewhere
+    precision: str | None = None  # of the arithmetic in which u is computed, if its rounding counts; else real numbers
     system: ControlAffineSystem
     cost: Cost
     controls: ControlSet

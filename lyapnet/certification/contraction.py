@@ -17,6 +17,7 @@ from lyapnet.certification.branch_and_bound import Budget, minimum
 from lyapnet.certification.preconditions import at_time, beside, first_of, over_time
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import decisions
+from lyapnet.graphs.rounding import rounding
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import PerState, State, Time
@@ -26,6 +27,9 @@ GROWTH, SIZES = 1.6, 20  # sizes of the box that are tried, as long as they do, 
 NEAR = 1e-6  # how far YZ may be from 1
 LEAST = 0.2  # of the linearised law's own rate, that is enough; no more than half of what Y has at the goal
 CORNERS = 6  # axes of P at whose corners laws are linearised
+NESTED, CLOSER = 10, 0.9  # balls in each other that rounding leaves, at most, as long as each is so much smaller
+PIECES = 256  # of the box around such a ball, about
+LITTLE = 1e-12  # radius of a ball in which no smaller one is sought
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,11 @@ class Contraction:
 
 
 class _Law:
-    """F(0, x), as its own operations at one x, so that its derivative is theirs; as it is on batches."""
+    """F(0, x) in real numbers: its own operations at one x, so that its derivative is theirs; as it is on batches."""
 
     def __init__(self, loop: ClosedLoop, states: Box):
         self.loop, self.domain, self.constants = loop, over_time(states, 0.0), loop.system.constants
-        self.bounded = BoundedFunction(lambda t, x: (self._declared(t, x),), self.domain)
+        self.bounded = BoundedFunction(lambda t, x: (self._declared(t, x),), self.domain, exact=True)
         decided = decisions(self.bounded.graph)
         self.decisions = None if decided is None else BoundedFunction(decided, self.domain)
 
@@ -195,6 +199,45 @@ def contraction_around(
             break
         found = larger
     return found, slowest
+
+
+def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Box, seen: Sequence[int]) -> float:
+    """How far from the goal closed loops stay in the end, at most, where u is rounded: ẋ = F̂(x) in place of F(x).
+
+    While a closed loop is in B, ‖Y(x − x_e)‖ falls at the rate κ, but for ‖Y(F̂ − F)‖. In the end it is therefore within
+    a ball, R = sup ‖Y(F̂ − F)‖/κ over B; hence within another one, over the box around the first; and so on. In norms of
+    x that is R/σ, with the least singular value σ of Y, beside the distance of x_e.
+
+    Args:
+        around: the contraction of F, with a set within B that no closed loop of F̂ leaves.
+        goal, states, seen: of contraction_around.
+    """
+
+    def error(t: Time, x: State) -> tuple[State]:
+        rounded = loop.system.dynamics(x, loop.policy(t, x))
+        with rounding(counted=False):
+            return (rounded - loop.system.dynamics(x, loop.policy(t, x)),)
+
+    bounded, n, Y = BoundedFunction(error, over_time(states, 0.0)), around.box.dimension, around.coordinates
+    chosen, box, radius = list(seen), around.box, math.inf
+    of_ball = torch.linalg.vector_norm(_inverse(Y, len(seen)), dim=-1)
+    axes = [1 + i for i in (*seen, *loop.system.constants)]
+    for _ in range(NESTED):
+        whole = beside(box, states)
+        ((low, high),) = bounded.bounds(*pieces(*over_time(whole, 0.0), axes, PIECES))
+        size = torch.maximum(low.abs(), high.abs())[:, chosen] @ Y.abs().mT
+        found = float(torch.linalg.vector_norm(size, dim=-1).max()) / around.rate * (1 + NEAR)
+        if not found < CLOSER * radius:
+            break
+        radius = found
+        if radius < LITTLE:
+            break
+        reach = torch.zeros(n, dtype=goal.dtype)
+        reach[chosen] = (of_ball * radius + around.offset) * (1 + NEAR)
+        low, high = goal[:n] - reach, goal[:n] + reach
+        box = Box(torch.maximum(low, around.box.lower), torch.minimum(high, around.box.upper))
+    left = around.offset + radius / float(torch.linalg.matrix_norm(Y, -2)) * (1 + NEAR)
+    return min(left, float(torch.linalg.vector_norm(around.box.reach_from(goal[:n]))))
 
 
 def _slowest(A: np.ndarray) -> float:

@@ -10,7 +10,7 @@ import torch
 
 from lyapnet.certification.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.certification.condition import own_constraints
-from lyapnet.certification.contraction import Contraction, contraction_around
+from lyapnet.certification.contraction import Contraction, contraction_around, distance_left
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.certification.funnel import (
     LEVELS,
@@ -32,6 +32,7 @@ from lyapnet.certification.verdict import Verdict, time_spent, verdict_on
 from lyapnet.constraints import Constraints, names_of
 from lyapnet.contracts import copied
 from lyapnet.errors import UsageError
+from lyapnet.policy import ValuePolicy
 from lyapnet.problem import Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
@@ -53,6 +54,10 @@ class RegionClaim:
     it leaves it or violates a constraint, V falls until the hole is reached, none leaves the hole, and there all go to
     one equilibrium exponentially, at the rate κ, for ever. It is within `contraction.offset` of the goal: rounding,
     where the goal is an equilibrium of u(0, ·) itself.
+
+    Where u is computed in a `precision` that rounds, V̇ ≤ … holds of every value that rounding may leave of u; F is that
+    of u in real numbers. Closed loops then go to no equilibrium, but all come, at the rate κ, within `distance_left` of
+    the goal, as t → ∞.
 
     With a disturbance, w_i > 0 for some i, the claim is about ẋ = F(x) + w(t), whatever w(t) is, with |w_i(t)| ≤ w_i.
     Pushes do not fade at the goal, where V̇ does: V need not fall in the hole {x ∈ D: V(x) < c}, nothing contracts, and
@@ -94,6 +99,8 @@ class RegionClaim:
     ultimate_share: float = math.nan  # of D in {x ∈ D: V(x) ≤ c}; an upper bound
     plants: Plants | None = None  # P; None where it is about one plant
     set_up: float = 0.0  # seconds of the budget before the first box
+    precision: str | None = None  # in which u is computed; None in real numbers
+    distance_left: float = math.nan  # of closed loops from the goal in the end, where u is rounded and none is pushed
 
     @property
     def entered_within(self) -> float:
@@ -255,11 +262,15 @@ def region_claim(
         proof = proof_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _end(condition, D, n, budget)
+    rounded = closed_loop.policy.precision if isinstance(closed_loop.policy, ValuePolicy) else None
+    proved = contraction if rounded is not None and rho > -math.inf else None
+    left = math.nan if proved is None else distance_left(condition.closed_loop, proved, goal, D, seen)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
         decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
         left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants, set_up,
+        rounded, left,
     )  # fmt: skip
 
 

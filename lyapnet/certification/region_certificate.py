@@ -1,5 +1,6 @@
 """Certificates by proof of the receding law: a region of attraction."""
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -66,6 +67,8 @@ class RegionCertificate(Certificate):
         "contraction_box": "B",
         "contraction_rate": "κ, 1/s",
         "equilibrium_offset": "distance of the equilibrium from the goal, at most",
+        "precision": "u is computed in",
+        "distance_left": "distance from the goal that rounding leaves in the end, at most",
         "constraints": "constraints that no closed loop of the region violates",
         "counterexample": "counterexample of lowest V",
         "remaining_volume": "share of D undecided",
@@ -117,6 +120,9 @@ class RegionCertificate(Certificate):
                 "entered_within": claim.entered_within,
                 "ultimate_extent": [claim.extent.lower.tolist(), claim.extent.upper.tolist()],
             }  # fmt: skip
+        if claim.precision is not None:
+            around |= {"precision": claim.precision}
+            around |= {} if math.isnan(claim.distance_left) else {"distance_left": claim.distance_left}
         searched = {} if proof is None else {
             "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
         }  # fmt: skip
@@ -158,10 +164,15 @@ class RegionCertificate(Certificate):
             plants = f"for each plant of this model with constant {ends}"
             equilibrium = "one equilibrium of their plant exponentially, for ever,"
         if B is not None:
+            end = f"all go to {equilibrium} which is within {B.offset:.3g} of the goal (in the norm of x)"
+            if claim.precision is not None:
+                end = (
+                    f"all come within {claim.distance_left:.3g} of the goal (in the norm of x) as t → ∞, "
+                    f"exponentially, and stay so close, however each operation of u is rounded in {claim.precision}"
+                )
             return (
                 f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants}: no "
-                f"closed loop that starts in it leaves it{kept}, and all go to {equilibrium} "
-                f"which is within {B.offset:.3g} of the goal (in the norm of x)."
+                f"closed loop that starts in it leaves it{kept}, and {end}."
             )
         assert claim.extent is not None
         names, (lower, upper) = (
@@ -204,12 +215,15 @@ class RegionCertificate(Certificate):
         if claim.plants is not None:
             each = f", for each p = ({', '.join(claim.plants.nominal)}) ∈ P = {[*claim.plants.ranges.values()]}"
         inside = f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''}"
+        rounded = ""
+        if claim.precision is not None:
+            rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
         if self.pushes:
             c = repr(claim.hole) if claim.hole > 0 else "c"
             w = ", ".join(f"w({name}) = {w!r}" for name, w in self.pushes.items())
             return [
                 f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
-                f"at each x ∈ D with {c} ≤ V ≤ {rho}{each}",
+                f"at each x ∈ D with {c} ≤ V ≤ {rho}{each}{rounded}",
                 inside,
             ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
@@ -217,10 +231,10 @@ class RegionCertificate(Certificate):
         Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
             f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
-            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{each}",
+            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{each}{rounded}",
             f"{inside},  V > {hole} > 0 on the boundary of {box}",
             f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
-            f"continuous{each}; {Y}",
+            f"continuous{each}{', without rounding' * bool(rounded)}; {Y}",
         ]
 
     def of_the_verdict(self) -> str:

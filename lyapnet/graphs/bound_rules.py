@@ -15,6 +15,7 @@ from lyapnet.graphs import elementary_functions as functions
 from lyapnet.graphs import taylor
 from lyapnet.graphs.branches import CHOICES, JUMPS, KINKS
 from lyapnet.graphs.linear_systems import LINEAR_SYSTEMS
+from lyapnet.graphs.rounding import ROUNDED
 from lyapnet.graphs.taylor import TaylorForm
 
 aten = torch.ops.aten
@@ -153,6 +154,18 @@ def _mean(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False
     """Σ x over some axes, divided by their length."""
     total = _sum(x, dim, keepdim)
     return _multiply(total, total.shape.numel() / x.shape.numel())
+
+
+# Rounding in another arithmetic
+
+
+@rule(ROUNDED)
+def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) -> TaylorForm:
+    """y (1 + θ) + η; nothing is known where y may exceed the largest number."""
+    y = y if isinstance(y, TaylorForm) else taylor.constant_form(_tensor(y), at)
+    size = y.magnitude * (1 + 1e-9)  # for the rounding of these lines
+    radius = y.radius + (relative * size + absolute) * (1 + 1e-9)
+    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).rounded()
 
 
 # Functions of one number

@@ -26,6 +26,7 @@ from lyapnet.graphs import taylor
 from lyapnet.graphs.bound_kernel.kernel import BoundKernel, kernel_of
 from lyapnet.graphs.bound_kernel.program import Support, of_boxes
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
+from lyapnet.graphs.rounding import rounding
 from lyapnet.graphs.simplification import with_known_truths, without_copies
 from lyapnet.graphs.taylor import TaylorForm, box_form, wide_axes
 from lyapnet.graphs.tracing import trace
@@ -43,6 +44,7 @@ class BoundedFunction:
             control flow does not depend on their values.
         sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
         degree: of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
+        exact: bounds the function in real numbers, also where it stands for one that a program rounds.
 
     Attributes:
         graph: the function as its torch operations, at one (t, x).
@@ -56,6 +58,7 @@ class BoundedFunction:
         function: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
         sample: tuple[Corner, Corner],
         degree: int = 2,
+        exact: bool = False,
     ):
         lower, upper = sample
         self.degree = degree
@@ -63,7 +66,9 @@ class BoundedFunction:
         share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
-            self.graph = copy.deepcopy(trace(function, first, others))  # with constants that no one else writes to
+            with rounding(counted=not exact):
+                graph = trace(function, first, others)
+            self.graph = copy.deepcopy(graph)  # with constants that no one else writes to
         except LyapnetError as error:
             raise UsageError(str(error)) from error
         except (Exception, SystemExit) as error:

@@ -19,6 +19,7 @@ from lyapnet.rollout import Rollout
 from lyapnet.types import Control, PerState, State, Time
 
 STATES = 1000  # at which functions of others are tried
+IN_PYTHON = "functions from Python, read in real numbers"
 LEAVES = 1e-6  # of the largest |u|, by which it may be outside of U: rounding in float32
 
 
@@ -51,11 +52,15 @@ class GivenLaw(ValuePolicy):
     Args:
         function: k, (k, n) ↦ (k, m).
         origin: where v and k come from, in words.
+        precision: of the arithmetic in which k is computed, whose rounding its bounds count; None for real numbers.
     """
 
-    def __init__(self, problem: Problem, V: GivenValue, function: nn.Module, origin: str = "functions from Python"):
+    def __init__(
+        self, problem: Problem, V: GivenValue, function: nn.Module, origin: str = IN_PYTHON,
+        precision: str | None = None,
+    ):  # fmt: skip
         super().__init__(problem, V)
-        self.function = function
+        self.function, self.precision = function, precision
         limits = " clamped to U" if self.controls.limited else ""
         self.origin = (
             f"V(0, x) is V(x) − V(x*) with V(x*) = {float(V.at_goal)!r}, u(0, x) is u(x){limits}, and V and u are "
@@ -74,8 +79,9 @@ def controller_of(
     problem: Problem,
     value: nn.Module,
     law: nn.Module,
-    origin: str = "functions from Python",
+    origin: str = IN_PYTHON,
     config: Config | None = None,
+    precision: str | None = None,
 ) -> Controller:
     """A controller of V(x) and u(x) that were made elsewhere, for `certify region` and its like.
 
@@ -87,6 +93,7 @@ def controller_of(
         law: (k, n) ↦ (k, m).
         origin: where both come from, as a certificate says it.
         config: that the problem comes from, for reports.
+        precision: of GivenLaw.
 
     Raises:
         UsageError: it is about a family, or V or u has another shape.
@@ -97,7 +104,7 @@ def controller_of(
     for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):
         _require_size(name, function, problem.goal, size)
     V = GivenValue(v, problem.goal)
-    policy = GivenLaw(problem, V, k, origin)
+    policy = GivenLaw(problem, V, k, origin, precision)
     _note_where_it_leaves(policy, problem)
     return Controller(problem, V, Rollout(problem, policy, gradient="backprop"), config=config)
 

@@ -1,7 +1,7 @@
 """ONNX operators as torch functions of float64 numbers, with the semantics of opset 18 and later.
 
 Each takes the node's inputs and its attributes by their names in ONNX. Shapes, axes and exponents are plain Python
-numbers: they are constants of the graph.
+numbers: they are constants of the graph. An operator that rounds takes the arithmetic of its type first.
 """
 
 import math
@@ -13,11 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-KINDS = {  # onnx.TensorProto: float and double, which are real numbers here; truths; integers
-    **dict.fromkeys((1, 11), torch.float64),
-    9: torch.bool,
-    **dict.fromkeys((2, 3, 4, 5, 6, 7, 12, 13), torch.int64),
-}
+from lyapnet.importing.arithmetic import LARGEST_ANGLE, REPRESENTED, Numbers
+
+SLOPE = 0.009999999776482582  # of LeakyRelu unless it is given: 0.01 in float32
 
 
 class Operator(NamedTuple):
@@ -25,6 +23,32 @@ class Operator(NamedTuple):
 
     function: Callable[..., Any]
     plain: tuple[int, ...] = ()  # the inputs that are handed over as plain numbers, not as tensors
+    rounds: bool = True  # whether it rounds floating-point numbers, in the arithmetic that it then takes first
+    whole: bool = False  # whether it may be of whole numbers
+
+
+def _basic(function: Callable[..., Tensor], whole: bool = False) -> Operator:
+    """An operation whose result is rounded correctly."""
+    return Operator(lambda numbers, *tensors: numbers.rounded(function(*tensors)), whole=whole)
+
+
+def _elementary(name: str, function: Callable[[Tensor], Tensor]) -> Operator:
+    """A function of one number."""
+    return Operator(lambda numbers, x: numbers.function(name, function(x)))
+
+
+def _wave(name: str, function: Callable[[Tensor], Tensor]) -> Operator:
+    """A function of an angle."""
+
+    def computed(numbers: Numbers, x: Tensor) -> Tensor:
+        return numbers.function(name, function(numbers.limited(x, LARGEST_ANGLE)))
+
+    return Operator(computed)
+
+
+def _exact(function: Callable[..., Any], *plain: int, whole: bool = True) -> Operator:
+    """An operation that does not round."""
+    return Operator(function, plain, rounds=False, whole=whole)
 
 
 def _clip(x: Tensor, low: float | None = None, high: float | None = None) -> Tensor:
@@ -32,19 +56,23 @@ def _clip(x: Tensor, low: float | None = None, high: float | None = None) -> Ten
 
 
 def _gemm(
-    a: Tensor, b: Tensor, c: Tensor | None = None, alpha: float = 1.0, beta: float = 1.0, transA: int = 0,
-    transB: int = 0,
+    numbers: Numbers, a: Tensor, b: Tensor, c: Tensor | None = None, alpha: float = 1.0, beta: float = 1.0,
+    transA: int = 0, transB: int = 0,
 ) -> Tensor:  # fmt: skip
     """α · ab + β · c."""
-    product = (a.mT if transA else a) @ (b.mT if transB else b)
-    product = product if alpha == 1 else alpha * product
-    return product if c is None else product + (c if beta == 1 else beta * c)
+    a, b = (a.mT if transA else a), (b.mT if transB else b)
+    y = numbers.product(a, b, alpha)
+    y = y if alpha == 1 else alpha * y
+    if c is not None:
+        c = numbers.summands(c, 1, max(1.0, abs(beta)))
+        y = y + (c if beta == 1 else beta * c)
+    return numbers.rounded(y, 0, lost=1 + abs(alpha) + abs(beta))
 
 
-def _power(x: Tensor, exponent: Any) -> Tensor:
+def _power(numbers: Numbers, x: Tensor, exponent: Any) -> Tensor:
     """xᵖ of one number p."""
     (p,) = exponent if isinstance(exponent, list) else (exponent,)
-    return x**p
+    return numbers.function("Pow", x**p)
 
 
 def _softplus(x: Tensor) -> Tensor:
@@ -52,21 +80,27 @@ def _softplus(x: Tensor) -> Tensor:
     return functional.softplus(x, threshold=40)
 
 
+def _elu(numbers: Numbers, x: Tensor, alpha: float = 1.0) -> Tensor:
+    below = numbers.rounded(numbers.function("Exp", torch.exp(x.clamp(max=0))) - 1)
+    return x.relu() + numbers.rounded(alpha * below)
+
+
 def _divide(x: Tensor, y: Tensor) -> Tensor:
     whole = not x.is_floating_point() and not y.is_floating_point()
     return torch.div(x, y, rounding_mode="trunc") if whole else x / y
 
 
-def _cast(x: Tensor, to: int, saturate: int = 1) -> Tensor:
-    """x as another kind of number; less than float32 is none, as that would round."""
-    if to not in KINDS:
-        raise ValueError(f"type {to} of onnx.TensorProto in the place of float or double")
-    return x.to(KINDS[to])
+def _cast(numbers: Numbers, x: Tensor, to: int, saturate: int = 1) -> Tensor:
+    """x as another kind of number."""
+    if REPRESENTED[to] == torch.bool:
+        return x if x.dtype == torch.bool else x != 0
+    y = x.to(REPRESENTED[to])
+    return numbers.rounded(y) if x.is_floating_point() and y.is_floating_point() else y
 
 
 def _constant_of_shape(shape: list[int], value: Tensor | None = None) -> Tensor:
     value = torch.zeros(1, dtype=torch.float64) if value is None else value
-    return value.reshape(()).expand(shape).clone()
+    return value.reshape(()).expand(shape)
 
 
 def _reshape(x: Tensor, shape: list[int], allowzero: int = 0) -> Tensor:
@@ -103,7 +137,8 @@ def _slice(
     for start, end, axis, step in zip(starts, ends, axes, steps, strict=True):
         size = x.shape[axis]
         last = None if step < 0 and end < -size else end  # a slice that goes down then includes the first
-        x = _gather(x, [*range(size)][start:last:step], axis)
+        chosen = range(size)[start:last:step]
+        x = x.narrow(axis, chosen.start, len(chosen)) if step == 1 else _gather(x, [*chosen], axis)
     return x
 
 
@@ -111,6 +146,8 @@ def _gather(x: Tensor, indices: Any, axis: int = 0) -> Tensor:
     """x at indices along an axis; nested lists give as many axes."""
     if isinstance(indices, int):
         return x.select(axis, indices)
+    if not indices:
+        return x.narrow(axis, 0, 0)
     if isinstance(indices[0], int) and indices[0] >= 0 and indices == [*range(indices[0], indices[0] + len(indices))]:
         return x.narrow(axis, indices[0], len(indices))
     return torch.stack([_gather(x, each, axis) for each in indices], axis)
@@ -126,20 +163,29 @@ def _split(
     return [x.narrow(axis, sum(split[:k]), each) for k, each in enumerate(split)]
 
 
-def _reducing(function: Callable[..., Tensor]) -> Operator:
-    """A sum over some axes, of a function of the numbers."""
+def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[Tensor], Tensor]) -> Operator:
+    """A function of a sum over some axes, of a function of the numbers, and of how many they are."""
 
-    def reduced(x: Tensor, axes: list[int] | None = None, keepdims: int = 1, noop_with_empty_axes: int = 0) -> Tensor:
+    def reduced(
+        numbers: Numbers, x: Tensor, axes: list[int] | None = None, keepdims: int = 1, noop_with_empty_axes: int = 0
+    ) -> Tensor:
         if not axes and noop_with_empty_axes:
-            return x
-        return function(x, axes or list(range(x.ndim)), bool(keepdims))
+            return of_sum(numbers, each(x), 1)
+        axes = axes or list(range(x.ndim))
+        terms = math.prod(x.shape[axis] for axis in axes)
+        total = numbers.summands(each(x), terms).sum(axes, bool(keepdims)) if axes else each(x)
+        return of_sum(numbers, numbers.rounded(total, 0), terms)
 
     return Operator(reduced, (1,))
 
 
-def _each(function: Callable[[Tensor, Tensor], Tensor]) -> Operator:
+def _each(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
     """A function of two, of any number."""
-    return Operator(lambda *tensors: reduce(function, tensors))
+    return lambda *tensors: reduce(function, tensors)
+
+
+def _total(numbers: Numbers, *tensors: Tensor) -> Tensor:
+    return reduce(lambda x, y: numbers.rounded(x + y), tensors)
 
 
 def _constant(**value: Any) -> Tensor:
@@ -151,40 +197,66 @@ def _constant(**value: Any) -> Tensor:
 
 
 OPERATORS: dict[str, Operator] = {
-    **{
-        name: Operator(function)
-        for name, function in {
-            "Identity": lambda x: x, "Neg": torch.neg, "Abs": torch.abs, "Reciprocal": torch.reciprocal,
-            "Exp": torch.exp, "Log": torch.log, "Sqrt": torch.sqrt, "Sin": torch.sin, "Cos": torch.cos,
-            "Tan": torch.tan, "Tanh": torch.tanh, "Sigmoid": torch.sigmoid, "Relu": torch.relu,
-            "Softplus": _softplus, "Sign": torch.sign, "Floor": torch.floor, "Ceil": torch.ceil,
-            "Not": torch.logical_not,
-            "Add": torch.add, "Sub": torch.sub, "Mul": torch.mul, "Div": _divide, "MatMul": torch.matmul, "Gemm": _gemm,
-            "Less": torch.lt, "LessOrEqual": torch.le, "Greater": torch.gt, "GreaterOrEqual": torch.ge,
-            "Equal": torch.eq, "And": torch.logical_and, "Or": torch.logical_or, "Where": torch.where,
-            "Flatten": _flatten, "Transpose": _transpose, "Cast": _cast, "Constant": _constant,
-            "Concat": lambda *tensors, axis: torch.cat(tensors, axis),
-            "LeakyRelu": lambda x, alpha=0.01: functional.leaky_relu(x, alpha),
-            "Elu": lambda x, alpha=1.0: x.relu() + alpha * (torch.exp(x.clamp(max=0)) - 1),
-            "Shape": lambda x, start=0, end=None: torch.tensor(x.shape[start:end]),
-        }.items()
-    },
+    # arithmetic
+    "Add": _basic(torch.add, whole=True),
+    "Sub": _basic(torch.sub, whole=True),
+    "Mul": _basic(torch.mul, whole=True),
+    "Div": _basic(_divide, whole=True),
+    "Sqrt": _elementary("Sqrt", torch.sqrt),
+    "Reciprocal": _elementary("Reciprocal", torch.reciprocal),
     "Pow": Operator(_power, (1,)),
-    "Clip": Operator(_clip, (1, 2)),
-    "Max": _each(torch.maximum),
-    "Min": _each(torch.minimum),
-    "Sum": _each(torch.add),
-    "Mean": Operator(lambda *tensors: reduce(torch.add, tensors) / len(tensors)),
-    "ReduceSum": _reducing(lambda x, axes, keep: x.sum(axes, keep)),
-    "ReduceMean": _reducing(lambda x, axes, keep: x.mean(axes, keep)),
-    "ReduceSumSquare": _reducing(lambda x, axes, keep: (x**2).sum(axes, keep)),
-    "ReduceL2": _reducing(lambda x, axes, keep: (x**2).sum(axes, keep).sqrt()),
-    "ConstantOfShape": Operator(_constant_of_shape, (0,)),
-    "Reshape": Operator(_reshape, (1,)),
-    "Squeeze": Operator(_squeeze, (1,)),
-    "Unsqueeze": Operator(_unsqueeze, (1,)),
-    "Expand": Operator(_expand, (1,)),
-    "Slice": Operator(_slice, (1, 2, 3, 4)),
-    "Gather": Operator(_gather, (1,)),
-    "Split": Operator(_split, (1,)),
-}  # fmt: skip
+    "LeakyRelu": Operator(lambda numbers, x, alpha=SLOPE: numbers.rounded(functional.leaky_relu(x, alpha))),
+    "Sum": Operator(_total),
+    "Mean": Operator(lambda numbers, *tensors: numbers.rounded(_total(numbers, *tensors) / len(tensors), 2)),
+    "MatMul": Operator(lambda numbers, a, b: numbers.rounded(numbers.product(a, b), 0)),
+    "Gemm": Operator(_gemm),
+    "ReduceSum": _reducing(lambda numbers, total, terms: total, lambda x: x),
+    "ReduceMean": _reducing(lambda numbers, total, terms: numbers.rounded(total / terms, 2), lambda x: x),
+    "ReduceSumSquare": _reducing(lambda numbers, total, terms: total, lambda x: x**2),
+    "ReduceL2": _reducing(lambda numbers, total, terms: numbers.function("Sqrt", total.sqrt()), lambda x: x**2),
+    # functions
+    "Exp": _elementary("Exp", torch.exp),
+    "Log": _elementary("Log", torch.log),
+    "Tanh": _elementary("Tanh", torch.tanh),
+    "Sigmoid": _elementary("Sigmoid", torch.sigmoid),
+    "Softplus": _elementary("Softplus", _softplus),
+    "Elu": Operator(_elu),
+    "Sin": _wave("Sin", torch.sin),
+    "Cos": _wave("Cos", torch.cos),
+    "Tan": _wave("Tan", torch.tan),
+    # what does not round
+    "Cast": Operator(_cast, whole=True),
+    "Neg": _exact(torch.neg),
+    "Abs": _exact(torch.abs),
+    "Relu": _exact(torch.relu, whole=False),
+    "Clip": _exact(_clip, 1, 2, whole=False),
+    "Sign": _exact(torch.sign, whole=False),
+    "Floor": _exact(torch.floor, whole=False),
+    "Ceil": _exact(torch.ceil, whole=False),
+    "Max": _exact(_each(torch.maximum)),
+    "Min": _exact(_each(torch.minimum)),
+    "Less": _exact(torch.lt),
+    "LessOrEqual": _exact(torch.le),
+    "Greater": _exact(torch.gt),
+    "GreaterOrEqual": _exact(torch.ge),
+    "Equal": _exact(torch.eq),
+    "Not": _exact(torch.logical_not),
+    "And": _exact(torch.logical_and),
+    "Or": _exact(torch.logical_or),
+    "Where": _exact(torch.where),
+    # arrangements
+    "Identity": _exact(lambda x: x),
+    "Constant": _exact(_constant),
+    "ConstantOfShape": _exact(_constant_of_shape, 0),
+    "Shape": _exact(lambda x, start=0, end=None: torch.tensor(x.shape[start:end])),
+    "Concat": _exact(lambda *tensors, axis: torch.cat(tensors, axis)),
+    "Flatten": _exact(_flatten),
+    "Transpose": _exact(_transpose),
+    "Reshape": _exact(_reshape, 1),
+    "Squeeze": _exact(_squeeze, 1),
+    "Unsqueeze": _exact(_unsqueeze, 1),
+    "Expand": _exact(_expand, 1),
+    "Slice": _exact(_slice, 1, 2, 3, 4),
+    "Gather": _exact(_gather, 1),
+    "Split": _exact(_split, 1),
+}

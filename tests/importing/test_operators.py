@@ -154,14 +154,14 @@ def test_every_operator_has_examples():
 def function_of(nodes, constants):
     model = model_of(nodes, constants, N, kind=FLOAT, opset=20)
     onnx.checker.check_model(model)
-    return OnnxFunction(model, N, "function.onnx"), model
+    return OnnxFunction(model, N, "function.onnx", rounds=True), model
 
 
 def bounded(function, box):
     return BoundedFunction(lambda t, x: (function(x[None])[0],), box)
 
 
-@pytest.mark.parametrize("name", sorted(EXAMPLES))
+@pytest.mark.parametrize("name", sorted(EXAMPLES.keys() - UNBOUNDED))
 def test_it_is_that_of_onnxruntime(name):
     x = torch.cat([2 * torch.randn(50, N, generator=torch.Generator().manual_seed(0)), torch.zeros(1, N)]).double()
     for nodes, constants in EXAMPLES[name]:

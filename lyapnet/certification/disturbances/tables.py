@@ -27,6 +27,8 @@ def _end(row: dict[str, Any], names: Sequence[str]) -> tuple[str, str, str, str]
         return "none proved", "", "", ""
     size = f"{row['region_volume_proved']:.4g}", floored(row["set_volume_share"])
     if "ultimate_level" not in row:
+        if "distance_left" in row:
+            return *size, "", f"the goal ± {row['distance_left']:.1g}"
         return *size, "", f"an equilibrium, goal ± {row['equilibrium_offset']:.1g}"
     sides = zip(names, *row["ultimate_extent"], strict=True)
     box = [f"{name} [{low:.3g}, {high:.3g}]" for name, low, high in sides if name not in row["states_left_out"]]

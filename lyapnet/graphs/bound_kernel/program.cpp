@@ -139,7 +139,16 @@ void apply_functions(const Block &block, const int *&code) {
     }
 }
 
-enum Operation { COMBINE, MATRIX_PRODUCT, MULTIPLY, FUNCTION, WHERE, NO_WIDER, SIGN, POSITIVE, NEGATION, CONJUNCTION };
+enum Operation { COMBINE, MATRIX_PRODUCT, MULTIPLY, FUNCTION, WHERE, NO_WIDER, SIGN, POSITIVE, NEGATION, CONJUNCTION, ROUNDED };
+
+// bound_rules._rounded: what another arithmetic, in which numbers go up to `largest`, makes of x
+void rounded(const Block &block, const Entry &x, const Entry &out, double relative, double absolute, double largest) {
+    const V size = block.magnitude(x) * (1 + 1e-9);
+    const V radius = x.radius() + (relative * size + absolute) * (1 + 1e-9);
+    for (int i = 0; i < x.support->count; i++) out.terms[i] = x.terms[i];
+    out.radius() = size <= largest ? radius : splat(INFINITY);
+    block.finish(out, 1);
+}
 
 V one(M truth) { return truth ? splat(1) : splat(0); }
 
@@ -166,6 +175,11 @@ void operate(const Block &block, int operation, const int *&code) {
     if (operation == NO_WIDER) {  // from here on, the second entry is the result
         const double low = block.numbers[*code++];
         return no_wider(block, x, y, low, block.numbers[*code++]);
+    }
+    if (operation == ROUNDED) {
+        const double *const limits[] = {block.numbers + code[0], block.numbers + code[1], block.numbers + code[2]};
+        code += 3;
+        return rounded(block, x, y, *limits[0], *limits[1], *limits[2]);
     }
     const Range ends = interval(block, x);
     const V low = one(ends.low > 0), high = one(ends.high > 0);

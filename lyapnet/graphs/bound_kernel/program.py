@@ -15,7 +15,7 @@ OPERATIONS = {
     name: code
     for code, name in enumerate((
         "combine", "matrix_product", "multiply", "functions", "where", "no_wider", "sign", "positive", "negation",
-        "conjunction",
+        "conjunction", "rounded",
     ))
 }  # fmt: skip
 FUNCTIONS = {
@@ -184,6 +184,10 @@ class Program:
     def no_wider(self, x: Entry, low: float, high: float) -> Entry:
         """x, but [low, high] where it is wider."""
         return self._emit("no_wider", self.supports[x], x, behind=(self._at(low), self._at(high)))
+
+    def rounded(self, x: Entry, *limits: float) -> Entry:
+        """x rounded in another arithmetic: by how much, relative to it and absolutely, and up to which number."""
+        return self._emit("rounded", self.supports[x], x, behind=tuple(self._at(limit) for limit in limits))
 
     def assembled(self, results: Sequence[Entry]) -> Assembled:
         """The program with its results, its forms laid out so that their places are used again."""

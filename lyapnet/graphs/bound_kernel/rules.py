@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.graphs.bound_kernel.program import Entry, Forms, Program
+from lyapnet.graphs.rounding import ROUNDED
 
 aten = torch.ops.aten
 
@@ -188,6 +189,11 @@ def _mean(
 @rule(aten._to_copy.default)
 def _to_copy(program: Program, x: Forms, **keywords: Any) -> Forms:
     return x
+
+
+@rule(ROUNDED)
+def _rounded(program: Program, y: Any, at: Forms, *limits: float) -> Forms:
+    return each(lambda x: program.rounded(x, *limits), as_forms(program, y))
 
 
 # Functions of one number

@@ -19,7 +19,9 @@ from lyapnet.types import State
 DOMAIN = ("", "ai.onnx")
 OPSET = 18  # whose semantics OPERATORS have; older files are converted to it
 INPUTS = {FLOAT: np.float32, DOUBLE: np.float64}
-MOST, MOST_OF_ONE, MOST_INDICES = 50_000_000, 100_000, 10_000  # numbers of all constants, of one that moves, of a list
+MOST, MOST_OF_ONE, MOST_INDICES = 50_000_000, 50_000, 10_000  # numbers of all constants, of one that moves, of a list
+MOST_NODES = 10_000
+CHUNK = 64  # states that are computed together
 TRUTHS = ("Less", "LessOrEqual", "Greater", "GreaterOrEqual", "Equal", "Not", "And", "Or")
 
 
@@ -111,6 +113,10 @@ class OnnxFunction(nn.Module):
         constants = {each.name: self._tensor(each) for each in graph.initializer}
         self._kinds |= {each.name: each.data_type for each in graph.initializer}
         moving = {self.input: x}
+        if len(graph.node) > MOST_NODES:
+            raise UsageError(
+                f"Expected at most {MOST_NODES} nodes in {self.name!r}, got {len(graph.node)}; write it smaller."
+            )
         for node in graph.node:
             operator = OPERATORS.get(node.op_type) if node.domain in DOMAIN else None
             if operator is None:
@@ -136,7 +142,7 @@ class OnnxFunction(nn.Module):
                 constants |= self._counted(node, results)
                 continue
             moving |= results
-            self._require_moving(node, kind, results)
+            self._require_moving(node, kind, results, given if all(each in moving for each in names) else [])
             weight = sum(float(y.abs().sum()) for y in given if isinstance(y, Tensor) and y.is_floating_point())
             arguments = [
                 Moving(each) if each in moving else self._kept(y) for each, y in zip(names, plain, strict=True)
@@ -193,9 +199,14 @@ class OnnxFunction(nn.Module):
             raise self._too_large(node, self._made, MOST)
         return results
 
-    def _require_moving(self, node: Any, kind: int, results: Mapping[str, Tensor]) -> None:
-        """Refuse values that depend on x and are many, or whole numbers."""
-        if (size := max(y.numel() for y in results.values())) > MOST_OF_ONE:
+    def _require_moving(
+        self, node: Any, kind: int, results: Mapping[str, Tensor], factors: Sequence[Tensor | None]
+    ) -> None:
+        """Refuse values that depend on x and are many, or whole numbers, and products of matrices with many terms."""
+        size = max(y.numel() for y in results.values())
+        if node.op_type in ("MatMul", "Gemm") and factors and factors[0] is not None:
+            size *= max(1, max(factors[0].shape, default=1))
+        if size > MOST_OF_ONE:
             raise self._too_large(node, size, MOST_OF_ONE)
         if kind in WHOLE:
             raise UsageError(
@@ -360,41 +371,52 @@ def require_same(function: OnnxFunction, model: Any, states: State) -> float:
     Raises:
         UsageError: it does not; or onnxruntime does not run it.
     """
+    levels = _library("onnxruntime").GraphOptimizationLevel
+    others = [_computed(model, function, states, level) for level in (levels.ORT_DISABLE_ALL, levels.ORT_ENABLE_ALL)]
+    with torch.no_grad():
+        own = torch.cat([function(some) for some in states.split(CHUNK)]).numpy()
+    if any(own.shape != other.shape for other in others):
+        raise UsageError(
+            f"Expected results of one shape from {function.name!r}, got another; report this with the file."
+        )
+    low, high = (side.numpy() for side in bounds_at(function, states))
+    apart = []
+    for other in others:
+        finite = np.isfinite(own) & np.isfinite(other)
+        largest = np.abs(other[finite]).max(initial=0.0) or 1.0
+        apart.append(np.abs(np.where(finite, own, 0.0) - np.where(finite, other, 0.0)).max(initial=0.0) / largest)
+        outside = ~((low <= other) & (other <= high)) & (np.isfinite(other) | np.isfinite(low))
+        if bool(outside.any()):
+            raise UsageError(
+                f"Expected {function.name!r} to be within its rounding of what onnxruntime computes, got another "
+                f"result at x = {states[int(outside.any(-1).argmax())].tolist()}; report this with the file."
+            )
+    return float(apart[0])
+
+
+def _computed(model: Any, function: OnnxFunction, states: State, level: Any) -> np.ndarray:
+    """What onnxruntime makes of states, one by one, with some of its optimisations of a graph."""
     runtime = _library("onnxruntime")
     try:
-        as_written = runtime.SessionOptions()
-        as_written.graph_optimization_level = runtime.GraphOptimizationLevel.ORT_DISABLE_ALL
-        session = runtime.InferenceSession(model.SerializeToString(), as_written, providers=["CPUExecutionProvider"])
+        options = runtime.SessionOptions()
+        options.graph_optimization_level = level
+        session = runtime.InferenceSession(model.SerializeToString(), options, providers=["CPUExecutionProvider"])
         with np.errstate(over="ignore"):  # beyond float32 all is infinite
             given = states.numpy().astype(INPUTS[function.kind])
         rows = [session.run(None, {function.input: x[None] if function.batched else x})[0].ravel() for x in given]
+        return np.stack(rows).astype(np.float64)
     except Exception as error:  # of many kinds
         raise UsageError(
             f"Expected a file that onnxruntime runs, got {function.name!r}: {one_line(error)[:200]}; export it again."
         ) from error
-    with torch.no_grad():
-        own = function(states).numpy()
-    other = np.stack(rows).astype(np.float64)
-    low, high = (side.numpy() for side in bounds_at(function, states))
-    outside = ~((low <= other) & (other <= high)) & (np.isfinite(other) | np.isfinite(low))
-    largest = float(np.abs(other[np.isfinite(other)]).max(initial=0.0)) or 1.0
-    finite = np.isfinite(own) & np.isfinite(other)
-    apart = np.abs(np.where(finite, own, 0.0) - np.where(finite, other, 0.0))
-    if own.shape != other.shape or bool(outside.any()):
-        state = states[int(outside.any(-1).argmax())].tolist() if own.shape == other.shape else []
-        raise UsageError(
-            f"Expected {function.name!r} to be within its rounding of what onnxruntime computes, got another result at "
-            f"x = {state}, {float(apart.max()):.2g} apart; report this with the file."
-        )
-    return float(apart.max()) / largest
 
 
 def bounds_at(function: OnnxFunction, states: State) -> tuple[Tensor, Tensor]:
     """(lower, upper) bounds of a function at each of some states, which its rounding parts."""
     at = torch.cat([torch.zeros(len(states), 1, dtype=torch.float64), states], 1)
     bounded = BoundedFunction(lambda t, x: (function(x[None])[0],), (at.amin(0), at.amax(0)), degree=1)
-    ((low, high),) = bounded.bounds(at, at)
-    return low, high
+    bounds = [bounded.bounds(some, some)[0] for some in at.split(CHUNK)]
+    return torch.cat([low for low, _ in bounds]), torch.cat([high for _, high in bounds])
 
 
 def tensor_of(proto: Any) -> Tensor:

@@ -61,3 +61,6 @@ def test_the_example_is_certified(tmp_path, monkeypatch, capsys):
     assert result["region_volume_proved"] > 100
     assert math.isclose(own.result["region_volume_proved"], result["region_volume_proved"], rel_tol=0.01)
     assert result["equilibrium_offset"] < 1e-8
+    assert result["precision"] == "float32"
+    assert result["distance_left"] < 0.01
+    assert "precision" not in own.result, "modules are read in real numbers"

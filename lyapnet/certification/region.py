@@ -250,8 +250,7 @@ def region_claim(
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
     setting = setting_of(condition, problem, 0.0, states, budget)
     left_out, X0, wanted, D, domain, sides, _ = setting
-    seen = [i for i in range(n) if i not in left_out]
-    _require_inside(D, goal, seen, left_out, n)
+    _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:
         kept.require(decay, D, w, names)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
@@ -262,16 +261,24 @@ def region_claim(
         proof = proof_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _end(condition, D, n, budget)
-    rounded = closed_loop.policy.precision if isinstance(closed_loop.policy, ValuePolicy) else None
-    proved = contraction if rounded is not None and rho > -math.inf else None
-    left = math.nan if proved is None else distance_left(condition.closed_loop, proved, goal, D, seen)
+    rounding = _rounding(loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
     return RegionClaim(
         decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
         share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
         left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants, set_up,
-        rounded, left,
+        *rounding,
     )  # fmt: skip
+
+
+def _rounding(
+    loop: ClosedLoop, one: ClosedLoop, around: Contraction | None, goal: State, states: Box, seen: Sequence[int]
+) -> tuple[str | None, float]:
+    """(the precision of u, the distance from the goal that it leaves), as of RegionClaim; `one` is of one plant."""
+    precision = one.policy.precision if isinstance(one.policy, ValuePolicy) else None
+    if precision is None or around is None:
+        return precision, math.nan
+    return precision, distance_left(loop, around, goal, states, seen)
 
 
 def _end(condition: RecedingDecrease, states: Box, n: int, budget: Budget) -> tuple[Box, float]:

@@ -12,7 +12,8 @@ from lyapnet.build import build_problem, own_parts, parts_named
 from lyapnet.config import Config, config_from_plain
 from lyapnet.controller import Controller
 from lyapnet.importing.law import controller_of, require_one_system, states_around
-from lyapnet.importing.onnx_function import OnnxFunction, read_onnx, require_same
+from lyapnet.importing.onnx_file import read_onnx, require_same
+from lyapnet.importing.onnx_function import OnnxFunction
 from lyapnet.problem import Problem
 from lyapnet.schema import read_yaml
 from lyapnet.types import State

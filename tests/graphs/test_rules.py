@@ -14,6 +14,7 @@ from lyapnet.graphs import elementary_functions, taylor
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import decisions
+from lyapnet.graphs.rounding import ROUNDED
 
 aten = torch.ops.aten
 AXES = 3
@@ -21,6 +22,7 @@ WIDTHS = (2.0, 0.5, 0.1, 1e-2, 1e-3, 1e-5)
 INDEX, TWICE = torch.tensor([2, 0]), torch.tensor([2, 2])
 
 CASES = {
+    ROUNDED: lambda y, z, M, N: ROUNDED(y, z, 1e-9, 1e-9, 1e9),
     aten.relu.default: lambda y, z, M, N: aten.relu(y),
     aten.leaky_relu.default: lambda y, z, M, N: aten.leaky_relu(y, 0.3),
     aten.abs.default: lambda y, z, M, N: aten.abs(y),
@@ -139,6 +141,7 @@ WRITTEN_OUT = {
     aten.masked_fill.Tensor: lambda y, z, M, N: torch.where(y > 0, M[0, 0], z),
     aten.fill.Scalar: lambda y, z, M, N: 0.3 * z + y,
     aten.empty_like.default: lambda y, z, M, N: 0.3 * z,
+    ROUNDED: lambda y, z, M, N: y,
     aten.silu_backward.default: lambda y, z, M, N: z * torch.sigmoid(4 * y) * (1 + 4 * y * torch.sigmoid(-4 * y)),
 }
 """The same, for operators that torch does not batch or differentiate."""

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from lyapnet.errors import UsageError
-from lyapnet.importing.onnx_function import OnnxFunction, read_onnx, require_same
+from lyapnet.importing.onnx_file import read_onnx, require_same
+from lyapnet.importing.onnx_function import OnnxFunction
 from tests.importing.models import DOUBLE, FLOAT, helper, linear, model_of, onnx, quadratic, saved
 
 pytest.importorskip("onnxruntime")

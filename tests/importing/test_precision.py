@@ -12,7 +12,8 @@ import torch
 from lyapnet.errors import UsageError
 from lyapnet.importing import imported_controller
 from lyapnet.importing.arithmetic import DOUBLE, FLOAT, FORMATS
-from lyapnet.importing.onnx_function import OnnxFunction, bounds_at, require_same
+from lyapnet.importing.onnx_file import bounds_at, require_same
+from lyapnet.importing.onnx_function import OnnxFunction
 from tests.importing.models import helper, model_of, onnx
 from tests.importing.test_operators import EXAMPLES, UNBOUNDED, N
 from tests.importing.test_regions import claimed, files

@@ -233,8 +233,7 @@ def region_claim(
         plants: P: the claim is about each of these plants under the law and V of the one plant.
 
     Raises:
-        UsageError: λ, w or D do not fit, it is about a family, or the closed loop has an operator without a rule; or
-            the file keeps the proof of something else.
+        UsageError: λ, w or D do not fit, it is a family, an operator has no rule, or the file keeps another proof.
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)

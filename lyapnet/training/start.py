@@ -73,7 +73,7 @@ class Start(NamedTuple):
         return f"in continuous time, u held for Δt, the law that training starts from costs {by}"
 
     def __str__(self) -> str:
-        others = ", ".join(f"{_shown(other)} from {other.name}" for other in self.candidates if other != self.chosen)
+        others = ", ".join(_beside(other) for other in self.candidates if other != self.chosen)
         return f"start: {self.chosen.name}, mean cost {_shown(self.chosen)} of {STATES} states ({others})"
 
     def as_json(self) -> dict[str, Any]:
@@ -386,7 +386,12 @@ def _kept(learner: Learner) -> list[int]:
     return kept_states(learner.V, learner.problem.system.n)
 
 
+def _beside(other: Candidate) -> str:
+    """What is said of a candidate that was not chosen."""
+    if other.missing is not None:
+        return f"no {other.name.removeprefix('the ')}: {other.missing.reason}"
+    return f"{_shown(other)} from {other.name}"
+
+
 def _shown(candidate: Candidate) -> str:
-    if candidate.missing is not None:
-        return f"none ({candidate.missing.reason})"
     return f"{candidate.cost:.4g}" if candidate.finite == 1 else f"not finite on {1 - candidate.finite:.0%}"

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.graphs.bound_kernel.program import Entry, Forms, Program
+from lyapnet.graphs.taylor import TINY
 
 aten = torch.ops.aten
 
@@ -218,7 +219,7 @@ def _tanh(program: Program, x: Forms) -> Forms:
 
 def _threshold(threshold: float) -> tuple[float, float]:
     """(where torch's softplus is the identity, by how much it is off at most)."""
-    return threshold, 1.001 * math.exp(-threshold)
+    return threshold, 1.001 * math.exp(-threshold) + TINY
 
 
 @rule(aten.softplus.default)

@@ -235,7 +235,7 @@ def _tanh_backward(gradient: Any, y: TaylorForm) -> TaylorForm:
 
 def _loosened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
     """The form with room for factor · e^{−threshold}, and its rounding, where y may exceed the threshold."""
-    room = 1.001 * factor * torch.exp(-_tensor(threshold))
+    room = factor * (1.001 * torch.exp(-_tensor(threshold)) + taylor.TINY)
     return smooth.with_parts(smooth.terms, smooth.radius + torch.where(y.interval()[1] > threshold, room, 0.0))
 
 

@@ -83,7 +83,7 @@ def _no_wider(y: TaylorForm, low: Tensor, high: Tensor) -> TaylorForm:
     least, most = y.interval()
     low, high = (side.to(y.radius).expand_as(y.radius) for side in (torch.minimum(low, high), high))
     wide = ~(most - least <= high - low)
-    room = 4 * taylor.EPSILON * (low.abs() + high.abs())  # for the rounding of centre and radius
+    room = 4 * taylor.EPSILON * (low.abs() + high.abs()) + taylor.TINY  # for the rounding of centre and radius
     constant = between(low - room, high + room, y)
     return y.with_parts(torch.where(wide, constant.terms, y.terms), torch.where(wide, constant.radius, y.radius))
 

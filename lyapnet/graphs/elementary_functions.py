@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.graphs import taylor
-from lyapnet.graphs.taylor import EPSILON, TINY, TaylorForm
+from lyapnet.graphs.taylor import EPSILON, FLOOR, TINY, TaylorForm
 
 Range = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
@@ -73,7 +73,7 @@ def _secant(
     f_p = function(points)
     h = torch.cat([(f_l - a * lo)[None], (f_u - a * hi)[None], f_p - a * points])
     low, high = h.amin(0), h.amax(0)
-    nearby = ((derivative(points) - a).abs() * 1e-12 * (1 + points.abs())).amax(0)
+    nearby = (((derivative(points) - a).abs() + TINY) * 1e-12 * (1 + points.abs())).amax(0)
     largest = torch.maximum(f_l.abs(), f_u.abs()).maximum(f_p.abs().amax(0)) + 2 * a.abs() * torch.maximum(-lo, hi)
     b, e = (low + high) / 2, (high - low) / 2 + nearby + 16 * EPSILON * largest + TINY
     return x.with_parts(torch.cat([(a * x.center + b)[None], a * x.terms[1:]]), a.abs() * x.radius + e).rounded(2)
@@ -106,12 +106,13 @@ def _expanded(
     M = (low + high) / 2
     a, b, c, k = function(m), derivative(m), derivatives.second(m) / 2, torch.zeros_like(m)
     if cubic:
-        a, c, k = a - M * w**4 / 192, c + M * w**2 / 24, derivatives.third(m) / 6
-        e = (M.abs() / 192 + (high - low) / 48) * w**4 * (1 + 1e-9)
+        a, c, k = a - M * w * w * w * w / 192, c + M * w * w / 24, derivatives.third(m) / 6
+        e = (M.abs() / 192 + (high - low) / 48) * w * w * w * w * (1 + 1e-9)
     else:
-        b = b + M * w**2 / 8
-        e = (M.abs() / 24 + (high - low) / 12) * w**3 * (1 + 1e-9)
-    size = a.abs() + b.abs() * w + (c.abs() + (k.abs() + M.abs() * (w if cubic else 1)) * w) * w**2
+        b = b + M * w * w / 8
+        e = (M.abs() / 24 + (high - low) / 12) * w * w * w * (1 + 1e-9)
+    higher = k.abs() + FLOOR + M.abs() * (w if cubic else 1)
+    size = a.abs() + (b.abs() + FLOOR + (c.abs() + FLOOR + higher * w) * w) * w
     e = e + 32 * EPSILON * size + TINY
     y = x.with_parts(torch.cat([(x.center - m)[None], x.terms[1:]]), x.radius).rounded()
     yy = taylor.multiply(y, y)

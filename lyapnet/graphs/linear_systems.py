@@ -34,7 +34,7 @@ def solve(A: TaylorForm, B: TaylorForm) -> TaylorForm:
 def _from_left(K: Tensor, x: TaylorForm) -> TaylorForm:
     """K x with a matrix K for each box, (boxes, n, n)."""
     x = x.rounded(2 * K.shape[-1])  # as in taylor.matrix_product
-    return x.with_parts(K @ x.terms, K.abs() @ x.radius)
+    return x.with_parts(K @ x.terms, K.abs() @ x.radius + taylor.TINY)
 
 
 def _columns(x: TaylorForm, columns: slice) -> TaylorForm:

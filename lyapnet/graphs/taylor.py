@@ -2,9 +2,21 @@
 
 Rounding. Forms enclose the values of real arithmetic on the given float64 numbers. Every operation here adds to its
 remainder a bound of its own rounding errors: a multiple of ε = 2⁻⁵² times the magnitudes that entered it, at least
-twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. Two things are taken on
+twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. One thing is taken on
 trust: that the elementary functions of torch, and of the C library where lyapnet.graphs.bound_kernel uses them, err by
-at most 8 ε (1.2 ε is the most that was seen of torch's, against mpmath), and that nothing underflows by more than TINY.
+at most 8 ε (1.2 ε is the most that was seen of torch's, against mpmath).
+
+Underflow. Below 2⁻¹⁰²² ≈ 2.2e-308 the model fails: a result errs by up to that number besides, if a processor replaces
+subnormal numbers by zero, and by less if not. So there is one rule: whatever is rounded errs by a multiple of ε times
+its size, plus TINY = 1e-300. This is room for 4e7 operations on an entry, more than any has.
+
+- The remainder of each result takes TINY, after all its products. An error that is multiplied afterwards takes part: a
+  remainder does by itself, and a coefficient counts as larger by FLOOR = TINY/ε where its rounding is bounded.
+- A product of three factors is formed so that nothing between underflows when the result does not: A·(A/m) with
+  A ≤ 2m, not A²/m; ((M·w)·w)·w, not M·w³; ε·(a·b), not (ε·a)·b.
+- Overflow gives an infinity or a nan, in terms or in the remainder, and `interval` gives infinite bounds for either.
+
+Numbers below 1e-300 are thus bounded, but not told from zero; and where derivatives underflow, bounds are wide.
 
 Sources: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004, for the first
 degree; Neumaier, "Taylor forms: use and limits", Reliable Computing 2003, for higher ones. The remainder here is one
@@ -22,6 +34,7 @@ from lyapnet.types import Corners, OnBoxes, Terms
 
 EPSILON = torch.finfo(torch.float64).eps
 TINY = 1e-300
+FLOOR = TINY / EPSILON
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +122,7 @@ class TaylorForm:
                 m[k] += B.abs() / 2
         A = self.coefficients.abs()
         inner = -2 * m > A  # the vertex lies within the box
-        parabolas = torch.where(inner, A**2 / torch.where(inner, -4 * m, 1.0), A + m).sum(0)
+        parabolas = torch.where(inner, A * (A / torch.where(inner, -4 * m, 1.0)), A + m).sum(0)
         return parabolas + _absolute_sum(self.of_degree(3)) if self.degree == 3 else parabolas
 
     @property
@@ -224,7 +237,7 @@ def negate(x: TaylorForm) -> TaylorForm:
 def matrix_product(x: TaylorForm, weight: Tensor) -> TaylorForm:
     """x @ W: c and A_k take W, the remainder |W|, since |Σ_i η_i W_ij| ≤ Σ_i r_i |W_ij|."""
     x = x.rounded(2 * len(weight))  # γ_k Σ_i |x_i||W_ij| bounds the error of each sum, of c, A and r alike
-    return x.with_parts(x.terms @ weight, x.radius @ weight.abs())
+    return x.with_parts(x.terms @ weight, x.radius @ weight.abs() + TINY)
 
 
 # Products
@@ -243,7 +256,7 @@ def multiply(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     if not x.dimension:
         return interval_product(x, y)
     remainder = (x.center.abs() + x.spread) * y.radius + (y.center.abs() + y.spread) * x.radius + x.radius * y.radius
-    rounding = (len(x.terms) ** 2 + 8) * EPSILON * x.magnitude * y.magnitude + TINY
+    rounding = (len(x.terms) ** 2 + 8) * EPSILON * (x.magnitude * y.magnitude) + TINY
     if x.degree == 1:
         terms, beyond = _linear_product(x, y)
     else:

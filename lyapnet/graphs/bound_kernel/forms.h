@@ -104,7 +104,7 @@ void between(const Block &block, const Entry &out, V low, V high) {
 void multiply(const Block &block, const int *product, const Entry &x, const Entry &y, const Entry &out) {
     const V ax = absolute(x.terms[0]) + block.spread(x), by = absolute(y.terms[0]) + block.spread(y);
     const V rx = x.radius(), ry = y.radius();
-    const V rounding = (block.terms * block.terms + 8) * EPSILON * (ax + rx) * (by + ry);
+    const V rounding = (block.terms * block.terms + 8) * EPSILON * ((ax + rx) * (by + ry));
     V radius = ax * ry + by * rx + rx * ry + rounding + TINY;
     for (int k = 0; k < out.support->count; k++) {
         V sum = splat(0);
@@ -143,7 +143,7 @@ void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
         const Jet at = f.jet(p);
         const V h = at.d[0] - a * p;
         least = smaller(least, h), most = larger(most, h);
-        nearby = larger(nearby, absolute(at.d[1] - a) * 1e-12 * (1 + absolute(p)));
+        nearby = larger(nearby, (absolute(at.d[1] - a) + TINY) * 1e-12 * (1 + absolute(p)));
         largest = larger(largest, absolute(at.d[0]));
     }
     largest += 2 * absolute(a) * larger(-lo, hi);
@@ -190,14 +190,14 @@ void expanded(const Powers &powers, const Argument &of, const Jet &jet, const Ra
     const V w = of.w, M = (range.low + range.high) * 0.5, span = range.high - range.low;
     V a = jet.d[0], b = jet.d[1], c = jet.d[2] * 0.5, k = splat(0), e;
     if (CUBIC) {
-        a -= M * (w * w) * (w * w) / 192, c += M * w * w / 24, k = jet.d[3] / 6;
-        e = (absolute(M) / 192 + span / 48) * (w * w) * (w * w) * (1 + 1e-9);
+        a -= M * w * w * w * w / 192, c += M * w * w / 24, k = jet.d[3] / 6;
+        e = (absolute(M) / 192 + span / 48) * w * w * w * w * (1 + 1e-9);
     } else {
         b += M * w * w * 0.125;
-        e = (absolute(M) / 24 + span / 12) * (w * w) * w * (1 + 1e-9);
+        e = (absolute(M) / 24 + span / 12) * w * w * w * (1 + 1e-9);
     }
-    const V higher = absolute(c) + (absolute(k) + absolute(M) * (CUBIC ? w : splat(1))) * w;
-    e += 32 * EPSILON * (absolute(a) + absolute(b) * w + higher * w * w) + TINY;
+    const V higher = absolute(k) + FLOOR + absolute(M) * (CUBIC ? w : splat(1));
+    e += 32 * EPSILON * (absolute(a) + (absolute(b) + FLOOR + (absolute(c) + FLOOR + higher * w) * w) * w) + TINY;
     for (int i = 0; i < out.support->count; i++) out.terms[i] = c * of.yy.terms[i];
     out.radius() = absolute(b) * of.y.radius() + absolute(c) * of.yy.radius() + e;
     if (CUBIC) {
@@ -283,7 +283,7 @@ void where(
 void no_wider(const Block &block, const Entry &y, const Entry &out, double low, double high) {
     const Range ends = interval(block, y);
     const M wide = ~(ends.high - ends.low <= high - low);
-    const double room = 4 * EPSILON * (std::fabs(low) + std::fabs(high));
+    const double room = 4 * EPSILON * (std::fabs(low) + std::fabs(high)) + TINY;
     for (int i = 0; i < y.support->count; i++) out.terms[i] = wide ? splat(0) : y.terms[i];
     out.terms[0] = wide ? splat((low + high) / 2) : out.terms[0];
     out.radius() = wide ? splat((high - low) / 2 + room) : y.radius();

@@ -19,7 +19,7 @@ constexpr int LANES = 4;
 typedef double V __attribute__((vector_size(8 * LANES)));
 typedef int64_t M __attribute__((vector_size(8 * LANES)));  // truths, or the bits of numbers
 
-constexpr double EPSILON = 2.220446049250313e-16, TINY = 1e-300, PI = 3.141592653589793;
+constexpr double EPSILON = 2.220446049250313e-16, TINY = 1e-300, FLOOR = TINY / EPSILON, PI = 3.141592653589793;
 constexpr int MOST_STATIONARY = 10;
 
 inline V splat(double value) { return V{} + value; }
@@ -51,7 +51,7 @@ inline Range roomy(V low, V high) {
 // The most of A ε + m ε² over |ε| ≤ 1, for A ≥ 0
 inline V parabola(V A, V m) {
     const M inner = -2 * m > A;
-    return inner ? A * A / (inner ? -4 * m : splat(1)) : A + m;
+    return inner ? A * (A / (inner ? -4 * m : splat(1))) : A + m;
 }
 
 struct Exponential {

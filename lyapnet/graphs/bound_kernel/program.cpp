@@ -79,7 +79,7 @@ void matrix_product(const Block &block, const int *&code) {
     for (; j < columns; j++) tiles<1>(x.data(), weights + j, inner, columns, &out[j], count);
     for (j = 0; j < columns; j++) {
         const Entry entry = block.entry(results);
-        V total = splat(0);
+        V total = splat(TINY);
         for (int i = 0; i < inner; i++) total += std::fabs(weights[i * columns + j]) * radius[i];
         entry.radius() = total;
         block.finish(entry, 0);

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lyapnet.graphs.bound_kernel.program import Entry, Forms, Program
 from lyapnet.graphs.rounding import ROUNDED
+from lyapnet.graphs.taylor import TINY
 
 aten = torch.ops.aten
 
@@ -224,7 +225,7 @@ def _tanh(program: Program, x: Forms) -> Forms:
 
 def _threshold(threshold: float) -> tuple[float, float]:
     """(where torch's softplus is the identity, by how much it is off at most)."""
-    return threshold, 1.001 * math.exp(-threshold)
+    return threshold, 1.001 * math.exp(-threshold) + TINY
 
 
 @rule(aten.softplus.default)

@@ -70,7 +70,16 @@ def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dic
             f"Expected the checkpoint that was written, got {str(path)!r}, which was changed or damaged since; use "
             "another checkpoint of the run, or a copy of this one."
         )
+    _add_missing_buffers(content["state_dict"])
     return content
+
+
+def _add_missing_buffers(weights: dict[str, Any]) -> None:
+    """Add what files of up to 0.3 lack: whether an expansion network ends in φ, which theirs did not."""
+    for name, tensor in list(weights.items()):
+        prefix, _, last = name.rpartition(".")
+        if last == "at_goal" and isinstance(tensor, Tensor):
+            weights.setdefault(f"{prefix}.ends", torch.zeros_like(tensor))
 
 
 def digest_of(content: Any) -> str:

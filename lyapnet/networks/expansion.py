@@ -38,19 +38,21 @@ class ExpansionNetwork(ValueFunction):
     S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
     ξ_y.
 
+    Where the expansion is φ at T, N is multiplied by 1 − t/T: V(T, ·) = φ for any weights, and close to T, where hardly
+    anything is left to pay and to learn from, V is what the Riccati equation or the optimum says.
+
     Args:
         scaling: of the task, for what starts without an expansion.
         hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
         constants: indices of the states that stay what they are.
-        smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear. Where
-            the expansion is φ at T, N is then multiplied by 1 − t/T, so that V(T, ·) = φ for any weights.
+        smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear.
     """
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
     at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
     moves: Float[Tensor, " n"]  # 0 for a constant state, 1 for any other
-    ends: Float[Tensor, ""]  # 1 where the expansion is φ at T, else 0; of what is smooth in time
+    ends: Float[Tensor, ""]  # 1 where the expansion is φ at T, else 0
 
     def __init__(
         self,
@@ -76,9 +78,8 @@ class ExpansionNetwork(ValueFunction):
         T, parts = scaling.duration, 1 + 2 * n + 2 * n * n
         nodes = torch.linspace(0, T, NODES)
         self.expansion = SmoothCurve(T, [parts]) if smooth else Curve(nodes, torch.zeros(NODES, parts))
-        self.duration, self.smooth = T, smooth
-        if smooth:
-            self.register_buffer("ends", torch.tensor(0.0))
+        self.duration = T
+        self.register_buffer("ends", torch.tensor(0.0))
 
     def forward(self, t: Time, x: State) -> PerState:
         c, p, H, delta = self._around(t, x)
@@ -100,7 +101,7 @@ class ExpansionNetwork(ValueFunction):
 
     def _fading(self, t: Time, rho: PerState) -> PerState:
         """ρ, or its slope, of which nothing is left at T where the expansion is φ there."""
-        return rho * (1 - self.ends * t / self.duration) if self.smooth else rho
+        return rho * (1 - self.ends * t / self.duration)
 
     def _near(self, xi: State) -> PerState:
         """1 / (1 + ‖ξ_y‖²)."""
@@ -123,8 +124,8 @@ class ExpansionNetwork(ValueFunction):
     def _take_curves(self, t: Tensor, parts: Tensor, exact_end: bool = False) -> None:
         """Curves through the nodes; with H symmetric to the last bit, as V_x wants it, where they are fitted."""
         self.expansion.take(t, parts)
+        self.ends.fill_(float(exact_end))
         if isinstance(self.expansion, SmoothCurve):
-            self.ends.fill_(float(exact_end))
             for fitted in (self.expansion.end, self.expansion.weights):
                 H = fitted[..., 1 + 2 * self.n :].unflatten(-1, (2, self.n, self.n))
                 H.copy_((H + H.mT) / 2)

@@ -15,6 +15,7 @@ from lyapnet.config import Config, config_from_plain
 from lyapnet.constraints import Constraints
 from lyapnet.controller import Controller
 from lyapnet.cost import Cost
+from lyapnet.devices import require_device
 from lyapnet.errors import CheckpointError, UsageError
 from lyapnet.programs import Program
 from lyapnet.sets import ControlSet
@@ -46,9 +47,10 @@ def load(
             of the goal; or error. None: hold, with a note when it first counts.
 
     Raises:
-        UsageError: no such file; or a part of the user's own that was not passed.
+        UsageError: no such file or device; or a part of the user's own that was not passed.
         CheckpointError: the file is truncated, foreign, or does not fit its own config.
     """
+    require_device(device, torch.float32)
     content = read_checkpoint(path, device)
     config = config_of(content, path)
     parts = Parts(system, cost, controls, constraints, network, program)

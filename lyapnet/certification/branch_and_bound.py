@@ -15,7 +15,8 @@ from torch import Tensor
 
 from lyapnet.certification.boxes import Boxes, CutTree, roots, single
 from lyapnet.certification.stopping import Stop
-from lyapnet.errors import UsageError, one_line
+from lyapnet.devices import require_device
+from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import TaylorForm, wide_axes
 from lyapnet.types import Corner, Corners, PerBox, Value
@@ -50,7 +51,11 @@ class Budget:
                 f"Expected chunk, frontier and workers ≥ 1, got {self.chunk}, {self.frontier} and {self.workers}."
             )
         if self.device != "cpu":
-            _require_device(self.device, self.workers, self.ray)
+            require_device(self.device, torch.float64)
+            if self.workers > 1:
+                raise UsageError(f"Expected one worker on {self.device}, got {self.workers}; leave --workers out.")
+            if self.ray is not None:
+                raise UsageError(f"Expected --device {self.device} or --ray, got both; cores of a cluster bound boxes.")
 
     @property
     def at_once(self) -> int:
@@ -70,20 +75,6 @@ class Budget:
     def left(self) -> float:
         """Seconds that are left."""
         return max(0.0, self.seconds - self.elapsed)
-
-
-def _require_device(device: str, workers: int, ray: str | None) -> None:
-    """Refuse a device that is not there, or that several processes would share."""
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise UsageError(
-            f"Expected a device that torch has, cpu or cuda, got {device!r}: {one_line(error)}."
-        ) from error
-    if workers > 1:
-        raise UsageError(f"Expected one worker on {device}, got {workers}; leave --workers out.")
-    if ray is not None:
-        raise UsageError(f"Expected --device {device} or --ray, got both; cores of a cluster bound boxes.")
 
 
 AHEAD = 4  # chunks of each of several workers in a round, so that none waits for what is done between rounds

@@ -1,6 +1,7 @@
 """Where closed loops at one instant's law converge exponentially: a box on which the linearised law contracts."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -260,10 +261,14 @@ def _metrics(
     than −own. Of plants there is V_xx too, as V falls with all of them, if V is any good.
 
     Raises:
-        LinAlgError: rounding leaves none of it.
+        LinAlgError: rounding leaves none of it, or overflow.
     """
     scaled, eye = A * scale / scale[:, None], np.eye(len(A))
-    found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
+    if not np.isfinite(scaled).all():
+        raise np.linalg.LinAlgError("Expected a finite law in units of D, got another.")
+    with warnings.catch_warnings():  # about rounding: what is found is tried before it is used
+        warnings.simplefilter("ignore")
+        found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
     if law.constants and law.loop.V is not None:
         t, V, chosen = goal.new_zeros(()), law.loop.V, list(seen)
         H = torch.autograd.functional.hessian(lambda x: V(t, x), goal)[chosen][:, chosen].numpy()  # pyright: ignore[reportArgumentType, reportCallIssue]

@@ -10,6 +10,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from lyapnet.certification import Budget
 from lyapnet.certification.tubes import enclosure
 from lyapnet.certification.tubes.certificate import TubeCertificate, tube_certificate
+from lyapnet.certification.tubes.coordinates import Moving, ratio_of, rotated, turning
 from lyapnet.certification.tubes.tube import tube_claim
 from lyapnet.cli import main
 from lyapnet.constraints import StateLimits
@@ -146,6 +147,21 @@ def test_what_escapes_is_not_proved():
     assert 0 < claim.volume_share < 2.2 / 2.4
     assert float(claim.cells.upper[:, 0].max()) < 1
     assert "seconds spent" in claim.reason
+
+
+@pytest.mark.parametrize(
+    "bad", [[[1.0, 2.0], [2.0, 4.0]], [[torch.nan, 0.0], [0.0, 1.0]], [[torch.inf, 1.0], [1.0, 1.0]]]
+)
+def test_coordinates_without_an_inverse_bound_nothing_and_leave_the_other_cells_alone(bad):
+    """A narrow spike in f gives such coordinates: its slope takes what moves with the middle of a cell to e⁵⁰."""
+    good = torch.tensor([[2.0, 1.0], [0.0, 1.0]]).double()
+    frames, r = torch.stack([good, torch.tensor(bad).double(), good]), torch.full((3, 2), 0.1).double()
+    found = rotated(frames, frames.abs(), frames, frames.abs(), 0 * r, r)
+    alone = rotated(*([frames[:1], frames[:1].abs()] * 2), 0 * r[:1], r[:1])
+    assert found[[0, 2]].tolist() == [alone[0].tolist()] * 2
+    assert not bool(found[1].isfinite().all())
+    E = turning(Moving(frames, 0 * frames, 0 * frames))[1]
+    assert ratio_of(E).isfinite().flatten().tolist() == [True, False, True]
 
 
 class Pretending(Escaping):

@@ -8,6 +8,7 @@ import threading
 import pytest
 import torch
 
+import lyapnet
 from lyapnet.certification import Budget, DecreaseCondition, proof, prove
 from lyapnet.certification.boxes import Boxes, single
 from lyapnet.certification.branch_and_bound import Question
@@ -131,12 +132,13 @@ def test_a_cluster_that_is_not_there_is_told_at_once():
         prove(DecreaseCondition(loop(riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, ray=address))
 
 
-def test_a_device_that_is_not_there_is_one_line():
-    with pytest.raises(UsageError, match="Expected a device that torch has, cpu or cuda, got 'xyz'"):
-        Budget(device="xyz")
-    if not torch.cuda.is_available():
-        with pytest.raises(UsageError, match="cpu or cuda, got 'cuda'"):
-            Budget(device="cuda")
+@pytest.mark.parametrize("device", ["xyz", "meta", "cpu:7", "cpu:0", "cuda:99", "mps:3", "", "cpu cuda"])
+def test_a_device_that_does_not_compute_is_one_line(device):
+    with pytest.raises(UsageError, match=f"Expected a device that computes here, cpu or cuda, got '{device}'"):
+        Budget(device=device)
+    with pytest.raises(UsageError, match="Expected a device that computes here"):
+        lyapnet.load("zoo:double_integrator", device=device)
+    assert Budget(device="cpu").device == "cpu"
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.cost import QuadraticCost
+from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import (
     RiccatiOracle,
     RiccatiSolution,
@@ -295,3 +296,10 @@ def test_a_linear_system_with_another_drift_is_not_linear():
     assert not is_linear(Bent())
     assert isinstance(oracle_of(problem_of(DoubleIntegrator())), RiccatiOracle)
     assert not isinstance(oracle_of(problem_of(Bent())), RiccatiOracle)
+
+
+@pytest.mark.parametrize("A", [[[1e300, 1.0], [1.0, 0.0]], [[1e12, 0.0], [0.0, 1.0]], [[0.0, 1e308], [1e308, 0.0]]])
+def test_matrices_that_leave_no_solution_are_one_line(A):
+    linear = problem_of(Linear(A, [[0.0], [1.0]]), steps=2, dt=0.1)
+    with pytest.raises(OracleError, match="Expected matrices whose Riccati equation rounding lets be solved"):
+        oracle_of(linear, "rk4")

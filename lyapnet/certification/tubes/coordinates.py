@@ -40,7 +40,7 @@ def rotated(before: Tensor, size: Tensor, after: Tensor, size_after: Tensor, jum
         before, after: A and B as floating point has them …
         size, size_after: … with bounds of the numbers that they are sums of.
     """
-    Y, n = torch.linalg.inv(after), r.shape[-1]
+    Y, n = near_inverse(after), r.shape[-1]
     into = (Y @ before).abs() + 4 * (n + 4) * EPSILON * (Y.abs() @ size)
     v = ((into @ r[..., None] + Y.abs() @ jump[..., None])[..., 0]) * ROOM
     return (v + ratio_of(_off(Y, after, size_after)) * v.amax(-1, keepdim=True)) * ROOM
@@ -48,10 +48,18 @@ def rotated(before: Tensor, size: Tensor, after: Tensor, size_after: Tensor, jum
 
 def turning(frame: Moving) -> tuple[Tensor, Tensor]:
     """(Y, E): Y near the inverse of Φ in the middle of a step, and |YΦ(τ) − 1| ≤ E at every τ; (cells, n, n) each."""
-    Y = torch.linalg.inv(frame.middle)
+    Y = near_inverse(frame.middle)
     n = Y.shape[-1]
     moved = (Y @ frame.slope).abs() + (Y @ frame.bend).abs() + 4 * (n + 4) * EPSILON * (Y.abs() @ frame.size)
     return Y, (moved + _off(Y, frame.middle, frame.size)) * ROOM
+
+
+def near_inverse(A: Tensor) -> Tensor:
+    """A⁻¹ up to rounding, (*batch, n, n); of a matrix that has none, or is not finite, numbers that are of no use.
+
+    What is proved with it holds for any numbers: a cell whose matrix has no inverse is not proved, the others are.
+    """
+    return torch.linalg.inv_ex(A).inverse
 
 
 def ratio_of(E: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.certification.tubes import nominal
-from lyapnet.certification.tubes.coordinates import ROOM, Moving, ratio_of, rotated, turning
+from lyapnet.certification.tubes.coordinates import ROOM, Moving, near_inverse, ratio_of, rotated, turning
 from lyapnet.certification.tubes.field import DEGREE, Field
 from lyapnet.certification.tubes.nominal import at_end, derivative, flow, over_step, places
 from lyapnet.graphs.taylor import EPSILON, TaylorForm, monomials
@@ -205,7 +205,8 @@ class _Tube:
         else:
             A = front.frame.at(1) / unit[:, None]
             A = A / A.norm(dim=1, keepdim=True)
-            skewed = torch.linalg.cond(A) > SKEW
+            # singular values exist of finite matrices alone; a cell with others is not proved whatever is chosen here
+            skewed = torch.linalg.cond(A.where(A.isfinite(), 0.0)) > SKEW
             A_r = front.frame.at(1) / unit[:, None] * front.radius[:, None, :].clamp_min(LEAST)
             longest = A_r.norm(dim=1).argsort(-1, descending=True)[:, None].expand_as(A)
             orthogonal = torch.linalg.qr(torch.gather(A_r, 2, longest))[0]
@@ -215,7 +216,7 @@ class _Tube:
         A = torch.linalg.matrix_exp(h * J[1]) @ Q
         bend = h / 8 * (J[2] @ A - J[0] @ Q)
         frame = Moving((A + Q) / 2 - bend, (A - Q) / 2, bend)
-        turn = torch.linalg.matrix_norm(torch.linalg.solve(frame.middle, frame.slope), torch.inf)
+        turn = torch.linalg.matrix_norm(near_inverse(frame.middle) @ frame.slope, torch.inf)
         return frame, turn.nan_to_num(torch.inf)
 
     def _jacobians(self, times: list[float], x: list[State]) -> Tensor:

@@ -3,7 +3,7 @@
 import importlib.util
 
 from lyapnet.cost import is_quadratic
-from lyapnet.errors import OracleError
+from lyapnet.errors import OracleError, one_line
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.riccati import (
     RiccatiOracle,
@@ -55,7 +55,13 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
     free = problem.constraints is None and not problem.controls.limited
     if free and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
-        return RiccatiOracle(solve(system, cost, horizon))
+        try:
+            return RiccatiOracle(solve(system, cost, horizon))
+        except (RuntimeError, OverflowError) as error:  # torch's LinAlgError is no public name
+            raise OracleError(
+                f"Expected matrices whose Riccati equation rounding lets be solved, got others ({one_line(error)}); "
+                "choose units in which they are of similar size."
+            ) from error
     if importlib.util.find_spec("casadi") is None:
         raise OracleError(
             "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."

@@ -17,6 +17,8 @@ from lyapnet.horizon import Horizon
 from lyapnet.systems import Linear
 from lyapnet.types import Control, ControlPath, PerState, State
 
+SUBSTEPS = 10_000  # restarts within one step of Δt, at most: a task of 100 steps takes a minute then
+
 
 @dataclass(frozen=True)
 class RiccatiSolution:
@@ -84,6 +86,7 @@ def continuous_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) ->
 
     Raises:
         ValueError: R depends on the state, or a weight does not fit the system's dimensions.
+        OverflowError: the equation has a mode that is faster than Δt by more than SUBSTEPS.
 
     Source: Kenney, Leipnik, "Numerical integration of the differential matrix Riccati equation", IEEE Transactions on
     Automatic Control 1985 (the modified Davison-Maki method).
@@ -92,7 +95,10 @@ def continuous_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) ->
     RinvBT = torch.linalg.solve(R, B.mT)
     H = torch.cat([torch.cat([A, -B @ RinvBT], 1), torch.cat([-Q, -A.mT], 1)])
     # Over a long h the fastest mode of exp(−hH) drowns the others in X and rounding loses P: |λ|h ≤ 1 between restarts.
-    substeps = max(1, math.ceil(horizon.dt * float(torch.linalg.eigvals(H).abs().max())))
+    fastest = horizon.dt * float(torch.linalg.eigvals(H).abs().max())
+    if not fastest <= SUBSTEPS:
+        raise OverflowError(f"a mode of {fastest:.1g} time constants in a step of Δt")
+    substeps = max(1, math.ceil(fastest))
     flow = torch.linalg.matrix_exp(-horizon.dt / substeps * H)
     P = [Q_T]
     for _ in range(horizon.steps):

@@ -7,7 +7,9 @@ import functools
 import hashlib
 import io
 import logging
+import os
 import pickle
+import sys
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -17,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.errors import CheckpointError, UsageError
-from lyapnet.files import write_atomically
+from lyapnet.errors import CheckpointError, UsageError, one_line
+from lyapnet.files import require_file, write_atomically
 
 # what torch.load raises on files that it cannot read, by their first bytes
 UNREADABLE = (
@@ -141,22 +143,25 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         CheckpointError: truncated, foreign, or holding anything else; nothing in it was executed.
     """
     path = Path(path)
-    if path.is_dir():
+    try:
+        require_file(path)
+    except IsADirectoryError as error:
         raise UsageError(
             f"Expected a checkpoint file, got the folder {str(path)!r}; in a run's it is checkpoints/best.ckpt."
-        )
-    if path.is_file() and not path.stat().st_size:
+        ) from error
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
+        ) from error
+    except (OSError, ValueError) as error:  # a name with a null character is a ValueError
+        raise UsageError(f"Expected a checkpoint file, got {str(path)!r} ({_words(error)}); use another.") from error
+    if not path.stat().st_size:
         raise CheckpointError(
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which is empty; use another of the run."
         )
-    if not path.is_file():
-        raise UsageError(
-            f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
-        )
     try:
-        with warnings.catch_warnings():  # about foreign pickles, which are refused below
-            warnings.simplefilter("ignore")
-            return torch.load(path, map_location=device, weights_only=True)
+        with path.open("rb") as file:
+            return plain_data_of(file, device)
     except OSError as error:
         raise CheckpointError(
             f"Expected a readable checkpoint, got {str(path)!r} ({error.strerror}); use another."
@@ -166,6 +171,51 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which is truncated or foreign "
             f"({_first_sentence(error)}); use another checkpoint of the run."
         ) from error
+
+
+def plain_data_of(file: io.BufferedIOBase, device: str | torch.device = "cpu") -> Any:
+    """What torch.save wrote, of tensors, numbers, strings, lists and dictionaries only; nothing in it is executed.
+
+    Raises:
+        One of UNREADABLE: it is another file; or it asks for far more memory than its own size, by compression, by
+            tensors that are larger than their storage, or by lists that name one another again and again.
+    """
+    size = file.seek(0, os.SEEK_END)
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise zipfile.BadZipFile("its archive is compressed")
+        if sum(entry.file_size for entry in entries) > size:
+            raise zipfile.BadZipFile("its archive is larger than the file")
+    file.seek(0)
+    with warnings.catch_warnings():  # about foreign pickles, which are refused
+        warnings.simplefilter("ignore")
+        content = torch.load(file, map_location=device, weights_only=True)
+    if (needed := _bytes_of(content, {})) > (most := SMALL + EXPANSION * size):
+        raise ValueError(f"it holds {needed:.3g} bytes, more than {most:.3g}")
+    return content
+
+
+SMALL, EXPANSION = 10**6, 100  # bytes, and times the bytes of its file: more than numbers and texts of a file take
+
+
+def _bytes_of(value: Any, counted: dict[int, int | None]) -> int:
+    """The bytes of nested data in which what is named several times counts as often; `counted` has those of its parts.
+
+    Raises:
+        ValueError: something contains itself.
+    """
+    if isinstance(value, Tensor):
+        return value.nbytes
+    if not isinstance(value, Mapping | list | tuple | set | frozenset):
+        return sys.getsizeof(value)
+    if id(value) not in counted:
+        counted[id(value)] = None
+        parts = [*value.keys(), *value.values()] if isinstance(value, Mapping) else value
+        counted[id(value)] = sys.getsizeof(value) + sum(_bytes_of(part, counted) for part in parts)
+    if (known := counted[id(value)]) is None:
+        raise ValueError("a list or dictionary in it contains itself")
+    return known
 
 
 def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
@@ -183,6 +233,11 @@ def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
             f"Expected to write checkpoint {str(path)!r}, got {error.strerror}; make room and continue with --resume "
             f"last: {'the previous checkpoint is untouched' if Path(path).exists() else 'there is no earlier one yet'}."
         ) from error
+
+
+def _words(error: Exception) -> str:
+    """What the system says of a file, or what else was raised."""
+    return getattr(error, "strerror", None) or one_line(error)
 
 
 def _first_sentence(error: Exception) -> str:

@@ -1,7 +1,8 @@
 """State constraints h(x) ≤ 0: what no closed loop may enter."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -48,7 +49,7 @@ class StateLimits(Constraints):
         names: of each, in words.
 
     Raises:
-        ValueError: a scale is not positive.
+        ValueError: a scale is not positive, a limit not finite, or no state lies between two limits of one.
     """
 
     states: Int[Tensor, " k"]
@@ -65,8 +66,13 @@ class StateLimits(Constraints):
         names: Sequence[str] = (),
     ):
         super().__init__()
-        if not all(scale > 0 for scale in scales):
+        if not all(math.isfinite(limit) for limit in limits):
+            raise ValueError(f"Expected finite limits, got {list(limits)}; leave out a state that has none.")
+        if not all(0 < scale < math.inf for scale in scales):
             raise ValueError(f"Expected scales > 0, got {list(scales)}; give the size of what counts as 1.")
+        for i, low, high in _sides(states, limits, sides):
+            if not low < high:
+                raise ValueError(f"Expected lower < upper limits, got {low:g} and {high:g} of state {i}; part them.")
         self.names: Sequence[str] = tuple(names) or tuple(f"limit {j + 1}" for j in range(len(states)))
         self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)
         for name, numbers in (("limits", limits), ("sides", sides), ("scales", scales)):
@@ -75,6 +81,16 @@ class StateLimits(Constraints):
 
     def forward(self, x: State) -> Float[Tensor, "*batch k"]:
         return self.sides * (x[..., self.states] - self.limits) / self.scales
+
+
+def _sides(
+    states: Sequence[int], limits: Sequence[float], sides: Sequence[float]
+) -> Iterator[tuple[int, float, float]]:
+    """(i, greatest lower limit, least upper one) of each state that has a limit."""
+    for i in dict.fromkeys(states):
+        own = [(side, limit) for j, limit, side in zip(states, limits, sides, strict=True) if j == i]
+        below, above = ([limit for side, limit in own if (side > 0) is upper] for upper in (False, True))
+        yield i, max(below, default=-math.inf), min(above, default=math.inf)
 
 
 class Ball(Constraints):
@@ -90,7 +106,7 @@ class Ball(Constraints):
         name: in words.
 
     Raises:
-        ValueError: r is not positive.
+        ValueError: r is not positive, or something not finite.
     """
 
     states: Int[Tensor, " k"]
@@ -100,8 +116,10 @@ class Ball(Constraints):
 
     def __init__(self, states: Sequence[int], center: Sequence[float], radius: float, inside: bool, name: str = ""):
         super().__init__()
-        if not radius > 0:
-            raise ValueError(f"Expected a ball with radius > 0, got {radius:g}.")
+        if not 0 < radius < math.inf or not all(math.isfinite(each) for each in center):
+            raise ValueError(
+                f"Expected a ball with a finite centre and radius > 0, got {list(center)} and {radius:g}; correct them."
+            )
         self.radius, self.side = float(radius), -0.5 if inside else 0.5
         self.names: Sequence[str] = (name or f"{'inside' if inside else 'outside'} a ball of radius {radius:g}",)
         self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import io
 import math
 import operator
 import re
@@ -14,7 +15,8 @@ import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from lyapnet.errors import UsageError, did_you_mean
+from lyapnet.errors import UsageError, did_you_mean, one_line
+from lyapnet.files import LARGEST_TEXT, read_file
 
 
 def option(
@@ -44,15 +46,15 @@ def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
         UsageError: no such file, not YAML, or none of the keys.
     """
     try:
-        content = OmegaConf.to_container(
-            OmegaConf.load(path), resolve=False
-        )  # reads 1e-2 as a number; YAML 1.1 does not
+        text = io.StringIO(read_file(Path(path), LARGEST_TEXT).decode())
+        # reads 1e-2 as a number; YAML 1.1 does not
+        content = OmegaConf.to_container(OmegaConf.load(text), resolve=False)
     except OSError as error:
         raise UsageError(
             f"Expected a config file, got {str(path)!r} ({error.strerror or error}); see conf/."
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException) as error:
-        reason = " ".join(str(error).split())
+    except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException, ValueError, RecursionError) as error:
+        reason = one_line(error)
         raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
     sections = [f.name for f in dataclasses.fields(schema)]
     if not isinstance(content, Mapping) or not any(name in content for name in sections):
@@ -90,8 +92,8 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
         raise UsageError(
             f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
         ) from error
-    except yaml.YAMLError as error:
-        raise UsageError(f"Expected a YAML value after =, got {' '.join(overrides)!r}; quote it.") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise UsageError(f"Expected a YAML value after =, got {one_line(' '.join(overrides))!r}; quote it.") from error
     assert isinstance(config, schema)
     return config
 

@@ -160,10 +160,10 @@ class ControlBox(ControlSet):
     3ᵐ are solved as one batch; with more, by an active-set method.
 
     Args:
-        lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none.
+        lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none on that side.
 
     Raises:
-        ValueError: limits of different lengths, reversed, or not numbers.
+        ValueError: limits of different lengths, equal, reversed, or not numbers.
 
     Source: Nocedal, Wright, Numerical Optimization, 2006, § 16.5 (primal active-set methods for convex programs).
     """
@@ -179,8 +179,9 @@ class ControlBox(ControlSet):
                 f"Expected lower and upper as two numbers, or one for each control, got {low.tolist()} and "
                 f"{high.tolist()}; write ∓inf where there is no limit."
             )
-        if not bool((low <= high).all()) or bool(((low == high) & low.isinf()).any()):
-            raise ValueError(f"Expected lower ≤ upper, got {low.tolist()} and {high.tolist()}; swap the two.")
+        if not bool((low < high).all()):
+            remedy = "swap the two" if bool((low > high).any()) else "a control that cannot move belongs into f"
+            raise ValueError(f"Expected lower < upper, got {low.tolist()} and {high.tolist()}; {remedy}.")
         self.register_buffer("lower", low, persistent=False)
         self.register_buffer("upper", high, persistent=False)
         self._limited = bool(low.isfinite().any() | high.isfinite().any())

@@ -9,9 +9,14 @@ import yaml
 from torch.testing import assert_close
 
 from lyapnet.build import resolve
+from lyapnet.certification.preconditions import over_time
 from lyapnet.config import config_from_plain, load_config, to_plain
+from lyapnet.contracts import copied
 from lyapnet.errors import UsageError
+from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.programs import LyapunovProgram, RegionProgram, ValueProgram
+from lyapnet.sets import Box
 from lyapnet.systems import (
     SYSTEMS,
     Cartpole,
@@ -23,6 +28,7 @@ from lyapnet.systems import (
     VanDerPol,
 )
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, SCRATCH, objects
+from tests.problems import untrained
 
 # The shipped configs against the task sheet
 
@@ -168,7 +174,7 @@ def test_limits_of_the_controls(limits, lower, upper):
     [
         ("controls.lower=[-1,-1,-1]", "controls.lower with 2 entries .*got 3"),
         ("controls.upper=fast", "controls.upper as a number or a list of them, got 'fast'"),
-        ("controls={lower: 2, upper: 1}", "lower ≤ upper"),
+        ("controls={lower: 2, upper: 1}", "lower < upper"),
         ("controls={lower: 1, name: 'mine:Mine'}", "limits or a controls.name, got both"),
     ],
 )
@@ -264,3 +270,52 @@ def test_a_module_without_a_class_is_told_from_one_with_it(name):
         resolve(name, SYSTEMS, "system.name", ControlAffineSystem)
     with pytest.raises(UsageError, match=r"got 'cartpol'; did you mean cartpole\?$"):
         resolve("cartpol", SYSTEMS, "system.name", ControlAffineSystem)
+
+
+def test_a_limit_on_one_side_means_the_same_to_the_law_its_bounds_and_the_oracle():
+    """u ≥ −0.05 and no more: ∞ is written .inf or null; the law is at the limit on one side, and free on the other."""
+    short = ("horizon.steps=8", "horizon.dt=0.2", "network.hidden=[4]", "controls.lower=-0.05")
+    one, other = (untrained("double_integrator", *short, f"controls.upper={none}") for none in (".inf", "null"))
+    assert_close(torch.stack(one.controls.limits), torch.stack(other.controls.limits))
+    x = one.initial_states.sample(200, torch.Generator().manual_seed(0))
+    free = untrained("double_integrator", *short[:-1])
+    free.V.load_state_dict(one.V.state_dict())
+    u, without = one.policy(torch.tensor(0.0), x), free.policy(torch.tensor(0.0), x)
+    assert_close(u, without.clamp(min=-0.05))
+    assert float(u.max()) > 0.05 > -0.05 == float(u.min())
+    domain = over_time(Box(x.amin(0), x.amax(0)), 0.0)
+    loop = copied(one.closed_loop)
+    law = BoundedFunction(lambda t, x: (loop.policy(t, x),), domain)
+    ((low, high),) = law.bounds(*(corner[None] for corner in domain))
+    assert float(low) == -0.05
+    assert float(high) >= float(u.max())
+    some = x[:2]
+    at_most, least = (oracle_of(each.problem, "euler").solve(some).cost for each in (one, free))
+    both = oracle_of(untrained("double_integrator", *short, "controls.upper=0.05").problem, "euler").solve(some).cost
+    assert bool((least < at_most + 1e-9).all())
+    assert bool((at_most < both + 1e-9).all())
+    assert float((both - at_most).max()) > 1e-3 < float((at_most - least).max())
+
+
+@pytest.mark.parametrize(
+    ("override", "reason"),
+    [
+        ("controls={lower: 1, upper: 1}", "lower < upper, .*belongs into f"),
+        ("controls={lower: .inf}", "lower < upper"),
+        ("controls={lower: .nan}", "controls.lower as a number"),
+        ("constraints={upper: {position: .inf}}", "finite limits"),
+        ("constraints={lower: {position: .nan}}", "finite limits"),
+        ("constraints={lower: {position: 1}, upper: {position: 1}}", "lower < upper limits"),
+        ("constraints={lower: {position: 2}, upper: {position: 1}}", "lower < upper limits"),
+        ("constraints={outside: [{center: {position: .inf}, radius: 1}]}", "a finite centre"),
+        ("constraints={inside: [{center: {position: 0}, radius: .inf}]}", "a finite centre"),
+        ("cost.obstacles=[{center: {position: .inf}, radius: 1, weight: 1}]", "a finite centre"),
+        ("cost.obstacles=[{center: {position: 3}, radius: 1, weight: .inf}]", "a finite centre"),
+        ("target=[.inf,0]", "target of finite numbers"),
+        ("initial_states.upper=[.inf,1]", "finite bounds"),
+        ("family={damping: [0, .inf]}", "family"),
+    ],
+)
+def test_bounds_without_meaning_are_refused(override, reason):
+    with pytest.raises(UsageError, match=f"Expected .*{reason}"):
+        untrained("double_integrator", override)

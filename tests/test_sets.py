@@ -191,7 +191,6 @@ def test_limits_on_one_side_or_none(m):
     assert (above == 0).any()
     assert above.isfinite().all()
     assert_close(above[(free > 0).all(-1)], free[(free > 0).all(-1)])
-    assert_close(ControlBox([0.2] * m, [0.2] * m).minimise(R, b), torch.full((50, m), 0.2))
 
 
 def slope_inwards(R, b, u, controls):
@@ -239,7 +238,7 @@ def test_the_minimum_within_limits_in_single_precision():
     assert_close(wide, torch.tensor([0.7, -1.0]).float(), rtol=0, atol=0.06)
 
 
-@given(st.floats(-1e3, 1e3), st.floats(0, 1e3))
+@given(st.floats(-1e3, 1e3), st.floats(1e-9, 1e3))
 def test_in_single_precision_limits_are_no_wider(low, width):
     box = ControlBox([low], [low + width])
     single = ControlBox([low], [low + width]).float()
@@ -250,9 +249,8 @@ def test_in_single_precision_limits_are_no_wider(low, width):
     assert single.lower.dtype == torch.float32
 
 
-@pytest.mark.parametrize("width", [0.0, 1e-12])
-def test_limits_that_single_precision_does_not_tell_apart(width):
-    box = ControlBox([0.1], [0.1 + width]).float()
+def test_limits_that_single_precision_does_not_tell_apart():
+    box = ControlBox([0.1], [0.1 + 1e-12]).float()
     assert box.lower == box.upper
     assert box.contains(box.project(torch.zeros(1).float()))
 
@@ -281,7 +279,9 @@ def test_the_minimum_within_limits_has_a_gradient_where_controls_are_free():
 @pytest.mark.parametrize(
     ("lower", "upper", "reason"),
     [
-        (1.0, -1.0, "lower ≤ upper"), (math.nan, 1.0, "lower ≤ upper"), (math.inf, math.inf, "lower ≤ upper"),
+        (1.0, -1.0, "lower < upper, .*swap the two"), (math.nan, 1.0, "lower < upper"),
+        (math.inf, math.inf, "lower < upper"), (-math.inf, -math.inf, "lower < upper"),
+        ([-1.0, 2.0], [1.0, 2.0], "lower < upper, .*belongs into f"), (0.0, -0.0, "lower < upper"),
         ([-1.0], [1.0, 2.0], "one for each control"),
     ],
 )  # fmt: skip

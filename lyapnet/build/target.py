@@ -1,5 +1,7 @@
 """The cost about a target, and the control that holds it."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -22,6 +24,9 @@ def about_target(config: Config, cost: Cost, system: ControlAffineSystem, contro
     target, given = repeated(config.target, system.n), repeated(config.target_control, system.m)
     require_length("target", len(target), system.state_names)
     x = torch.tensor(target, dtype=torch.float64)
+    for name, numbers in (("target", target), ("target_control", given or [])):
+        if not all(math.isfinite(number) for number in numbers):
+            raise UsageError(f"Expected {name} of finite numbers, got {numbers}; correct it.")
     if given is None:
         u = holding(system, x)
     else:

@@ -89,6 +89,9 @@ def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -
     return lower, upper
 
 
+DEEPEST = 2000  # cuts in a row that a proof may have; after 53 along an axis a box is as thin as rounding
+
+
 class CutTree:
     """How one box was cut in two, again and again: cut k parts node n_k in the middle of axis a_k.
 
@@ -124,12 +127,12 @@ class CutTree:
         number = torch.full((2 * self.size + 1,), -1)
         number[node] = torch.arange(self.size)
         level, found = single(lower, upper), []
-        while len(level.key):
+        while len(level.key) and len(found) <= DEEPEST:
             cut = number[level.node]
             found.append(level[cut < 0])
             level = level[cut >= 0].halves(axis[cut[cut >= 0]].long(), cut[cut >= 0])
         leaves = Boxes(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-        if len(leaves.key) != self.size + 1:  # a node cut twice, or one that no cut makes
+        if len(leaves.key) != self.size + 1:  # a node cut twice, one that no cut makes, or too many in a row
             raise ValueError("Expected cuts that part a box and its halves, got others.")
         return leaves
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lyapnet.files import digest_of_file
+from lyapnet.files import appending, digest_of_file, read_file
 from lyapnet.provenance import RUN_RECORD
 
 DRAWS = "draws.jsonl"  # a line for each claim from sampled states
@@ -36,7 +36,7 @@ class Draws(NamedTuple):
         line = json.dumps(entry, sort_keys=True)
         try:
             if line not in self._lines():
-                with self.file.open("a", encoding="utf-8") as file:
+                with appending(self.file) as file:
                     file.write(f"{line}\n")
         except OSError as error:
             return f"not recorded: {error.strerror} ({self.file.name}); other draws may not be accounted for"
@@ -44,7 +44,7 @@ class Draws(NamedTuple):
 
     def _lines(self) -> list[str]:
         try:
-            return [] if self.file is None else self.file.read_text(encoding="utf-8", errors="replace").splitlines()
+            return [] if self.file is None else read_file(self.file).decode(errors="replace").splitlines()
         except OSError:  # none yet, or none that can be read: then none can be added
             return []
 

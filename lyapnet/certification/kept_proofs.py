@@ -28,8 +28,9 @@ from lyapnet.certification.boxes import CutTree
 from lyapnet.certification.branch_and_bound import Search, just_below
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
+from lyapnet.checkpoint import plain_data_of
 from lyapnet.errors import UsageError
-from lyapnet.files import write_atomically
+from lyapnet.files import read_file, write_atomically
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.types import Corner
 
@@ -208,7 +209,7 @@ def read_proofs(path: Path) -> dict[str, Any]:
         UsageError: there is no such file; or it is another, of an earlier version, or changed since.
     """
     with refusing(path):
-        content = path.read_bytes()
+        content = read_file(path)
         start = len(FORMAT) + hashlib.sha256().digest_size
         head, payload = content[:start], content[start:]
         if head != FORMAT + hashlib.sha256(payload).digest():
@@ -218,7 +219,7 @@ def read_proofs(path: Path) -> dict[str, Any]:
                 f"Expected the proof that was written, got {str(path)!r}, which was changed or damaged since; name a "
                 "copy of it, or another."
             )
-        proofs = torch.load(io.BytesIO(payload), weights_only=True)
+        proofs = plain_data_of(io.BytesIO(payload))
         if not proofs or not proofs.keys() <= PROVED.keys():
             raise ValueError("no proofs by their names")
         return proofs

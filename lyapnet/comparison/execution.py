@@ -24,7 +24,7 @@ from lyapnet.config import ControlsConfig, CostConfig, config_from_plain, to_pla
 from lyapnet.controller import Controller
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.evaluation.states import measure
-from lyapnet.files import write_json
+from lyapnet.files import read_file, write_json
 from lyapnet.loading import load
 from lyapnet.random_streams import TEST, stream
 from lyapnet.schema import differences
@@ -65,7 +65,7 @@ def require_same(job: Job) -> None:
     if not record.is_file():
         return
     wanted = json.loads(json.dumps(_description(job)))
-    kept = _with_defaults(json.loads(record.read_text(encoding="utf-8")))
+    kept = _with_defaults(json.loads(read_file(record)))
     changes = [
         text if len(text := f"{name} = {now} instead of {then}") < 80 else f"another {name}"
         for name, (then, now) in differences(kept, wanted).items()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyapnet.files import write_json
+from lyapnet.files import read_file, write_json
 
 OURS = "lyapnet"
 LEARNED = (OURS, "ppo_paper", "ppo_tuned", "sac_paper", "sac_tuned")
@@ -71,7 +71,7 @@ class Result:
     @staticmethod
     def read(path: Path) -> "Result":
         """The result that `write` left."""
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content: dict[str, Any] = json.loads(read_file(path))
         curve, times = [Measurement(**point) for point in content["curve"]], content.get("times")
         return Result(**{**content, "curve": curve, "times": times and ControlTimes(**times)})
 

@@ -204,8 +204,11 @@ class ObstacleCost(MadeOfAnother):
 
     def __init__(self, cost: Cost, states: Sequence[int], centre: Sequence[float], radius: float, weight: float):
         super().__init__(cost)
-        if not (radius > 0 and weight > 0):
-            raise ValueError(f"Expected an obstacle with radius > 0 and weight > 0, got {radius:g} and {weight:g}.")
+        if not (0 < radius < math.inf and 0 < weight < math.inf and all(math.isfinite(each) for each in centre)):
+            raise ValueError(
+                f"Expected an obstacle with a finite centre, radius > 0 and weight > 0, got {list(centre)}, {radius:g} "
+                f"and {weight:g}; correct them."
+            )
         self.radius, self.weight = radius, weight
         self.words = f"an obstacle at {list(centre)} of the states {list(states)}, radius {radius:g}, weight {weight:g}"
         self.register_buffer("states", torch.tensor(list(states), dtype=torch.long), persistent=False)

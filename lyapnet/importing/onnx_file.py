@@ -1,5 +1,6 @@
 """ONNX files: what they hold, and what onnxruntime makes of it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.errors import UsageError, one_line
-from lyapnet.files import digest_of_file
+from lyapnet.files import digest_of_file, require_file
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.importing.onnx_function import DOMAIN, INPUTS, OnnxFunction, library
 from lyapnet.types import State
@@ -33,9 +34,13 @@ def read_onnx(path: Path) -> OnnxModel:
     """
     onnx = library("onnx")
     try:
+        require_file(path)
         model = onnx.load(str(path), load_external_data=False)
-        entries = [entry for each in model.graph.initializer for entry in each.external_data]
+        tensors = (each for part in (model.graph, *model.functions) for each in _tensors_of(part))
+        entries = [entry for each in tensors for entry in each.external_data]
         beside = sorted({entry.value for entry in entries if entry.key == "location"})
+        for name in beside:
+            require_file(path.parent / name)
         onnx.load_external_data_for_model(model, str(path.parent))
         onnx.checker.check_model(model)
         digests = {name: digest_of_file(path.parent / name) for name in (path.name, *beside)}
@@ -49,6 +54,15 @@ def read_onnx(path: Path) -> OnnxModel:
             advice = "reading a torch file can run code that it holds: export it with torch.onnx.export"
         raise UsageError(f"Expected an ONNX file, got {str(path)!r} ({one_line(error)[:150]}); {advice}.") from error
     return OnnxModel(_modern(model, path), digests, model)
+
+
+def _tensors_of(graph: Any) -> Iterator[Any]:
+    """All tensors of a graph or function, which may lie beside the file: constants, and what nodes hold."""
+    yield from getattr(graph, "initializer", ())  # a function has none
+    for attribute in (each for node in graph.node for each in node.attribute):
+        yield from (attribute.t, *attribute.tensors)
+        for inner in (attribute.g, *attribute.graphs):
+            yield from _tensors_of(inner)
 
 
 def _modern(model: Any, path: Path) -> Any:

@@ -1,6 +1,7 @@
 """From a config to what trains: modules, data, and the user's own callbacks."""
 
 import csv
+import io
 from pathlib import Path
 
 import lightning as L
@@ -19,6 +20,7 @@ from lyapnet.build import (
 )
 from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
 from lyapnet.errors import UsageError
+from lyapnet.files import read_file
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
 from lyapnet.rollout import Rollout
@@ -97,15 +99,14 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
 def _points_of(path: Path, n: int) -> Tensor:
     """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            heading, *lines = csv.reader(file)
+        heading, *lines = csv.reader(io.StringIO(read_file(path).decode(), newline=""))
         if heading[:1] != ["t"]:
             raise ValueError("no heading t, …")
         rows = [[float(entry) for entry in row] for row in lines]
         points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
         if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
             raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise UsageError(
             f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "
             "see lyapnet certify --refine."

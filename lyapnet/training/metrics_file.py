@@ -10,7 +10,7 @@ from typing import Any
 from lightning.fabric.utilities import rank_zero_only
 from lightning.pytorch.loggers import Logger
 
-from lyapnet.files import write_atomically
+from lyapnet.files import appending, read_file, write_atomically
 
 METRICS = "metrics.csv"
 STEP, WALL_TIME = "step", "wall_time"  # wall_time: seconds since the Epoch
@@ -61,7 +61,7 @@ class MetricsFile(Logger):
             _, rows = _read(self.path)
             _write(self.path, columns, [*rows, *self._pending])
         else:
-            with self.path.open("a", newline="", encoding="utf-8") as file:
+            with appending(self.path) as file:
                 _writer(file, columns).writerows(self._pending)
         self._pending.clear()
 
@@ -98,7 +98,7 @@ def _read(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     file."""
     if not path.is_file():
         return [], []
-    whole, newline, _ = path.read_text(encoding="utf-8").rpartition("\n")
+    whole, newline, _ = read_file(path).decode().rpartition("\n")
     reader = csv.DictReader(io.StringIO(whole + newline))
     return list(reader.fieldnames or []), list(reader)
 

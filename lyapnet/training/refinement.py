@@ -15,7 +15,7 @@ from lyapnet.certification.region_certificate import RegionCertificate
 from lyapnet.certification.sound_certificate import SoundCertificate
 from lyapnet.config import Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
-from lyapnet.files import write_atomically
+from lyapnet.files import read_file, write_atomically
 from lyapnet.loading import require_parts
 from lyapnet.random_streams import CERTIFICATION, stream
 from lyapnet.training.experiment import train
@@ -102,8 +102,7 @@ def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], par
     pointwise, earlier = config["pointwise"], config["pointwise"]["counterexamples"]
     rows = [["t", *controller.system.state_names], *failing_points(certificate).tolist()]
     if earlier is not None:
-        with Path(earlier).open(encoding="utf-8", newline="") as file:
-            rows += list(csv.reader(file))[1:]
+        rows += list(csv.reader(io.StringIO(read_file(Path(earlier)).decode(), newline="")))[1:]
     text = io.StringIO()
     csv.writer(text).writerows(rows)
     write_atomically(folder / POINTS_FILE, text.getvalue().encode())

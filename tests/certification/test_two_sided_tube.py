@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lyapnet.certification.tubes import two_sided
+from lyapnet.certification.tubes import two_sided
 from lyapnet.certification.tubes.two_sided import TwoSidedTube, two_sided_tube
 from lyapnet.cli import main
 from lyapnet.controller import Controller
@@ -55,8 +56,9 @@ def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
     assert result["optima_between"] == 1
 
 
-def test_a_value_that_is_too_high_is_no_bound():
-    certificate = both_sides(1.1, seconds=12)
+def test_a_value_that_is_too_high_is_no_bound(monkeypatch):
+    monkeypatch.setattr(two_sided, "FOR_TUBE", 1)  # as long as it takes: on a busy machine, more than half
+    certificate = both_sides(1.1, seconds=15)
     assert certificate.claim.verdict == "certified", "the tube itself is none the worse"
     assert certificate.verdict != "certified"
     assert certificate.result["lower_reason"] is not None

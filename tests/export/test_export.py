@@ -28,6 +28,7 @@ KINDS = {
     "the HJB law": ("double_integrator", ()),
     "Sontag's formula": ("double_integrator", ("rollout.policy=sontag",)),
     "a limit, held": ("pendulum_limited", ()),
+    "limits on one side": ("reacher", ("controls.lower=[-0.4]", "controls.upper=[null,0.4]")),
     "two limits, R(x) full": ("reacher", ("controls.lower=[-1,-0.4]", "controls.upper=[1,0.4]")),
     "limits of four controls": ("quadrotor", ("controls.lower=-1", "controls.upper=2")),
     "a law that looks ahead": ("keep_out", ()),

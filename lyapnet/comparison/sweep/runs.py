@@ -9,6 +9,7 @@ from typing import Any
 from lyapnet.comparison.sweep.points import Point
 from lyapnet.comparison.workers import run_jobs
 from lyapnet.config import load_config
+from lyapnet.files import read_file
 from lyapnet.tables import csv_text
 from lyapnet.training.runs import EVALUATION, Run
 
@@ -68,7 +69,7 @@ def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any], ray:
 def rows_of(point: Point, run: Run) -> Iterator[SweepRow]:
     """A finished run's rows."""
     config, name = point.config, load_config(point.path, point.overrides).experiment
-    result = json.loads((run.folder / EVALUATION).read_text(encoding="utf-8"))
+    result = json.loads(read_file(run.folder / EVALUATION))
     record = run.record()
     for one, member in zip(result.get("seeds", [result]), run.members(config), strict=True):
         measures = {key: one[key] for key in MEASURES}

@@ -173,7 +173,7 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         ) from error
 
 
-def plain_data_of(file: io.BufferedIOBase, device: str | torch.device = "cpu") -> Any:
+def plain_data_of(file: io.BytesIO | io.BufferedReader, device: str | torch.device = "cpu") -> Any:
     """What torch.save wrote, of tensors, numbers, strings, lists and dictionaries only; nothing in it is executed.
 
     Raises:

@@ -7,6 +7,7 @@ a device) would be waited for without one, and what is larger than the memory wo
 import contextlib
 import errno
 import hashlib
+import io
 import json
 import math
 import os
@@ -15,7 +16,7 @@ import socket
 import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from lyapnet import sizes
 from lyapnet.errors import LyapnetError
@@ -56,7 +57,7 @@ def read_file(path: Path, most: int | None = None) -> bytes:
 
 
 @contextlib.contextmanager
-def appending(path: Path) -> Iterator[TextIO]:
+def appending(path: Path) -> Iterator[io.TextIOWrapper]:
     """A text file to append to, made where there is none: this one, and no other that a link in its place names.
 
     Raises:

@@ -53,12 +53,23 @@ def page_of(controller: Controller, title: str, funnel: KeptSide | None = None) 
         from plotly.offline import get_plotlyjs  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise UsageError(f'Expected plotly, got {error}; pip install "lyapnet[view]".') from error
-    facts = json.dumps(facts_of(controller, title, funnel), ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
+    facts = json_in_script(facts_of(controller, title, funnel))
     parts = files("lyapnet.view")
     return Template((parts / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(title), plotly=get_plotlyjs(), functions=functions_of(controller), facts=facts,
         program=(parts / "page.js").read_text(encoding="utf-8"),
     )  # fmt: skip
+
+
+def json_in_script(content: Any) -> str:
+    """JSON for a script element, whose text neither ends nor begins another element or comment there.
+
+    HTML knows no escapes within a script: after `<!--<script>`, not even `</script>` ends it. JSON does.
+    """
+    return json.dumps(content, ensure_ascii=False, allow_nan=False).translate(ESCAPES)
+
+
+ESCAPES = {ord(each): f"\\u{ord(each):04x}" for each in "<>&\u2028\u2029"}
 
 
 def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """The page of a controller: it says what the controller says, answers a slider and clicks, and refuses clearly."""
 
+import json
 import re
 import shutil
 import subprocess
 import sys
+from html.parser import HTMLParser
 
 import pytest
 import torch
@@ -99,3 +101,36 @@ def test_the_command_refuses_another_ending(tmp_path, capsys, caplog):
     assert main(["view", FIXTURE, "--out", str(tmp_path / "page.png")]) != 0
     assert ".html" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+HOSTILE = ["<!--<script>", "</script><script>alert(1)</script>", "</ScRiPt >", "<![CDATA[", "]]>", "&lt;/script&gt;",
+           "a\u2028b\u2029c", "<img src=x onerror=alert(1)>", "\\u003c/script>", "'\"`${1}"]  # fmt: skip
+
+
+def test_no_title_ends_or_begins_a_script(monkeypatch):
+    class Elements(HTMLParser):
+        """The scripts of a page as a browser ends them, and every other element of it."""
+
+        def __init__(self):
+            super().__init__()
+            self.names, self.texts = [], []
+
+        def handle_starttag(self, tag, attrs):
+            self.names.append(tag)
+            self.texts.append("")
+
+        def handle_data(self, data):
+            if self.texts:
+                self.texts[-1] += data
+
+    monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: "")
+    controller, names = untrained("double_integrator", "horizon.steps=6", "network.hidden=[4]"), set()
+    for title in ("plain", *HOSTILE):
+        page = page_of(controller, title)
+        found = Elements()
+        found.feed(page)
+        facts = next(text for text in found.texts if text.startswith('{"title"'))
+        assert json.loads(facts)["title"] == title
+        names.add(tuple(found.names))
+        assert not set("<>&\u2028\u2029") & set(facts)
+    assert len(names) == 1, "all pages have the same elements"

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from lyapnet.certification.tubes import two_sided
-from lyapnet.certification.tubes import two_sided
 from lyapnet.certification.tubes.two_sided import TwoSidedTube, two_sided_tube
 from lyapnet.cli import main
 from lyapnet.controller import Controller

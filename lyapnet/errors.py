@@ -3,13 +3,15 @@
 import difflib
 import re
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
-_INSTALLED = (str(Path(__file__).parent), "site-packages", "<frozen", "/lib/python")
+_INSTALLED = (str(Path(__file__).parent), "site-packages", "/lib/python")
 _REQUEST = re.compile(
     r"[^.;:]*(please|feel free to)[^.;]*(file|open|report|submit)[^.;]*(issue|bug|ticket).*", re.I | re.S
 )
@@ -40,9 +42,29 @@ def raised(error: BaseException) -> str:
 
 def own_line(error: BaseException) -> traceback.FrameSummary | None:
     """The innermost line of the user's own code that an error came through; None if it came through none."""
-    frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if not any(part in frame.filename for part in _INSTALLED)]
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
     return own[-1] if own else None
+
+
+def running_line(frame: FrameType | None = None) -> traceback.FrameSummary | None:
+    """The innermost line of the user's own code that runs now, or ran in a frame; None where there is none."""
+    frame = sys._getframe(1) if frame is None else frame
+    while frame is not None and not is_own_file(frame.f_code.co_filename):
+        frame = frame.f_back
+    if frame is None:
+        return None
+    return traceback.FrameSummary(frame.f_code.co_filename, frame.f_lineno, frame.f_code.co_name)
+
+
+def place_of(line: traceback.FrameSummary | None) -> str:
+    """ " at file:line (its text)"; nothing where there is no line."""
+    return "" if line is None else f" at {Path(line.filename).name}:{line.lineno} ({line.line})"
+
+
+def is_own_file(name: str) -> bool:
+    """Whether code of this file is the user's own: neither lyapnet's, nor of an installed library, nor Python's."""
+    written = not name.startswith("<") or name.startswith(("<stdin>", "<ipython"))  # and not made by a program
+    return written and not any(part in name for part in _INSTALLED)
 
 
 class LyapnetError(Exception):

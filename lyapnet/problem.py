@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.constraints import Constraints
-from lyapnet.contracts import called, check_function, copied
+from lyapnet.contracts import called, check_function, check_memory, copied
 from lyapnet.cost import Cost, PenaltyCost
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
@@ -188,6 +188,22 @@ class Problem(nn.Module):
                 f"Expected {type(own.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
                 f"{tuple(u.shape)} or a control outside; correct it."
             )
+        check_memory(own.parts, lambda: own.call(x[:TRIED]), lambda: own.call(own.initial_states.ends(TRIED)))
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        """The parts that others may have written, by what messages call them."""
+        parts = (self.system, self.cost, self.controls, self.constraints)
+        return {type(part).__name__: part for part in parts if part is not None}
+
+    def call(self, x: State) -> None:
+        """Compute all that its parts have to say of some states, for what that leaves behind."""
+        system, cost = self.system, self.cost
+        R, u = cost.R(x), torch.ones_like(x[..., :1]).expand(*x.shape[:-1], system.m)
+        u = self.controls.project(self.controls.minimise(R, u))
+        _ = system.dynamics(x, u), cost.running(x, u), cost.terminal(x), self.controls.contains(u), self.rates(x, u)
+        if self.constraints is not None:
+            self.constraints(x)
 
     def _check_constraints(self, x: State) -> None:
         """Hold h against its contract, and some states of X₀ against h."""
@@ -221,6 +237,12 @@ class Problem(nn.Module):
         leaf = x.clone().requires_grad_()
         with torch.enable_grad():
             (expected,) = torch.autograd.grad(own(t, leaf).sum(), leaf, materialize_grads=True)
+        ends = self.initial_states.ends(TRIED).double().cpu()
+        check_memory(
+            {name: own},
+            lambda: own.value_and_state_gradient(t, x),
+            lambda: own.value_and_state_gradient(t.flip(0), ends),
+        )
         value, V_x = called(f"{name}.value_and_state_gradient(t, x)", own.value_and_state_gradient, [t, x])
         same = V_x.shape == x.shape and torch.allclose(
             V_x, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().max())

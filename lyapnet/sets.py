@@ -81,6 +81,11 @@ class Box(nn.Module):
             found[:, i] = torch.where(upper, self.upper[i], self.lower[i])
         return found
 
+    def ends(self, count: int) -> State:
+        """`count` of its corners, over and over where it has fewer."""
+        corners = self.corners(max(1, count.bit_length() - 1))
+        return corners[torch.arange(count) % len(corners)]
+
     def extra_repr(self) -> str:
         return f"{self.lower.tolist()}, {self.upper.tolist()}"
 

@@ -30,13 +30,21 @@ def _checked_at_first(typechecker):
         @functools.wraps(function)
         def call(*arguments, **options):
             count[0] += 1
-            return (checked() if count[0] <= CHECKED_CALLS else function)(*arguments, **options)
+            once = count[0] <= CHECKED_CALLS and not _of_any_size(arguments)
+            return (checked() if once else function)(*arguments, **options)
 
+        # Code of a library, as the one that it stands for: no part of what lyapnet's users wrote.
+        call.__code__ = call.__code__.replace(co_filename=jaxtyping.__file__)
         # Only when called: a function within a function is made anew each time, and most of these are not checked.
         checked = functools.cache(lambda: _jaxtyped(function, typechecker=typechecker))
         return call
 
     return decorate
+
+
+def _of_any_size(arguments):
+    """Whether one of them is a batch whose size has no value, which jaxtyping would ask for."""
+    return any(isinstance(each, torch.Tensor) and torch.SymInt in map(type, each.shape) for each in arguments)
 
 
 _jaxtyped = jaxtyping.jaxtyped

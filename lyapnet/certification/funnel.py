@@ -222,7 +222,7 @@ def setting_of(
     Raises:
         UsageError: D does not fit; or the condition is none that bounds can speak of.
     """
-    freeze(condition, over_time(problem.initial_states, duration))
+    memory = freeze(condition, over_time(problem.initial_states, duration))
     constants, goal = condition.closed_loop.system.constants, problem.goal.double()
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
     X0 = without(problem.initial_states, left_out)
@@ -233,6 +233,7 @@ def setting_of(
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
+    memory.check()
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels)
 

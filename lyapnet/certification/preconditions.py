@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.certification.condition import DecreaseCondition, OwnOperations, own_constraints
-from lyapnet.contracts import check_function
+from lyapnet.contracts import Memory, called, check_batch_sizes, check_function, check_memory, reaches_own_code
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
@@ -19,30 +19,71 @@ from lyapnet.types import Corner, Corners, State, Time, Value
 NOTHING = 1e-200  # bounds of zero have the least room for rounding
 
 
-def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> None:
-    """Trace V and h once, for every question that is asked of them, after a look at what they are."""
+def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memory:
+    """Trace V and h once, for every question that is asked of them, after a look at what they are.
+
+    Returns:
+        What the closed loop holds, to be held against it once it was called more.
+    """
+    loop, h = condition.closed_loop, condition.constraints
+    memory = check_loop(loop, h, sample)
     own = OwnOperations(condition.V, sample)
-    if condition.constraints is not None:
-        condition.constraints = own_constraints(condition.constraints, sample)
+    if h is not None:
+        condition.constraints = own_constraints(h, sample)
     check_states(condition, sample)
+    memory.check()
     condition.V = own
+    return memory
+
+
+def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Corner, Corner]) -> Memory:
+    """Refuse a closed loop with a memory, or one that is another in batches of another size.
+
+    It is called before it is traced: what it computes lazily is there by then.
+    """
+    lower, upper = domain
+    points = _points(lower, upper)
+    ends = Box(lower, upper).ends(TRIED)
+
+    def everything(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        policy, V = loop.policy, loop.V
+        h = () if constraints is None else (constraints(x),)
+        of_V = () if V is None else (V(t, x), V.value_and_state_gradient(t, x)[1])
+        return loop.slope(x, policy(t, x)), loop.control(t, x).u, loop.cost.terminal(x), *of_V, *h
+
+    def call(points: Tensor) -> None:
+        called("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+
+    parts = [loop.system, loop.cost, loop.V, constraints, loop.policy]
+    named = {type(part).__name__: part for part in parts if part is not None}
+    memory = check_memory(named, lambda: call(points), lambda: call(ends))
+    if reaches_own_code(named):
+        check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+    return memory
+
+
+def _points(lower: Corner, upper: Corner) -> Tensor:
+    """Points of a box at random."""
+    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
+    return lower + (upper - lower) * share
 
 
 def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
     """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
     lower, upper = domain
     _require_constant(condition.closed_loop, domain)
-    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
-    points = lower + (upper - lower) * share
+    points = _points(lower, upper)
 
     def all_three(t: Tensor, x: Tensor) -> Tensor:
         return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
 
     t, x = points[:, 0], points[:, 1:]
-    check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False)
+    check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False, any_size=False)
     if condition.constraints is not None:
         k = len(condition.constraints.names)
-        check_function("h(x) with a number for each name", condition.constraints, [x], (k,), differentiable=False)
+        check_function(
+            "h(x) with a number for each name", condition.constraints, [x], (k,), differentiable=False, any_size=False
+        )
     with torch.no_grad():
         own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
         if not _close(own, condition.V(t, x)):

@@ -1,10 +1,9 @@
 """Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
 
 import re
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from traceback import FrameSummary
 from typing import Any
 
 import torch
@@ -18,7 +17,7 @@ from torch.fx.node import map_aggregate
 from torch.overrides import TorchFunctionMode
 from torch.testing import assert_close
 
-from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line
+from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
 
 Tensors = tuple[Tensor, ...]
 
@@ -45,8 +44,15 @@ def trace(
         Exception: of any other kind that the function raises.
     """
     options = {"decomposition_table": decompositions, "tracing_mode": "fake", "_allow_non_fake_inputs": True}
-    with _reading_values(), _Watch():
+    with _reading_values(), _Watch() as watch:
         graph_module = make_fx(function, **options)(*arguments)
+    written = next((node for node in graph_module.graph.nodes if _mutates(node) and _writes_outside(node)), None)
+    if written is not None:
+        raise UsageError(
+            f"Expected f, g, the cost, U, V and u to be functions that remember nothing, got {name_of(written.target)} "
+            f"on a tensor that outlives the call{place_of(watch.written)}; fill constants in __init__, keep counters "
+            "and logs outside, and call .eval() where there is a BatchNorm."
+        )
     for node in graph_module.graph.nodes:  # what a product with a vector is to torch; to be traced again takes as long
         if node.target is torch.ops.aten.squeeze_.dim and len(node.args[0].users) == 1:
             node.target = torch.ops.aten.squeeze.dim
@@ -120,8 +126,14 @@ class _Watch(TorchFunctionMode):
     """
 
     refusal: Exception | None = None
+    written: FrameSummary | None = (
+        None  # where a tensor with values, which is none of the function's own, is written to
+    )
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        target = (kwargs or {}).get("out", args[0] if args and WRITES.search(func.__name__) else None)
+        if type(target) is Tensor and self.written is None:
+            self.written = running_line()
         try:
             if func in (Tensor.__repr__, Tensor.__format__, Tensor.__reduce_ex__):
                 raise RuntimeError("FakeTensor as text")
@@ -147,19 +159,16 @@ def _reading_values():
             raise
         raise UntraceableError(
             f"Expected torch operations, with control flow that does not depend on values, got code that reads the "
-            f"values of a tensor{_where(own_line(error))}; use torch.where, or lyapnet.Table for a table."
+            f"values of a tensor{place_of(own_line(error))}; use torch.where, or lyapnet.Table for a table."
         ) from error
 
+
+WRITES = re.compile(r"[a-z0-9]_$|^__(setitem|i[a-z]+)__$")  # names of what writes to its first argument
 
 UNINITIALISED = ("empty", "empty_like", "empty_strided", "empty_permuted", "new_empty", "new_empty_strided")
 
 NO_VALUES = re.compile(r"tensor subclasses|data pointer|'meta' device|Cannot copy out of meta|FakeTensor")
 """What torch says of code that asks a tensor without values for them."""
-
-
-def _where(line: traceback.FrameSummary | None) -> str:
-    """ " at file:line (its text)"; nothing where there is no line."""
-    return "" if line is None else f" at {Path(line.filename).name}:{line.lineno} ({line.line})"
 
 
 def batched(
@@ -278,6 +287,19 @@ def _depends_on_values(node: Node) -> bool:
 def _mutates(node: Node) -> bool:
     schema = getattr(node.target, "_schema", None)
     return schema is not None and schema.is_mutable
+
+
+def _writes_outside(node: Node) -> bool:
+    """Whether an operator writes to a tensor that was not made in the function: a buffer, say, or a part of one."""
+    schema: Any = node.target._schema  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+    given = [*node.args, *(node.kwargs.get(each.name) for each in schema.arguments[len(node.args) :])]
+    for argument, value in zip(schema.arguments, given, strict=True):
+        if argument.alias_info is not None and argument.alias_info.is_write and isinstance(value, Node):
+            while value.op == "call_function" and is_view(value.target):
+                value = value.all_input_nodes[0]
+            if value.op == "get_attr":
+                return True
+    return False
 
 
 def is_view(target: Any) -> bool:

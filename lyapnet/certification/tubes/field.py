@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from lyapnet.certification.preconditions import check_parts
+from lyapnet.certification.preconditions import check_loop, check_parts
 from lyapnet.constraints import Constraints
 from lyapnet.contracts import check_function
 from lyapnet.graphs.bounds import BoundedFunction
@@ -32,12 +32,14 @@ class Field:
         self.loop, self.constraints, self.seen, self.n = loop, constraints, list(seen), len(seen)
         self._into = torch.eye(loop.system.n, dtype=torch.float64)[self.seen]
         lower, upper = (torch.cat([end[:1], end[1:][self.seen]]) for end in domain)
+        memory = check_loop(loop, constraints, domain)
         _check(self, lower, upper)
         one = torch.ones(self.n + 1 + self.n**2, dtype=torch.float64)
         self.defect = BoundedFunction(
             lambda t, y: self._defect(t, y), (torch.cat([lower, -one]), torch.cat([upper, one])), DEGREE
         )
         self.end = BoundedFunction(lambda t, x: (self.loop.cost.terminal(self.whole(x)),), (lower, upper), DEGREE)
+        memory.check()
 
     def slope(self, t: float | Tensor, x: State) -> Tensor:
         """(ẋ, ℓ) of the seen states, (*batch, n + 1)."""
@@ -68,6 +70,6 @@ def _check(field: Field, lower: Corner, upper: Corner) -> None:
     share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
     points = lower + (upper - lower) * share
     t, x = points[:, 0], points[:, 1:]
-    check_function("(f + g u, ℓ)", field.slope, [t, x], (field.n + 1,), differentiable=False)
+    check_function("(f + g u, ℓ)", field.slope, [t, x], (field.n + 1,), differentiable=False, any_size=False)
     with torch.no_grad():
         check_parts(field.loop, t, field.whole(x))

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lyapnet.contracts.batch_sizes import check_batch_sizes
+from lyapnet.contracts.memory import reaches_own_code
 from lyapnet.errors import UsageError, raised
 
 REMEDIES = {  # what an error of torch's says ↦ what to do
@@ -41,6 +43,7 @@ def check_function(
     arguments: Sequence[Tensor],
     shape: Sequence[int],
     differentiable: bool = True,
+    any_size: bool = True,
 ) -> None:
     """Hold a function of states against its contract.
 
@@ -52,6 +55,7 @@ def check_function(
         arguments: batches (b, …) of float64 numbers, b even.
         shape: of one state's result.
         differentiable: whether its derivative is asked for too.
+        any_size: whether it is traced for batches of every size too, where it is the user's own.
 
     Raises:
         UsageError: it breaks one of these; names which, and where.
@@ -77,6 +81,8 @@ def check_function(
             f"Expected finite {name}, got {_first_bad(value[bad[0]])} at {_at(arguments, int(bad[0]))}; correct it, or "
             "choose an X₀ that avoids this state."
         )
+    if any_size and reaches_own_code(function):
+        check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
     _check_each_for_itself(name, function, arguments, value)
     if differentiable:
         _check_derivative(name, function, arguments, value)

@@ -14,8 +14,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.contracts import differences, state_of
 from lyapnet.cost import Cost
 from lyapnet.errors import UsageError, one_line
+from lyapnet.graphs.tracing import trace
 from lyapnet.shapes import Shape
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, ControlMatrix, InputMatrix, PerState, State, Time
@@ -219,7 +221,7 @@ def check_members(
             f"Expected {cls}.f or g to read {unread[0]}, got the same for each; read self.{unread[0]}, or leave it out."
         )
     for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
-        member = build({name: float(p[k]) for name, k in family.parameters_in_f.items()}).to(z)
+        member = build(_values(family, p)).to(z)
         for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
             got = own[i][: len(x)] if own.ndim > 1 and len(own) == len(z) else own
             if got.shape != expected.shape or not torch.allclose(got, expected, ALIKE, ALIKE):
@@ -229,6 +231,98 @@ def check_members(
                     "__init__ derives from them has to be derived in f and g, and a system that is passed has the "
                     "other parameters of the config."
                 )
+    _require_same_operations(family, build, z)
+
+
+def _values(family: FamilySystem, p: Tensor) -> dict[str, float]:
+    """The parameters in f at some p (k,)."""
+    return {name: float(p[i]) for name, i in family.parameters_in_f.items()}
+
+
+def _require_same_operations(
+    family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State
+) -> None:
+    """Refuse a family whose members are others than systems built with their parameters, at any state there is.
+
+    Two objects that hold the same are the same functions. What the constructor makes of its arguments beside the
+    parameters themselves, and f or g reads, shows as another operation or number in the trace.
+    """
+    low, high = family.split(torch.stack([z.amin(0), z.amax(0)]))[1]
+    share = torch.rand(BUILT, len(low), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(z)
+    compared = _Compared()
+    build({name: compared.number(value) for name, value in _values(family, (low + high) / 2).items()})
+    before, traced = state_of({"": family.system}), 0
+    for p in [low, high, *compared.beside(low, high), *(low + (high - low) * share)]:
+        values = _values(family, p)
+        built, member = build(values).to(z), with_attributes(family.system, values).to(z)
+        derived = differences(state_of({"self": member}), state_of({"self": built}))
+        if derived and traced < TRACED:
+            traced += 1
+            if _operations(member, values, z) != _operations(built, values, z):
+                raise UsageError(
+                    f"Expected {type(built).__name__}.f and g to read no more of {', '.join(values)} than self."
+                    f"{next(iter(values))} and so on, got others than those of {type(built).__name__} built with "
+                    f"{p.tolist()}, of which __init__ derives {derived[0]}; derive it in f and g."
+                )
+    if changed := differences(before, state_of({"": family.system})):
+        raise UsageError(
+            f"Expected {type(family.system).__name__}.__init__ to change nothing but its object, got {changed[0]}, "
+            "which is another one after it; write self.NAME = … for each number."
+        )
+
+
+BUILT = 32  # members at random that are held against what the constructor builds, beside those at the ends and at jumps
+TRACED = 8  # how many of their f and g are compared as graphs, where the constructor makes more of its arguments
+
+
+class _Compared(list[float]):
+    """The numbers that a constructor compares its arguments with: at each of them it may do something else."""
+
+    def number(self, value: float) -> float:
+        """The value, as a number that notes what it is compared with."""
+        met = self
+
+        class Noting(float):
+            """A number that notes what it is compared with."""
+
+        for sign in ("__lt__", "__le__", "__gt__", "__ge__", "__eq__", "__ne__"):
+
+            def compare(one: float, other: Any, sign: str = sign) -> Any:
+                if isinstance(other, int | float):
+                    met.append(float(other))
+                return getattr(float(one), sign)(other)
+
+            setattr(Noting, sign, compare)
+        Noting.__hash__ = float.__hash__
+        return Noting(value)
+
+    def beside(self, low: Tensor, high: Tensor) -> list[Tensor]:
+        """Parameters with one of them at such a number, or on either side of it, within a box."""
+        found = list[Tensor]()
+        for axis, (least, greatest) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+            for value in {met + step * (greatest - least) for met in self for step in (-1e-3, 0.0, 1e-3)}:
+                if least <= value <= greatest:
+                    found.append((low + high) / 2)
+                    found[-1][axis] = value
+        return found
+
+
+def _operations(system: ControlAffineSystem, values: Mapping[str, float], z: State) -> Any:
+    """f, g and all that a problem asks of a system as operators and numbers, of parameters as numbers and as tensors;
+    None where they have no trace, as no certificate has."""
+    like = z[0, : system.n]
+
+    def asked(x: Tensor, u: Tensor, *p: Tensor) -> tuple[Tensor, ...]:
+        here = with_attributes(system, dict(zip(values, p[0].unbind(-1), strict=True))) if p else system
+        weight = getattr(here, "inverse_mass", None)
+        return here.f(x), here.g(x), here.dynamics(x, u), *([] if weight is None else [weight(x)])
+
+    try:
+        p = torch.tensor([*values.values()]).to(z)
+        graphs = [trace(asked, [like, like.new_zeros(system.m), *more]) for more in ([], [p])]
+    except Exception:  # of any kind: f and g may be the user's
+        return None
+    return [(str(graph.graph), state_of({"": dict(graph.named_buffers())})) for graph in graphs]
 
 
 def _unread(family: FamilySystem, z: State) -> list[str]:

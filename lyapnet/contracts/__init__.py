@@ -2,9 +2,9 @@
 
 from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.contracts.functions import called, check_function, copied, initialised, remedy
-from lyapnet.contracts.memory import Memory, check_memory, reaches_own_code
+from lyapnet.contracts.memory import Memory, check_memory, differences, reaches_own_code, state_of
 
 __all__ = [
-    "Memory", "called", "check_batch_sizes", "check_function", "check_memory", "copied", "initialised",
-    "reaches_own_code", "remedy",
+    "Memory", "called", "check_batch_sizes", "check_function", "check_memory", "copied", "differences",
+    "initialised", "reaches_own_code", "remedy", "state_of",
 ]  # fmt: skip

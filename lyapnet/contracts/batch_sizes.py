@@ -70,8 +70,8 @@ def check_batch_sizes(
     if mixing:
         first = next((node for node in mixing if sizes.lines.get(node.name)), mixing[0])
         raise UsageError(
-            f"Expected {name} to be a function of each state by itself, got {_name(first)} over the states of a batch or "
-            f"of their number{place_of(sizes.lines.get(first.name))}; {REMEDY}."
+            f"Expected {name} to be a function of each state by itself, got {_name(first)} over the states of a batch "
+            f"or of their number{place_of(sizes.lines.get(first.name))}; {REMEDY}."
         )
     return None
 

@@ -60,7 +60,7 @@ class Memory:
     """
 
     def __init__(self, parts: Mapping[str, Any]):
-        self.parts, self.before = dict(parts), _state_of(parts)
+        self.parts, self.before = dict(parts), state_of(parts)
 
     def check(self) -> None:
         """Refuse objects that have changed since.
@@ -68,19 +68,22 @@ class Memory:
         Raises:
             UsageError: one has; names the attribute.
         """
-        before, now = self.before, _state_of(self.parts)
-        changed = [name for name in now if name in before and now[name] != before[name]]
-        changed += [name for name in now.keys() ^ before.keys() if CACHED not in name]
-        if changed:
-            name = min(changed, key=lambda name: (name not in before, len(name), name))
+        if changed := differences(self.before, state_of(self.parts)):
             raise UsageError(
-                f"Expected f, g, the cost, U, V and u to be functions that remember nothing, got {name}, which changes "
-                "each time that they are called; fill constants in __init__, keep counters and logs outside, and call "
-                ".eval() where there is a BatchNorm or a dropout."
+                f"Expected f, g, the cost, U, V and u to be functions that remember nothing, got {changed[0]}, which "
+                "changes each time that they are called; fill constants in __init__, keep counters and logs outside, "
+                "and call .eval() where there is a BatchNorm or a dropout."
             )
 
 
-def _state_of(parts: Mapping[str, Any]) -> dict[str, Any]:
+def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """The names under which two states differ, the plainest first; what a cache holds may come and go."""
+    both = [name for name in one if name in other and one[name] != other[name]]
+    found = both + [name for name in one.keys() ^ other.keys() if CACHED not in name]
+    return sorted(found, key=lambda name: (name not in one, len(name), name))
+
+
+def state_of(parts: Mapping[str, Any]) -> dict[str, Any]:
     """Name ↦ value of every plain thing that is reachable; of tensors and arrays, a digest."""
     found: dict[str, Any] = {"the state of torch's random numbers": _digest(torch.get_rng_state().numpy())}
     for name, value in _reachable(parts):

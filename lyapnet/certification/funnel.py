@@ -16,6 +16,7 @@ from lyapnet.certification.condition import (
     bounded_condition,
     require_own_gradient,
 )
+from lyapnet.certification.control_sets import check_controls
 from lyapnet.certification.counterexamples import Counterexample, find_counterexample
 from lyapnet.certification.crossing import Violation, beginning_level, crossing_level, find_violation
 from lyapnet.certification.ignorable_states import ignorable_states
@@ -89,6 +90,7 @@ class SoundClaim:
     violation: Violation | None = None  # of a closed loop from X₀
     disturbance: State | None = None  # w: it is so for ẋ = f + gu + w(t), |w_i(t)| ≤ w_i, then with Ẇ at its worst
     set_up: float = 0.0  # seconds of the budget before the first box
+    assumed: str = ""  # of u, beside what is proved
 
     @property
     def verdict(self) -> Verdict:
@@ -151,7 +153,7 @@ def sound_claim(
         copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance
     )
     duration = problem.horizon.duration
-    left_out, initial_states, wanted, D, domain, sides, levels = setting_of(
+    left_out, initial_states, wanted, D, domain, sides, levels, assumed = setting_of(
         condition, problem, duration, states, budget
     )
     x_low, x_high = initial_states.lower, initial_states.upper
@@ -175,7 +177,7 @@ def sound_claim(
     return SoundClaim(
         alpha, delta, duration, D, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
         found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance, spent,
+        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance, spent, assumed,
     )  # fmt: skip
 
 
@@ -207,6 +209,7 @@ class Setting(NamedTuple):
     domain: tuple[Corner, Corner]  # [0, T] × D
     sides: tuple[Corners, Corners]  # [0, T] × the boundary of D
     levels: Budget  # what is left of the one for levels
+    assumed: str  # of u, beside what is proved
 
 
 def setting_of(
@@ -233,9 +236,10 @@ def setting_of(
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
+    assumed = check_controls(condition.closed_loop, domain)
     memory.check()
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
-    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels)
+    return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, assumed)
 
 
 def for_levels(budget: Budget) -> Budget:

@@ -1,10 +1,12 @@
 """What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
 
+from lyapnet.calculus import ValueFunction
 from lyapnet.certification.condition import DecreaseCondition, OwnOperations, own_constraints
 from lyapnet.contracts import Memory, called, check_batch_sizes, check_function, check_memory, reaches_own_code
 from lyapnet.errors import UsageError
@@ -47,9 +49,15 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
 
     def everything(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
         policy, V = loop.policy, loop.V
-        h = () if constraints is None else (constraints(x),)
-        of_V = () if V is None else (V(t, x), V.value_and_state_gradient(t, x)[1])
-        return loop.slope(x, policy(t, x)), loop.control(t, x).u, loop.cost.terminal(x), *of_V, *h
+        results = [loop.slope(x, policy(t, x)), loop.cost.terminal(x)]
+        results += [] if V is None else [V(t, x)]
+        results += [] if constraints is None else [constraints(x)]
+        # what their base classes make of V(t, x) and policy(t, x) needs no second look
+        if V is not None and type(V).value_and_state_gradient is not ValueFunction.value_and_state_gradient:
+            results.append(V.value_and_state_gradient(t, x)[1])
+        if reaches_own_code(getattr(type(policy), "with_value", None)):
+            results.append(loop.control(t, x).u)
+        return tuple(results)
 
     def call(points: Tensor) -> None:
         called("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
@@ -58,7 +66,11 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     named = {type(part).__name__: part for part in parts if part is not None}
     memory = check_memory(named, lambda: call(points), lambda: call(ends))
     if reaches_own_code(named):
-        check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+        why = check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+        if why is not None:
+            logging.getLogger(__name__).warning(
+                "note: batches of 1, 2 and %d states are tried, no others: %s", TRIED, why
+            )
     return memory
 
 

@@ -248,7 +248,7 @@ def region_claim(
     condition = RecedingDecrease(loop, decay, w, names)
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
     setting = setting_of(condition, problem, 0.0, states, budget)
-    left_out, X0, wanted, D, domain, sides, _ = setting
+    left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:
         kept.require(decay, D, w, names)

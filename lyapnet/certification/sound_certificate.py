@@ -112,6 +112,7 @@ class SoundCertificate(Certificate):
             f"T = {claim.duration:g} s, {self._however_pushed}and its cost is bounded as below. It holds at least "
             f"{floored(claim.volume_share)} of X₀ by volume. It is about the operations that f, g, ℓ, V and u were "
             f"traced to, of this fingerprint; {FROZEN}{self.of_parameters}"
+            f"{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 
     @property

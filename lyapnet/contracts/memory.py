@@ -139,6 +139,8 @@ def _parts_of(name: str, value: Any) -> Iterator[tuple[str, Any]]:
             for key, each in vars(value).items():
                 yield from [(f"{value.__qualname__}.{key}", each)] * (key not in OF_CLASSES)
         return
+    if isinstance(value, CONTAINERS):
+        yield f"the number of entries of {name}", len(value)
     if isinstance(value, Mapping):
         for i, (key, each) in enumerate(list(value.items())):
             yield f"{name}[{key!r}]" if isinstance(key, str | int) else f"{name}[{i}]", each

@@ -60,13 +60,24 @@ def clamp(x: TaylorForm, low: float | None = None, high: float | None = None) ->
 def maximum(x: Any, y: Any) -> TaylorForm:
     """max(x, y) = y + max(x − y, 0): what x and y have in common cancels."""
     x, y = _forms(x, y)
+    if not x.dimension:
+        return _of_intervals(torch.maximum, x, y)
     return taylor.add(y, relu(taylor.add(x, taylor.negate(y))))
 
 
 def minimum(x: Any, y: Any) -> TaylorForm:
     """min(x, y) = x − max(x − y, 0)."""
     x, y = _forms(x, y)
+    if not x.dimension:
+        return _of_intervals(torch.minimum, x, y)
     return taylor.add(x, taylor.negate(relu(taylor.add(x, taylor.negate(y)))))
+
+
+def _of_intervals(rising: Callable[[Tensor, Tensor], Tensor], x: TaylorForm, y: TaylorForm) -> TaylorForm:
+    """A function that rises with both of its arguments, of intervals: it is at its ends at theirs."""
+    x, y = taylor.aligned(x, y)
+    (x_low, x_high), (y_low, y_high) = x.interval(), y.interval()
+    return between(rising(x_low, y_low), rising(x_high, y_high), x).rounded(2)
 
 
 def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:

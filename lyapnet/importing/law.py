@@ -9,11 +9,11 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config
-from lyapnet.contracts import called, copied
+from lyapnet.contracts import called, check_batch_sizes, check_memory, copied, reaches_own_code
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.policy import ValuePolicy
-from lyapnet.problem import Problem
+from lyapnet.problem import TRIED, Problem
 from lyapnet.random_streams import TEST, stream
 from lyapnet.rollout import Rollout
 from lyapnet.types import Control, PerState, State, Time
@@ -103,6 +103,7 @@ def controller_of(
     v, k = (copy.deepcopy(each).double().cpu().eval().requires_grad_(False) for each in (value, law))
     for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):
         _require_size(name, function, problem.goal, size)
+        _require_function(name, function, problem)
     V = GivenValue(v, problem.goal)
     policy = GivenLaw(problem, V, k, origin, precision)
     _note_where_it_leaves(policy, problem)
@@ -134,6 +135,19 @@ def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
             "note: u(x) leaves U, as at x = %s with u = %s: what is certified is u(x) clamped to U.",
             [round(each, 6) for each in x[first].tolist()], [round(each, 6) for each in u[first].tolist()],
         )  # fmt: skip
+
+
+def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
+    """Refuse a function that remembers something, or is another one in batches of another size."""
+    x, ends = states_around(problem)[:TRIED], problem.initial_states.ends(TRIED).double()
+
+    def call(x: State) -> None:
+        with torch.no_grad():
+            called(name, function, [x])
+
+    check_memory({name: function}, lambda: call(x), lambda: call(ends))
+    if reaches_own_code(function):
+        check_batch_sizes(name, lambda x: (function(x),), [x])
 
 
 def _require_size(name: str, function: nn.Module, goal: State, size: int) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from lyapnet.certification.control_sets import check_controls
 from lyapnet.certification.preconditions import check_loop, check_parts
 from lyapnet.constraints import Constraints
 from lyapnet.contracts import check_function
@@ -33,6 +34,7 @@ class Field:
         self._into = torch.eye(loop.system.n, dtype=torch.float64)[self.seen]
         lower, upper = (torch.cat([end[:1], end[1:][self.seen]]) for end in domain)
         memory = check_loop(loop, constraints, domain)
+        check_controls(loop, domain)
         _check(self, lower, upper)
         one = torch.ones(self.n + 1 + self.n**2, dtype=torch.float64)
         self.defect = BoundedFunction(

@@ -272,7 +272,7 @@ def _require_same_operations(
 
 
 BUILT = 32  # members at random that are held against what the constructor builds, beside those at the ends and at jumps
-TRACED = 6  # how many of their f and g are compared as graphs, where the constructor makes more of its arguments
+TRACED = 4  # how many of their f and g are compared as graphs, where the constructor makes more of its arguments
 
 
 class _Compared(list[float]):

@@ -103,10 +103,25 @@ def test_what_asks_for_the_size_of_a_batch_is_refused_at_its_line(way):
 TEN = ("len", "shape", "size", "numel", "number of axes", "broadcast_shapes", "stride", "enumerate", "unbind", "split")
 
 
-@pytest.mark.parametrize(
-    ("place", "way"), [*itertools.product(["f", "g", "q", "V", "u"], TEN), ("R", "len"), ("φ", "len")]
-)
-def test_it_is_refused_in_a_certificate_wherever_it_stands(place, way):
+def functions_of(place, add):
+    """The function of the closed loop that something was added to, and what it is given."""
+    parts = PLACES[place](add)
+    x, t = torch.zeros(4, 2), torch.zeros(4)
+    if place == "u":
+        problem = problem_of(System(), Paid())
+        return parts["law"](problem, Bowl()), [t, x]
+    part = next(iter(parts.values()))
+    return (part, [t, x]) if place == "V" else (getattr(part, {"q": "state"}.get(place, place)), [x])
+
+
+@pytest.mark.parametrize(("place", "way"), [*itertools.product(["f", "g", "q", "V", "u"], TEN)])
+def test_it_is_refused_wherever_it_stands(place, way):
+    function, given = functions_of(place, guarded(WAYS[way]))
+    refused(way, lambda: check_batch_sizes(place, lambda *batches: (function(*batches),), given))
+
+
+@pytest.mark.parametrize(("place", "way"), [*zip(PLACES, TEN, strict=False)])
+def test_certificates_look_at_all_of_these(place, way):
     refused(way, lambda: claim(**PLACES[place](guarded(WAYS[way]))))
 
 
@@ -159,14 +174,7 @@ def test_shapes_are_used_honestly(way):
     assert check_batch_sizes("f(x)", lambda x: (HONEST[way](x),), [torch.zeros(4, 2)]) is None
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [
-        {"system": System(HONEST["reshape"])},
-        {"V": Bowl(lambda t, x: HONEST["zeros"](x) * x[..., 0])},
-        {"law": lambda problem, V: Law(problem, V, HONEST["einsum"])},
-    ],
-    ids=["f", "V", "u"],
-)
-def test_and_certified(parts):
-    assert claim(**parts).verdict == "certified"
+def test_and_certified():
+    V = Bowl(lambda t, x: HONEST["zeros"](x) * x[..., 0])
+    found = claim(System(HONEST["reshape"]), V=V, law=lambda problem, V: Law(problem, V, HONEST["einsum"]))
+    assert found.verdict == "certified"

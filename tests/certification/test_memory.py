@@ -340,7 +340,7 @@ def test_what_remembers_is_refused(place, way):
     refused(place, way)
 
 
-@pytest.mark.parametrize(("place", "way"), [*zip(itertools.cycle(["u", "g", "q"]), WAYS, strict=False)])
+@pytest.mark.parametrize(("place", "way"), [*zip(itertools.cycle(["u", "g", "q"]), [*WAYS][::2], strict=False)])
 def test_it_is_refused_in_the_law_and_elsewhere(place, way):
     refused(place, way)
 
@@ -393,13 +393,11 @@ def parametrized():
     return lambda x: 0.01 * layer(x)[..., 0]
 
 
-@pytest.mark.parametrize(
-    "honest", [Lazy, Property, lambda: by_lru_cache, parametrized],
-    ids=["lazy", "cached property", "lru_cache", "spectral norm"],
-)  # fmt: skip
-def test_constants_that_are_computed_once_are_certified(honest):
+def test_constants_that_are_computed_once_are_certified():
     """The twins: what the first calls fill in stays."""
-    assert claim(System(honest())).verdict == "certified"
+    law = lambda problem, V: Law(problem, V, by_lru_cache)  # noqa: E731
+    assert claim(System(Lazy()), Paid(terminal=Property()), law=law).verdict == "certified"
+    assert claim(System(parametrized())).verdict == "certified"
 
 
 def test_before_a_training_and_at_load_it_is_refused_too():

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lyapnet.horizon import Horizon
     from lyapnet.interpolation import Table
     from lyapnet.loading import load
-    from lyapnet.policy import HJBPolicy, SontagPolicy
+    from lyapnet.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
     from lyapnet.problem import Problem
     from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
     from lyapnet.rollout import Rollout, Trajectory
@@ -37,7 +37,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
     "loading": ["load"],
-    "policy": ["HJBPolicy", "SontagPolicy"],
+    "policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
     "horizon": ["Horizon"],
     "problem": ["Problem"],
     "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
@@ -64,6 +64,7 @@ __all__ = [
     "HJBPolicy",
     "Horizon",
     "InitialStateDataModule",
+    "LookaheadPolicy",
     "LyapnetError",
     "LyapunovProgram",
     "ObstacleCost",
@@ -74,6 +75,7 @@ __all__ = [
     "PseudoHuberCost",
     "QuadraticCost",
     "Rollout",
+    "SampledPolicy",
     "SontagPolicy",
     "StateLimits",
     "Table",

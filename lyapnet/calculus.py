@@ -22,6 +22,9 @@ class ValueFunction(nn.Module, ABC):
     which is faster, and compiles and exports everywhere.
     """
 
+    made_for: type[nn.Module] | None = None
+    """The control law that V is made for, a ValuePolicy: what trains V sets it; None: unknown."""
+
     @abstractmethod
     def forward(self, t: Time, x: State) -> PerState:
         """V(t, x) for t in s, scalar or one time each, and x (*batch, n); (*batch,), in units of cost."""

@@ -18,13 +18,15 @@ from lyapnet.cost import Cost
 from lyapnet.errors import UsageError
 from lyapnet.family import AtParameters, FamilySystem
 from lyapnet.horizon import TABLEAUX, Horizon
-from lyapnet.policy import HJBPolicy, ValuePolicy
+from lyapnet.policy import HJBPolicy, ValuePolicy, gain_over_step, known_law
 from lyapnet.problem import Problem
 from lyapnet.programs import Program, ValueProgram
 from lyapnet.rollout import ClosedLoop, Rollout, Trajectory
 from lyapnet.rollout.runge_kutta import Step
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
+
+ALIKE = 0.2  # share by which two control laws of a V may differ without a note: about 1 % of the cost
 
 
 def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
@@ -56,23 +58,35 @@ class Controller:
         config: Config | None = None,
         beyond: str | None = None,
         parts: Parts | None = None,
+        policy: type[ValuePolicy] | None = None,
     ):
         """A controller of parts.
+
+        Without a rollout it is the closed loop with steps of the horizon's method, as training and evaluation have it;
+        that of an adaptive method has to be given.
 
         Args:
             problem: what it was made for.
             V: its weights are frozen.
-            rollout: the closed loop of V; None: that of the HJB policy under Euler.
+            rollout: the closed loop of V; None: that of its law.
             program: what V was trained for, and so what a certificate asks of it; None: the value program.
             config: of the run that trained it, where there was one.
             beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load.
             parts: the user's own parts that stood in the place of the config's.
+            policy: the control law of V, where no rollout has one; None: the one that V is made for, and the HJB law
+                where nobody knows, with a note if that matters.
+
+        Raises:
+            UsageError: V says that it is made for what is no control law.
+            ValueError: the rollout is of another V or problem, or beside a policy.
         """
         self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
         self.program = ValueProgram() if program is None else program
         self._warned = False  # of parameters of a family that V was not told
         self.V = V.requires_grad_(False).eval()
-        self._rollout = rollout or Rollout(problem, HJBPolicy(problem, V), gradient="backprop")
+        if rollout is not None and policy is not None:
+            raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
+        self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient="backprop")
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
         policy = self.closed_loop.policy
@@ -278,6 +292,19 @@ class Controller:
                 f"Expected x of shape (*batch, {n}), got {tuple(state.shape)}; the last axis holds {names}."
             )
         return state
+
+
+def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
+    """The control law that V is made for; where nobody knows the HJB law, with a note if that matters."""
+    known = known_law(problem, V)
+    if known is None and (gain := gain_over_step(problem, V)) > ALIKE:
+        logging.getLogger(__name__).warning(
+            "note: nobody says which control law %s is made for; u is its HJB law, which at this Δt differs by %.0f %% "
+            "from the law with u held. Pass policy=lyapnet.SampledPolicy where V is about steps with u held, "
+            "lyapnet.HJBPolicy where it is about continuous time; or set V.made_for.",
+            type(V).__name__, 100 * gain,
+        )  # fmt: skip
+    return HJBPolicy if known is None else known
 
 
 def _like(given: Any, result: Any) -> Any:

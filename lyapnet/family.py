@@ -150,7 +150,7 @@ class AtParameters(ValueFunction):
 
     def __init__(self, V: ValueFunction, p: Tensor):
         super().__init__()
-        self.V = V
+        self.V, self.made_for = V, V.made_for
         self.register_buffer("p", p, persistent=False)
 
     def _joined(self, x: Tensor) -> Tensor:

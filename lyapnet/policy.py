@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.cost import Cost
+from lyapnet.errors import UsageError
 from lyapnet.expansions import held_control, jacobian, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, convex_or, multiply
@@ -218,6 +219,40 @@ class _HeldStep:
         own = paid + (own + own.mT) / 2
         model = paid + dt * multiply(B.mT, multiply(H.detach(), B))
         return convex_or(own, paid, model)
+
+
+def known_law(problem: Problem, V: ValueFunction) -> type[ValuePolicy] | None:
+    """The control law that V is made for, if that is known.
+
+    It is the one that V names. A V with a model of its curvature has it for laws that hold u: it is made for the law of
+    the standard recipe, with constraints the one that looks ahead.
+    """
+    if V.made_for is not None:
+        if not issubclass(V.made_for, ValuePolicy):
+            name = getattr(V.made_for, "__name__", V.made_for)
+            raise UsageError(f"Expected made_for of {type(V).__name__} as a ValuePolicy, got {name}; name a law of V.")
+        return V.made_for
+    if V.curvature(torch.zeros(()).to(problem.goal)) is None:
+        return None
+    return SampledPolicy if problem.constraints is None else LookaheadPolicy
+
+
+def gain_over_step(problem: Problem, V: ValueFunction) -> float:
+    """Δt λ_max(R⁻¹gᵀV_xx g)/2, the greatest of some states and times: by what share V's HJB and sampled law differ.
+
+    In −½R⁻¹gᵀV_x, R stands where the held law has R + ½Δt gᵀV_xx g.
+    """
+    X0, times = problem.initial_states, problem.horizon.times(problem.goal)
+    x = torch.stack([X0.center, (X0.center + X0.upper) / 2, problem.goal])
+    greatest = 0.0
+    for t in (times[0], times[len(times) // 2], times[-2]):
+        with torch.enable_grad():
+            z = x.detach().requires_grad_()
+            g = problem.system.g(z).detach()
+            bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1]), z).detach()
+        weighted = torch.linalg.solve(problem.cost.R(x), multiply(bent, g)).nan_to_num()
+        greatest = max(greatest, problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max()))
+    return greatest
 
 
 POLICIES: dict[str, type[ValuePolicy]] = {

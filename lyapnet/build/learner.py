@@ -29,7 +29,7 @@ from lyapnet.systems import ControlAffineSystem
 
 
 def build_value_function(config: Config, problem: Problem, network: type[ValueFunction] | None = None) -> ValueFunction:
-    """V(t, x) with fresh weights drawn from the config's seed, in its precision.
+    """V(t, x) with fresh weights drawn from the config's seed, in its precision; made for the config's control law.
 
     Args:
         network: the class taken instead of the one that the config names.
@@ -76,6 +76,7 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
             V = Timeless(V)
         if len(kept) < n:
             V = IgnoringStates(V, kept, n)
+    V.made_for = POLICIES[config.rollout.policy]
     return V.to(DTYPES[config.training.precision])
 
 

@@ -10,13 +10,16 @@ import torch
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
-from lyapnet.evaluation.oracles import Optima, Report, oracle_of, silent
+from lyapnet.evaluation.optimality import ratio_of_means
+from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
+from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.files import plain
 from lyapnet.problem import Problem
 from lyapnet.random_streams import TEST, stream
 from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.tables import csv_text
-from lyapnet.types import ControlPath, State
+from lyapnet.types import PerState
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 
@@ -42,6 +45,9 @@ class Evaluation(NamedTuple):
     seed: int
     problem: Problem
     corner: Corner
+    held_cost: PerState  # of the table's states in continuous time, u held for Δt; infinite where it diverges
+    lqr_cost: PerState | None  # of the table's states under LQR, likewise; None where there is no such law
+    optimum_of: str = ""  # of which steps, or of continuous time; empty where no optimum was sought
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -61,9 +67,11 @@ class Evaluation(NamedTuple):
         return {
             **self.table.summary(),
             **paper,
+            **self._references(),
             "terminal_errors": terminal,
             **used,
             **counts,
+            **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
             "worst_corner": self.corner._asdict(),
         }
@@ -80,7 +88,8 @@ class Evaluation(NamedTuple):
             **dict(zip(states, table.x0.unbind(-1), strict=True)),
             "cost": table.cost, "optimal_cost": optimal, "cost_ratio": table.cost / optimal, "value": table.value,
             "value_error": (table.value - optimal) / optimal, "constraint_loss": table.constraint_loss,
-            "hinge": table.hinge, "decreasing": table.decreasing.int(), "terminal_error": table.terminal_error,
+            "hinge": table.hinge, "decreasing": table.decreasing.int(), "falling": table.falling.int(),
+            "largest_rise": table.largest_rise, "terminal_error": table.terminal_error,
             **{f"terminal {name}": x for name, x in zip(states, table.terminal_state.unbind(-1), strict=True)},
         }  # fmt: skip
         if table.worst is not None:
@@ -89,6 +98,19 @@ class Evaluation(NamedTuple):
         values = zip(*(column.tolist() for column in columns.values()), self.notes, strict=True)
         rows = [dict(zip([*columns, "no_optimum"], row, strict=True)) for row in values]
         path.write_text(csv_text(rows), encoding="utf-8")
+
+    def _references(self) -> dict[str, float | None]:
+        """Mean costs of the plant in continuous time and of LQR, and their ratios to the optimum; None: not finite."""
+        optimal = torch.full_like(self.table.cost, torch.nan)
+        optimal = optimal if self.table.optimal_cost is None else self.table.optimal_cost
+        costs = {"held": self.held_cost, "lqr": self.lqr_cost}
+        measures = {
+            f"{name}_{key}": value
+            for name, cost in costs.items()
+            if cost is not None
+            for key, value in (("cost_mean", float(cost.mean())), ("cost_ratio", ratio_of_means(cost, optimal)))
+        }
+        return plain(measures)
 
     def _note(self) -> dict[str, str]:
         missing = [note for note in self.notes if note]
@@ -133,17 +155,20 @@ def evaluation(
     trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
-    corner = dearest_corner(controller)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
+    corner, problem = dearest_corner(controller), controller.problem
+    held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
+    further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0))
     if not optimum:
-        return Evaluation(first, paper, ["not asked for"] * samples, seed, controller.problem, corner)
+        return Evaluation(first, paper, ["not asked for"] * samples, *further)
     try:
-        optima = _optima(controller, first.x0, trajectory.u[:, :samples], progress)
+        oracle = oracle_of(problem, controller.method)
+        optima = oracle.solve(first.x0, trajectory.u[:, :samples], progress)  # the controller's own are starts
     except OracleError as reason:
-        return Evaluation(first, paper, [str(reason)] * samples, seed, controller.problem, corner)
-    return Evaluation(
-        dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, seed, controller.problem, corner
-    )
+        return Evaluation(first, paper, [str(reason)] * samples, *further)
+    exact = isinstance(oracle, RiccatiOracle) and controller.method != "euler"
+    about = "continuous time" if exact else f"steps of {problem.horizon.dt:g} s ({controller.method}), u held"
+    return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, *further, about)
 
 
 def dearest_corner(controller: Controller) -> Corner:
@@ -158,9 +183,3 @@ def dearest_corner(controller: Controller) -> Corner:
     i = int(cost.argmax())
     finite = bool(cost[i].isfinite())
     return Corner(len(x0), x0[i].tolist(), float(cost[i]) if finite else None, float(value[i]))
-
-
-def _optima(controller: Controller, x0: State, known: ControlPath, progress: Report) -> Optima:
-    """The optima from the states of X₀; the controller's own controls are starts of the oracle."""
-    oracle = oracle_of(controller.problem, controller.method)
-    return oracle.solve(x0, known, progress)

@@ -10,7 +10,7 @@ from torch import Tensor
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.problem import Problem
 from lyapnet.programs import Program
-from lyapnet.programs.terms import hinge, satisfied
+from lyapnet.programs.terms import falls, hinge, largest_rise, satisfied
 from lyapnet.rollout import Trajectory
 from lyapnet.sets import ControlSet
 from lyapnet.types import ControlPath, PerState, State
@@ -27,6 +27,8 @@ class StateTable:
     constraint_loss: PerState  # the program's sum along the trajectory
     hinge: PerState  # Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0)
     decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
+    falling: Tensor  # bool: V falls by half of each step's cost, within 1e-6 of V(0, x₀)
+    largest_rise: PerState  # of V in a step, in units of V(0, x₀)
     terminal_state: State  # x_N
     terminal_error: PerState  # ‖x_N − goal‖
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
@@ -55,6 +57,8 @@ class StateTable:
             "constraint_loss": float(self.constraint_loss.mean()),
             "terminal_error": float(self.terminal_error.mean()),
             "bounded_fraction": _share(self.cost <= self.value),
+            "falling_fraction": _share(self.falling),
+            "largest_rise": float(self.largest_rise.max()),
             "decreasing_fraction": _share(self.decreasing),
             "satisfied_fraction": _share(self.satisfied(1e-2)),
             "satisfied_fraction_1e-3": _share(self.satisfied(1e-3)),
@@ -113,6 +117,8 @@ def measure(
         constraint_loss=program.constraint_loss(values, trajectory),
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),
+        falling=falls(values, trajectory.step_cost, trajectory.cost),
+        largest_rise=largest_rise(values, trajectory.cost),
         terminal_state=trajectory.x[-1],
         terminal_error=torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1),
         at_limits=_at_limits(problem.controls, trajectory.u),

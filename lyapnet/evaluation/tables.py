@@ -6,24 +6,30 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
+from lyapnet.tables import DIVERGED, ratio
+
 ROWS = {
     "cost_mean": "cost J, mean",
     "cost_max": "cost J, worst",
     "optimal_cost_mean": "optimal cost, mean",
     "cost_ratio": "cost / optimum",
+    "held_cost_mean": "in continuous time, u held for Δt: cost, mean",
+    "held_cost_ratio": "in continuous time, u held for Δt: cost / optimum",
+    "lqr_cost_mean": "LQR, without training: cost, mean",
+    "lqr_cost_ratio": "LQR, without training: cost / optimum",
     "value_mean": "V(0, x₀), mean",
     "value_to_cost": "V(0, x₀) / cost J, ratio of the means",
     "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
     "constraint_loss": "constraint loss, mean",
     "terminal_error": "terminal error, mean ‖x(T)‖",
     "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
-    "decreasing_fraction": "V decreases at every step, share of states",
+    "falling_fraction": "V falls by half of each step's cost, within 1e-6 of V(0, x₀)",
+    "largest_rise": "largest rise of V in a step, relative to V(0, x₀)",
     "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
     "satisfied_fraction_1e-3": "… within 0.1 %",
     "satisfied_fraction_1e-6": "… within 1e-6",
 }
-
-
+REFERENCES = ("held", "lqr")  # costs from the same states, shown as a ratio where the optimum is known
 VIOLATED = {"violated_fraction": "constraints violated, share of states"}  # where there are some
 
 
@@ -31,10 +37,7 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     """What a controller reaches, as evaluation.Evaluation.result has it."""
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
-        if result[key] is None:
-            table.add_row(label, "–")
-        else:
-            table.add_row(label, measured(key, result[key]))
+        table.add_row(label, _entry(key, result[key]))
     for name, error in result["terminal_errors"].items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
     for name, share in result.get("at_limits", {}).items():
@@ -68,12 +71,24 @@ def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
 
 
 def _rows(result: dict[str, Any]) -> dict[str, str]:
-    return {**ROWS, **VIOLATED} if "violated_fraction" in result else ROWS
+    """The labels of what a result has; of a reference the ratio to the optimum, else its mean cost."""
+    unknown = "ratio" if result["cost_ratio"] is None else "mean"
+    left_out = {f"{name}_cost_{unknown}" for name in REFERENCES}
+    return {key: label for key, label in {**ROWS, **VIOLATED}.items() if key in result and key not in left_out}
+
+
+def _entry(key: str, value: float | None) -> str:
+    """A measure of a result as text; a reference without a number has left the finite ones."""
+    if value is None and key.startswith(REFERENCES):
+        return DIVERGED
+    return measured_or_not(key, value)
 
 
 def _caption(results: list[dict[str, Any]]) -> Text | None:
-    """Why some optimum is missing."""
+    """What the optimum is of, and why some is missing."""
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
+    if about := results[0].get("optimum_of"):
+        notes = {f"optimum: of {about}": None, **notes}
     return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 
@@ -110,6 +125,6 @@ def measured_or_not(key: str, value: float | None) -> str:
 
 def measured(key: str, value: float) -> str:
     """A measure of an evaluation as text: ratios with four decimals, shares in percent."""
-    if key == "cost_ratio":
-        return f"{value:.4f}"
+    if key.endswith("cost_ratio"):
+        return ratio(value)
     return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from lyapnet.types import PerState, StepPath, ValuePath
 
+FALL, ROUGHLY = 0.5, 1e-6  # what V has to fall by, of a step's cost, and what a step may miss of that, of V(0, x₀)
 LEAST = 0.05  # of a typical cost, against which an error counts where the cost itself is less
 
 
@@ -63,3 +64,21 @@ def satisfied(summed_hinge: PerState, value: PerState, tolerance: float) -> Bool
     """
     rounding = 100 * torch.finfo(value.dtype).eps * value.abs().max()
     return summed_hinge <= tolerance * value + rounding
+
+
+def falls(values: ValuePath, step_cost: StepPath, cost: PerState) -> Bool[Tensor, "*batch"]:
+    """Whether V falls at every step by at least FALL of what the step costs, within ROUGHLY of V(0, x₀).
+
+    Half of the cost leaves room for a V that is not exact, and the tolerance for rounding, far below what counts.
+
+    Args:
+        cost: of the whole trajectories.
+    """
+    rounding = 100 * torch.finfo(values.dtype).eps * values.abs().amax()
+    missed = (values.diff(dim=0) + FALL * step_cost).amax(0)
+    return missed <= ROUGHLY * promised(values[0], cost) + rounding
+
+
+def largest_rise(values: ValuePath, cost: PerState) -> PerState:
+    """The largest rise of V from one node to the next, in units of V(0, x₀)."""
+    return torch.relu(values.diff(dim=0)).amax(0) / promised(values[0], cost).clamp_min(torch.finfo(values.dtype).tiny)

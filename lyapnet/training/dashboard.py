@@ -14,7 +14,7 @@ LAYOUT = {
         "constraint loss": ["Multiline", ["constraint_loss/train", "constraint_loss/val"]],
         "trajectory cost": ["Multiline", ["trajectory_cost/train", "trajectory_cost/val"]],
         "optimality gap and value error": ["Multiline", ["optimality_gap/val", "value_error/val"]],
-        "satisfied and decreasing": ["Multiline", ["satisfied_fraction/val", "decreasing_fraction/val"]],
+        "satisfied and decreasing": ["Multiline", ["satisfied_fraction/val", "falling_fraction/val"]],
     }
 }
 

@@ -61,6 +61,7 @@ class Learner(nn.Module):
                 "problem.relaxed(weight=…), w in cost per second, or train from a config, which finds w."
             )
         self.problem, self.V, self.rollout = problem, V, rollout
+        V.made_for = type(rollout.closed_loop.policy)
         self.program, self.pointwise, self.seed, self.label = program, pointwise, seed, label
         self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
         # of the last training step and the last validation, for whoever shows them
@@ -134,8 +135,8 @@ class Learner(nn.Module):
             **{
                 f"{name}/val": summary[name]
                 for name in (
-                    "value_error", "value_to_cost", "satisfied_fraction", "bounded_fraction", "decreasing_fraction",
-                    "terminal_error",
+                    "value_error", "value_to_cost", "satisfied_fraction", "bounded_fraction", "falling_fraction",
+                    "decreasing_fraction", "largest_rise", "terminal_error",
                 )
             },
         }  # fmt: skip

@@ -20,7 +20,7 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cost import PenaltyCost
 from lyapnet.errors import CheckpointError, CompilationError, DivergenceError, UsageError
-from lyapnet.policy import HJBPolicy
+from lyapnet.policy import HJBPolicy, known_law
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program
 from lyapnet.random_streams import POINTS
@@ -214,7 +214,8 @@ class ValueModule(TrainingModule):
         V: what is trained.
         program: what is minimised: a ValueProgram makes V the cost-to-go of its greedy policy, a LyapunovProgram makes
             V fall along the closed loop at least as fast as the cost accrues.
-        rollout: the closed loop of a policy that V defines; None: the HJB policy under Euler, with its exact gradient.
+        rollout: the closed loop of a policy that V defines; None: that of the law that V is made for, the HJB law where
+            nobody knows, with its exact gradient. V is made for that law from then on.
         pointwise: the program's condition off the closed loops, if that is a term too.
         optimizer: how the weights move.
         seed: of the points at which that condition is asked for.
@@ -237,7 +238,8 @@ class ValueModule(TrainingModule):
         if not any(p.is_floating_point() for p in V.parameters()):
             raise UsageError(f"Expected a network with real weights to train, got {type(V).__name__} without.")
         problem.check_value_function(V)
-        rollout = Rollout(problem, HJBPolicy(problem, V), gradient="discrete") if rollout is None else rollout
+        law = known_law(problem, V) or HJBPolicy
+        rollout = Rollout(problem, law(problem, V), gradient="discrete") if rollout is None else rollout
         member = Learner(problem, V, rollout, program, pointwise, seed)
         super().__init__([member], optimizer or OptimizerOptions())
 

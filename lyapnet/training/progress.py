@@ -27,6 +27,7 @@ class TrainingProgress(ProgressBar):
     def __init__(self, console: Console):
         super().__init__()
         self._console, self._progress, self._task = console, None, None
+        self._named = False  # whether it was said what validations are over
 
     def disable(self) -> None:
         self._enabled = False
@@ -63,6 +64,9 @@ class TrainingProgress(ProgressBar):
             return
         members = members_of(pl_module)
         tables = [member.validation for member in members]
+        if not self._named:
+            self._named, states = True, sum(len(table.cost) for table in tables if table is not None)
+            self._console.print(f"below: means over {states} validation states, the same at every step", soft_wrap=True)
         summaries = [table.summary() for table in tables if table is not None]
         measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
         shares = [float(member.region_share) for member in members if member.region_share is not None]

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import is_quadratic_about_target
+from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
 from lyapnet.expansions import (
     TRIES,
     Expansion,
@@ -28,7 +29,7 @@ from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
 from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, relative_misfit, typical
-from lyapnet.types import Control, PerState, State
+from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
@@ -38,7 +39,6 @@ MISSED = 0.02  # of the cost: what steps may miss of continuous time without a w
 CALM = "V = 0"
 LEVELS = tuple(4.0**-k for k in range(9))  # of the regulator's mean value on X₀, up to which it may be taken for right
 REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
-SUBSTEPS = 4  # of fourth order within Δt, for continuous time
 
 Report = Callable[[str], None]
 
@@ -75,8 +75,17 @@ class Start(NamedTuple):
         return f"in continuous time, u held for Δt, the law that training starts from costs {by}"
 
     def __str__(self) -> str:
-        others = ", ".join(f"{_shown(other)} from {other.name}" for other in self.candidates if other != self.chosen)
-        return f"start: {self.chosen.name}, mean cost {_shown(self.chosen)} of {STATES} states ({others})"
+        others = "; ".join(self._beside(other) for other in self.candidates if other != self.chosen)
+        finite = "" if self.chosen.finite == 1 else f", {_shown(self.chosen)} of X₀"
+        return f"start: {self.chosen.name}, the cheapest of {len(self.candidates)}{finite}" + (
+            others and f" ({others})"
+        )
+
+    def _beside(self, other: Candidate) -> str:
+        """A candidate against the chosen one: a ratio, as the states are not those of which a training tells costs."""
+        if other.finite < 1 or not 0 < self.chosen.cost < math.inf:
+            return f"{other.name}: {_shown(other)}"
+        return f"{other.name}: {other.cost / self.chosen.cost:.4g} times its cost"
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -124,9 +133,8 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
-    N, dt = problem.horizon.steps, problem.horizon.dt
-    in_time = problem.in_steps(steps=SUBSTEPS * N, dt=dt / SUBSTEPS, method="rk4")
-    return Start(chosen, tried, float(_costs(learners[0], in_time, x0).mean()))
+    policy = learners[0].rollout.closed_loop.policy
+    return Start(chosen, tried, float(costs_of_plant(problem, policy, x0).mean()))
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -224,22 +232,10 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
 
 def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
     """What the closed loop of a learner costs as it is now."""
-    cost = _costs(learner, learner.problem, x0)
+    problem = learner.problem
+    cost = costs_of_holding(learner.rollout.closed_loop.policy, problem.horizon, problem, x0)
     share = float(cost.isfinite().double().mean())
     return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
-
-
-def _costs(learner: Learner, problem: Problem, x0: State) -> PerState:
-    """What the law of a learner costs in a problem, each control held for a step of the learner's own horizon."""
-    policy, own = learner.rollout.closed_loop.policy, learner.problem.horizon
-    times, each, u = own.times(x0), problem.horizon.steps // own.steps, x0
-
-    def law(n: int, x: State) -> Control:
-        nonlocal u
-        u = u if n % each else policy(times[n // each], x)
-        return u
-
-    return path_under(problem, law, x0).cost
 
 
 def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:

@@ -64,8 +64,8 @@ class ValidationOptimum(Callback):
         if optima.failures:
             missing = f"; unknown for {optima.failures}, which are left out"
         if missing or seconds > 0.2:  # else nobody waits for it
-            mean = f"mean {optima.cost.nanmean():.4g}, in {seconds:.0f} s"
-            self.console.print(f"optimum of {len(optima.cost)} validation states: {mean}{missing}", soft_wrap=True)
+            found = f"optimum of {len(optima.cost)} validation states, in {seconds:.0f} s"
+            self.console.print(f"{found}{missing}", soft_wrap=True)
         cost = optima.cost.cpu().reshape(-1, compared.shape[-2])
         return pad(cost, (0, states.shape[-2] - cost.shape[-1]), value=torch.nan)
 

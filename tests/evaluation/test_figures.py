@@ -156,7 +156,7 @@ def test_another_value_function_is_another_picture():
 def table(cost, value, optimal):
     zero = torch.zeros(len(cost))
     cost, value, optimal = map(torch.tensor, (cost, value, optimal))
-    return StateTable(zero[:, None], cost, value, optimal, zero, zero, zero > 0, zero[:, None], zero)
+    return StateTable(zero[:, None], cost, value, optimal, zero, zero, zero > 0, zero > 0, zero, zero[:, None], zero)
 
 
 def test_optimality_is_drawn_where_the_optimum_is_known():

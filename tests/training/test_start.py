@@ -197,7 +197,7 @@ def test_a_run_records_its_start_and_loads_with_it(tmp_path, capsys):
     assert record["chosen"] == "the Riccati solution at the goal"
     assert record["seconds"].keys() == record["tried"].keys()
     assert record["tried"][CALM] > record["tried"][record["chosen"]]
-    assert "start: the Riccati solution at the goal, mean cost" in capsys.readouterr().out
+    assert "start: the Riccati solution at the goal, the cheapest of" in capsys.readouterr().out
     controller = load(run.best)
     assert controller.config.rollout.policy == "sampled"
     again = train(LINEAR | {"logs": str(tmp_path)}, ["training.iterations=3", *brief[1:]], resume="last")

@@ -1,0 +1,64 @@
+"""What the cost of a closed loop is held against, from the same states: the plant in continuous time, and LQR."""
+
+from collections.abc import Callable
+
+import torch
+from torch import nn
+
+from lyapnet.expansions import in_float64, path_under, regulator
+from lyapnet.horizon import Horizon
+from lyapnet.linear_algebra import apply
+from lyapnet.problem import Problem
+from lyapnet.types import Control, PerState, State
+
+SUBSTEPS = 4  # of fourth order within Δt, for continuous time
+
+
+def in_continuous_time(problem: Problem) -> Problem:
+    """The problem with SUBSTEPS steps of fourth order in each Δt."""
+    horizon = problem.horizon
+    return problem.in_steps(steps=SUBSTEPS * horizon.steps, dt=horizon.dt / SUBSTEPS, method="rk4")
+
+
+def costs_of_holding(policy: nn.Module, own: Horizon, problem: Problem, x0: State) -> PerState:
+    """What a law costs in a problem, each control held for a step of the law's own horizon; infinite where it diverges.
+
+    Args:
+        policy: u(t, x).
+        problem: whose steps divide those of `own`.
+    """
+    times, each, u = own.times(x0), problem.horizon.steps // own.steps, x0
+
+    def law(n: int, x: State) -> Control:
+        nonlocal u
+        u = u if n % each else policy(times[n // each], x)
+        return u
+
+    return path_under(problem, law, x0).cost
+
+
+def costs_of_plant(problem: Problem, policy: nn.Module, x0: State) -> PerState:
+    """What the plant pays under a law: in continuous time, with u held for Δt."""
+    return costs_of_holding(policy, problem.horizon, in_continuous_time(problem), x0)
+
+
+def costs_of_lqr(problem: Problem, x0: State) -> PerState | None:
+    """What LQR costs: u = ū_n + K_n(x − x*) of the problem linearised at its goal, for its N steps, kept to U.
+
+    None where there is no such law: the linearisation is not finite, or U is a set without limits that are known.
+    """
+    law = None if problem.controls.limits is None else _lqr(problem)
+    if law is None:
+        return None
+    return path_under(in_float64(problem), law, x0.double().cpu()).cost.to(x0)
+
+
+def _lqr(problem: Problem) -> Callable[[int, State], Control] | None:
+    try:
+        u, K = regulator(problem)
+    except torch.linalg.LinAlgError:
+        return None
+    exact = in_float64(problem)
+    if not (u.isfinite().all() and K.isfinite().all()):
+        return None
+    return lambda n, x: exact.controls.project(u[n] + apply(K[n], x - exact.goal))

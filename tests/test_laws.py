@@ -10,6 +10,7 @@ import lyapnet
 from lyapnet.build import Parts, build_problem
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import config_from_plain
+from lyapnet.cost import QuadraticCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.networks import NETWORKS
@@ -84,8 +85,9 @@ def test_training_from_python_tells_v_its_law():
 
 def exact(dt=0.2, steps=30):
     """The discretised double integrator, and its exact V, of which nobody says what law it is made for."""
-    problem = problem_of(DoubleIntegrator(), None, steps, dt)
-    return problem, Quadratic(discrete_riccati(problem.system, problem.cost, problem.horizon).P, dt)
+    system, cost = DoubleIntegrator(), QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2))
+    problem = problem_of(system, cost, steps, dt)
+    return problem, Quadratic(discrete_riccati(system, cost, problem.horizon).P, dt)
 
 
 def test_the_constructor_says_so_where_nobody_knows_and_it_matters(caplog):

@@ -56,7 +56,7 @@ def costs_of_lqr(problem: Problem, x0: State) -> PerState | None:
 def _lqr(problem: Problem) -> Callable[[int, State], Control] | None:
     try:
         u, K = regulator(problem)
-    except torch.linalg.LinAlgError:
+    except torch.linalg.LinAlgError:  # pyright: ignore[reportPrivateImportUsage]
         return None
     exact = in_float64(problem)
     if not (u.isfinite().all() and K.isfinite().all()):

@@ -249,8 +249,8 @@ def gain_over_step(problem: Problem, V: ValueFunction) -> float:
         with torch.enable_grad():
             z = x.detach().requires_grad_()
             g = problem.system.g(z).detach()
-            bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1]), z).detach()
-        weighted = torch.linalg.solve(problem.cost.R(x), multiply(bent, g)).nan_to_num()
+            bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1].to(g)), z).detach()
+        weighted = torch.linalg.solve(problem.cost.R(x).to(bent), multiply(bent, g.to(bent))).nan_to_num()
         greatest = max(greatest, problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max()))
     return greatest
 

@@ -5,7 +5,6 @@ import logging
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.linalg import solve_discrete_are
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
@@ -119,6 +118,8 @@ class Regulator(nn.Module):
         super().__init__()
         if problem.system.constants:
             raise ValueError(f"Expected a single problem for {purpose}, got a family; {instead} or receding.")
+        from scipy.linalg import solve_discrete_are  # loaded where it is asked for: it takes a tenth of a second
+
         exact = in_float64(problem)
         x, u = exact.goal, exact.rest
         if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:

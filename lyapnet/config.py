@@ -142,7 +142,7 @@ class ConstraintsConfig:
 
 @dataclass
 class InitialStatesConfig:
-    """X₀, the box of initial states; a list of one number is the bound of every state."""
+    """X₀, the box of initial states; a single number is the bound of every state."""
 
     lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
     upper: list[float] = option(MISSING, "Upper bounds, one for each state.")

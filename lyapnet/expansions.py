@@ -144,7 +144,12 @@ def _at_goal(problem: Problem) -> "_Backward":
 
 
 def optimal_trajectories(
-    problem: Problem, x0: State, u: ControlPath, iterations: int = 80, rivals: bool = False
+    problem: Problem,
+    x0: State,
+    u: ControlPath,
+    iterations: int = 80,
+    rivals: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
@@ -156,6 +161,7 @@ def optimal_trajectories(
         iterations: of each of the two kinds, at the most.
         rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
             that still cost HOPELESS times as much are left as they are.
+        progress: is told how many trajectories are done, of how many, each descent counting for its share.
     """
     problem = in_float64(problem)
     x0, u = x0.double(), problem.controls.project(u.double())
@@ -163,20 +169,35 @@ def optimal_trajectories(
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
         return path_under(problem, lambda n, _: controls[n], x0)
 
-    now = under(u)
-    if problem.horizon.method != "euler":
+    now, higher_order = under(u), problem.horizon.method != "euler"
+    kinds, b = 2 + higher_order, len(x0)
+
+    def settled(kind: int) -> Callable[[int], None]:
+        return lambda count: progress((kind * b + count) // kinds, b)
+
+    if higher_order:
         roughly = problem.in_steps(method="euler")
-        now = cheapest([now, under(_descended(roughly, under(u, roughly), False, iterations, NEAR, rivals).u)])
-    now = _descended(problem, now, False, iterations, NEAR, rivals)
-    now = _descended(problem, now, True, iterations, SETTLED, rivals)
+        euler = _descended(roughly, under(u, roughly), False, iterations, NEAR, rivals, settled(0))
+        now = cheapest([now, under(euler.u)])
+    now = _descended(problem, now, False, iterations, NEAR, rivals, settled(kinds - 2))
+    now = _descended(problem, now, True, iterations, SETTLED, rivals, settled(kinds - 1))
     return Optimum(now, _backward(problem, now.x, now.u).expansion)
 
 
-def _descended(problem: Problem, now: Path, curved: bool, iterations: int, enough: float, rivals: bool) -> Path:
+def _descended(
+    problem: Problem,
+    now: Path,
+    curved: bool,
+    iterations: int,
+    enough: float,
+    rivals: bool,
+    progress: Callable[[int], None],
+) -> Path:
     """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
     for k in range(iterations):
         rows = torch.nonzero(~settled).flatten()
+        progress(len(settled) - len(rows))
         if not len(rows):
             break
         was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])

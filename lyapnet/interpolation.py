@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 DEGREES = {"linear": 1, "cubic": 3}
@@ -169,6 +168,8 @@ class SmoothCurve(nn.Module):
             self.end.copy_(values[-1])
             self.weights.fill_(torch.nan)
             return
+        from scipy.interpolate import CubicSpline  # takes a third of a second: only where there is a spline
+
         spline = CubicSpline(nodes.double().cpu(), values.double().cpu().flatten(1))
         t = _refined(nodes.double().cpu(), self.BETWEEN)
         y, y_t = (torch.from_numpy(spline(t, order)) for order in (0, 1))
@@ -215,6 +216,8 @@ def _cardinal(nodes: Tensor, degree: int) -> Tensor:
     if degree == 1:
         powers = [unit[:, 1:] - unit[:, :-1]]
     else:
+        from scipy.interpolate import CubicSpline
+
         coefficients = torch.as_tensor(CubicSpline(nodes.numpy(), unit.numpy(), axis=1, bc_type="natural").c)
         powers = [coefficients[3 - k].mT * h**k for k in (1, 2, 3)]
     return torch.cat([unit[:, :1], *powers], 1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args
 
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from lyapnet.errors import UsageError, did_you_mean, one_line
@@ -77,10 +77,11 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
         if "=" not in override.lstrip("="):
             raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
     try:
-        layers = [OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))]
-        for layer in layers:
+        layers = []
+        for layer in (OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))):
             given: Any = OmegaConf.to_container(layer, resolve=False)
             _refuse_unknown_keys(given, schema, "")
+            layers.append(OmegaConf.create(_with_numbers_as_lists(given, schema)))
             for f in dataclasses.fields(schema):  # pyright: ignore
                 if f.metadata.get("folder") and re.search(r"\$\{[^}]*:", str(given.get(f.name, ""))):
                     raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
@@ -132,6 +133,39 @@ def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
         for entry in get_args(section)[1:]:  # of dict[str, section]
             for name, one in value.items() if dataclasses.is_dataclass(entry) and isinstance(value, Mapping) else ():
                 _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
+
+
+def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str = "") -> dict[str, Any]:
+    """The content with [0.1] for a number 0.1 in the place of a list of numbers.
+
+    Raises:
+        UsageError: what stands in the place of a list is neither.
+    """
+    found = dict(content)
+    for f in dataclasses.fields(schema):  # pyright: ignore
+        key, value, annotation = f"{prefix}{f.name}", content.get(f.name), str(f.type)
+        if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
+            if isinstance(value, Mapping):
+                found[f.name] = _with_numbers_as_lists(value, f.type, f"{key}.")
+        elif annotation.startswith(("list[float]", "list[int]")) and type(value) in (int, float):
+            found[f.name] = [value]
+        elif annotation.startswith("list[") and _is_scalar(value):
+            of_numbers = annotation.startswith(("list[float]", "list[int]"))
+            raise UsageError(
+                f"Expected {key} as {'a number or ' * of_numbers}a list, got {value!r}; write it as [{value}], or correct it."
+            )
+        elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
+            for name, entry in value.items():
+                if _is_scalar(entry) or type(entry) in (int, float):
+                    raise UsageError(
+                        f"Expected {key}.{name} as a list, got {entry!r}; write it in brackets: {f.metadata['doc']}"
+                    )
+    return found
+
+
+def _is_scalar(value: Any) -> bool:
+    """Whether a value is text or a truth value, and not an interpolation or what is still missing."""
+    return isinstance(value, bool) or (isinstance(value, str) and value != MISSING and "${" not in value)
 
 
 def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:

@@ -20,7 +20,7 @@ from lyapnet.evaluation.measurement import evaluation
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 from lyapnet.evaluation.path_figure import has_plane, paths
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati
-from lyapnet.training.build import build_learner
+from lyapnet.training.build_learner import build_learner
 from lyapnet.training.facts import facts_of
 from lyapnet.training.modules import ValueModule
 from lyapnet.training.relaxation import find_relaxation

@@ -1,16 +1,23 @@
 """lyapnet check."""
 
-import dataclasses
+import gc
 import json
 import shlex
+import textwrap
+import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Column, Table
+from rich.text import Text
 
 from lyapnet.cli.options import Debug
+from lyapnet.errors import Interrupted
+
+NAMES = 14  # columns for the names of facts
+WIDEST = 120
+ORDER = ("task", "goal", "modes", "controllable", "stiffness", "constraints", "start")  # in which facts become known
 
 
 def check(
@@ -19,29 +26,81 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
     debug: Debug = False,
 ) -> None:
-    """Say what can be said of a task before training it: its goal, its modes, how stiff it is, and where to start."""
-    import torch
+    """Say what can be said of a task before training it: its goal, its modes, how stiff it is, and where to start.
 
-    from lyapnet.build import parts_of
-    from lyapnet.config import load_config
-    from lyapnet.training.build import build_learner, build_problem
-    from lyapnet.training.facts import facts_of
+    Each fact is printed as soon as it is known; after Ctrl-C those that are known stay.
+    """
+    from lyapnet.training.stages import Stages
 
-    resolved = dataclasses.replace(load_config(config, overrides or []), seeds=1)
+    output = Console(highlight=False, markup=False)
+    shown = output if output.is_terminal and not as_json else Console(stderr=True, highlight=False, markup=False)
+    facts, began = list[Any](), time.monotonic()
+
+    def known(fact: Any) -> None:
+        facts.append(fact)
+        if not as_json:
+            print_fact(output, fact)
+
+    if config.is_file() and not as_json:
+        output.print(Text(f"{config.name}, before training", "bold"), soft_wrap=True)
+    stages, experiment = Stages(shown, "check"), config.stem
+    try:
+        with stages:
+            stages("reading the task")
+            experiment = _check(config, overrides or [], stages, known)
+    except Interrupted as stop:
+        if as_json:
+            _print_json(experiment, facts, _not_reached(facts))
+        seconds = time.monotonic() - began
+        raise Interrupted(
+            f"Stopped after {seconds:.1f} s ({stages.now}); not reached: {', '.join(_not_reached(facts))}.", 130
+        ) from stop
+    if as_json:
+        _print_json(experiment, facts, [])
+        return
+    command = shlex.join(["lyapnet", "train", "--config", str(config), *(overrides or [])])
+    output.print(f"{'train':{NAMES}}{command}", soft_wrap=True)
+
+
+def _check(config: Path, overrides: list[str], report: Any, known: Any) -> str:
+    """Find the facts; the name of the experiment."""
+    gc.disable()  # of what is imported now nothing is garbage, and looking for it takes a seventh of the time
+    try:
+        import torch
+
+        from lyapnet.build import build_problem, parts_of
+        from lyapnet.config import load_config
+        from lyapnet.training.build_learner import build_learner
+        from lyapnet.training.facts import facts_of
+    finally:
+        gc.enable()
+    resolved = load_config(config, overrides)
+    resolved.seeds = 1
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
     learner = build_learner(resolved, build_problem(resolved, parts).relaxed(), parts)
-    with Console(stderr=True).status("start …") as status:
-        facts = facts_of(learner, lambda stage: status.update(f"start: {stage} …"))
-    console = Console(highlight=False, markup=False)
-    if as_json:
-        rows = [{"fact": fact.name, "found": fact.found, "advice": fact.advice or None} for fact in facts]
-        print(json.dumps({"experiment": resolved.experiment, "facts": rows}, ensure_ascii=False))
-        return
-    advice = Column("what to do", overflow="fold")
-    table = Table("fact", Column("found", overflow="fold"), advice, title=f"{resolved.experiment}, before training")
-    for fact in facts:
-        table.add_row(*fact)
-    console.print(table)
-    command = shlex.join(["lyapnet", "train", "--config", str(config), *(overrides or [])])
-    console.print(f"train     {command}", soft_wrap=True)
+    facts_of(learner, report, known)
+    return resolved.experiment
+
+
+def print_fact(console: Console, fact: Any) -> None:
+    """A fact in two columns, its name and what was found, with what to do about it below."""
+    width = max(40, min(console.width, WIDEST)) - NAMES
+    name, lines = fact.name, textwrap.wrap(fact.found, width, break_on_hyphens=False)
+    if fact.advice:
+        lines += textwrap.wrap(fact.advice, width, initial_indent="→ ", subsequent_indent="  ", break_on_hyphens=False)
+    for line in lines:
+        console.print(Text(f"{name:{NAMES}}", "bold").append(line, "not bold"), soft_wrap=True)
+        name = ""
+
+
+def _not_reached(facts: list[Any]) -> list[str]:
+    """The names of the facts that come after the last one that is known."""
+    last = max((ORDER.index(fact.name) for fact in facts if fact.name in ORDER), default=-1)
+    return list(ORDER[last + 1 :]) or ["the best start"]
+
+
+def _print_json(experiment: str, facts: list[Any], not_reached: list[str]) -> None:
+    rows = [{"fact": fact.name, "found": fact.found, "advice": fact.advice or None} for fact in facts]
+    content = {"experiment": experiment, "complete": not not_reached, "not_reached": not_reached, "facts": rows}
+    print(json.dumps(content, ensure_ascii=False))

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch._decomp import core_aten_decompositions, get_decompositions
-from torch._functorch.compile_utils import fx_graph_cse
 from torch.func import functionalize, vmap
 from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
@@ -320,6 +319,8 @@ class _MinusZero(float):
 
 def without_repetitions(graph: Graph) -> Graph:
     """The graph with each expression computed once."""
+    from torch._functorch.compile_utils import fx_graph_cse  # loads sympy: a third of a second
+
     for node in graph.nodes:
         node.args, node.kwargs = map_aggregate((node.args, node.kwargs), _telling_zeros_apart)  # pyright: ignore
     return fx_graph_cse(graph)

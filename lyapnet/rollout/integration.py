@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torchdiffeq import odeint, odeint_adjoint
 
 from lyapnet.errors import DivergenceError
 from lyapnet.horizon import TABLEAUX, Horizon
@@ -185,6 +184,8 @@ class Rollout(nn.Module):
 
     def _solve(self, y0: Tensor, t: Times) -> Tensor:
         """The augmented state at the nodes, by the route of `gradient`."""
+        from torchdiffeq import odeint, odeint_adjoint  # loads scipy.integrate: a third of a second
+
         solve: Callable[..., Any] = odeint
         arguments = dict(self.solver_arguments)
         if self.gradient == "adjoint" and torch.is_grad_enabled():

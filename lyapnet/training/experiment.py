@@ -4,7 +4,7 @@ import resource
 import shlex
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,6 @@ from typing import Any
 import lightning as L
 import torch
 from rich.console import Console
-from rich.status import Status
 from rich.text import Text
 
 from lyapnet.build import Parts
@@ -29,7 +28,8 @@ from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.start import REMEDY, Start, choose_start, has_place_for_start, silent
+from lyapnet.training.stages import Stages, silent
+from lyapnet.training.start import REMEDY, Start, choose_start, has_place_for_start
 from lyapnet.training.trainer import build_trainer
 from lyapnet.training.validation_optimum import optimum_progress
 
@@ -144,8 +144,7 @@ def _seeks_start(plan: Plan) -> bool:
 
 def _relax(plan: Plan, console: Console, told: bool) -> None:
     """Set the penalty that stands for constraints, and say what it keeps."""
-    with console.status("constraints …") if told else nullcontext() as status:
-        report = silent if status is None else _told(console, status, "constraints")
+    with Stages(console, "constraints") if told else nullcontext(silent) as report:
         relaxation = find_relaxation(plan.module.members[0].problem, report)
     assert plan.module.penalty is not None
     plan.module.penalty.weight.fill_(relaxation.weight)
@@ -154,22 +153,9 @@ def _relax(plan: Plan, console: Console, told: bool) -> None:
         console.print(str(relaxation), soft_wrap=True)
 
 
-def _told(console: Console, status: Status, what: str) -> Callable[[str], None]:
-    """Shows a stage beside the spinner of a terminal; elsewhere, as in a log, on a line of its own."""
-
-    def report(stage: str) -> None:
-        if console.is_terminal:
-            status.update(f"{what}: {stage} …")
-        else:
-            console.print(f"{what}: {stage} …", soft_wrap=True)
-
-    return report
-
-
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
-    with console.status("start …") if told else nullcontext() as status:
-        report = silent if status is None else _told(console, status, "start")
+    with Stages(console, "start") if told else nullcontext(silent) as report:
         start = choose_start(list(plan.module.members), report)
     if told and start is not None:
         plan.run.note(start=start.as_json())

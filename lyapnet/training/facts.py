@@ -1,21 +1,29 @@
 """What can be said of a problem before training: its goal, its linearisation there, how stiff it is, where to start."""
 
 import math
+from collections import Counter
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from lyapnet.build.classes import float64_defaults
 from lyapnet.cost import PenaltyCost
-from lyapnet.expansions import in_float64, riccati
+from lyapnet.expansions import in_float64
 from lyapnet.horizon import TABLEAUX
+from lyapnet.linearisation import Linearisation, Missing, goal_in_words, linearised, riccati_or_reason
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.start import CALM, REMEDY, Report, choose_start, silent
+from lyapnet.training.stages import Report, silent
+from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, choose_start
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
+REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
+VANISHING = 1e-3  # of what q and φ are on X₀, below which they vanish at the goal
+TRIED = 256  # states of X₀ for that
 
 
 class Fact(NamedTuple):
@@ -26,33 +34,59 @@ class Fact(NamedTuple):
     advice: str = ""
 
 
-def facts_of(learner: Learner, report: Report = silent) -> list[Fact]:
+def facts_of(
+    learner: Learner, report: Report = silent, known: Callable[[Fact], None] = lambda fact: None
+) -> list[Fact]:
     """The facts of a learner's problem; V and the penalty of constraints are left where training begins.
 
     Args:
         report: is told what is being done.
+        known: is told each fact as soon as it is.
     """
-    problem = learner.problem
-    exact = in_float64(problem)
-    facts = [_task(exact), _goal(exact), *_linearisation(exact), stiffness(exact, learner.rollout)]
+    problem, facts = learner.problem, list[Fact]()
+
+    def tell(*several: Fact) -> None:
+        for fact in several:
+            facts.append(fact)
+            known(fact)
+
+    with float64_defaults():  # as the problem is built, so that f computes with the same constants
+        exact = in_float64(problem)
+        tell(_task(exact))
+        around = linearised(exact)
+        if (missing := around.missing_values or _goal_missing(exact)) is not None:
+            tell(Fact("goal", f"none: {missing.reason}", missing.remedy))
+        else:
+            tell(_goal(exact, around))
+            tell(*_modes(exact, around), stiffness(exact, learner.rollout))
     if isinstance(problem.cost, PenaltyCost):
         relaxation = find_relaxation(problem, report)
         problem.cost.weight.fill_(relaxation.weight)
-        facts.append(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
-    start = choose_start([learner], report)
+        tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
+    start = choose_start([learner], report, lambda candidate: tell(_tried(candidate, facts)))
     if start is None:
-        return [*facts, Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")]
-    for candidate in start.candidates:
-        cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
-        chosen = " ← training starts here" if candidate == start.chosen else ""
-        facts.append(Fact(f"start from {candidate.name}", f"{cost}, known after {candidate.seconds:.2g} s{chosen}"))
+        tell(Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V"))
+        return facts
     if start.steps_miss:
-        facts.append(Fact("steps", start.steps_miss, REMEDY))
+        tell(Fact("steps", start.steps_miss, REMEDY))
+    advice = ""
     if start.chosen.finite < 1:
-        facts.append(Fact("start", "no candidate is finite on all of X₀", "choose a smaller X₀, or a shorter horizon"))
+        advice = f"no candidate is finite on all of X₀: {SMALLER}"
     elif start.chosen.name == CALM:
-        facts.append(Fact("start", "nothing known is better than no control", "expect a longer training"))
+        advice = "nothing known is better than no control: expect a longer training"
+    tell(Fact("start", f"training starts from {start.chosen.name}", advice))
     return facts
+
+
+def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:
+    """What came of a candidate; why there is none is said once."""
+    if candidate.missing is not None:
+        found, (reason, remedy) = f"no {candidate.name.removeprefix('the ')}", candidate.missing
+        if any(reason in fact.found for fact in told):
+            return Fact("start", f"{found}, for the reason above")
+        return Fact("start", f"{found}: {reason}", remedy)
+    cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
+    return Fact("start", f"from {candidate.name}: {cost}, known after {candidate.seconds:.2g} s")
 
 
 def _task(problem: Problem) -> Fact:
@@ -68,10 +102,12 @@ def _task(problem: Problem) -> Fact:
     )
 
 
-def _goal(problem: Problem) -> Fact:
+def _goal(problem: Problem, around: Linearisation) -> Fact:
     """Whether the goal is an equilibrium, or which control makes it one."""
+    if around.missing_values is not None:
+        return Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy)
     goal, system = problem.goal, problem.system
-    f, rest = system.f(goal), system.dynamics(goal, problem.rest)
+    f, rest = around.f, system.dynamics(goal, problem.rest)
     where = f"{_listed(goal)}, " if goal.any() else ""
     if not bool(problem.controls.contains(problem.rest)):
         return Fact("goal", f"{where}u = {_listed(problem.rest)} is beyond its limits", "the cost has no rest there")
@@ -80,35 +116,52 @@ def _goal(problem: Problem) -> Fact:
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
     if float(left.abs().max()) <= 1e-9 * float(f.abs().max()):
-        remedy = "no target_control" if problem.cost.rest is not None else f"target: {goal.tolist()}"
-        return Fact(
-            "goal",
-            f"{where}held by u = {_listed(u)}, which the cost charges",
-            f"{remedy} has the cost count u from there, so that staying costs nothing",
-        )
+        remedy = f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing"
+        if problem.cost.rest is not None:  # target_control says from where
+            remedy = ""
+        return Fact("goal", f"{where}held by u = {_listed(u)}, which the cost charges", remedy)
     return Fact(
         "goal", f"{where}no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there"
     )
 
 
-def _linearisation(problem: Problem) -> list[Fact]:
+def _goal_missing(problem: Problem) -> Missing | None:
+    """Why the origin is no goal where nobody named one: q or φ, or a slope of them, does not vanish there."""
+    if problem.cost.goal is not None:
+        return None
+    cost = problem.cost.cost if isinstance(problem.cost, PenaltyCost) else problem.cost
+    x = problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0)).to(problem.goal)
+    extent = problem.initial_states.reach_from(problem.goal)
+    for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
+        with torch.enable_grad():
+            goal = problem.goal.clone().requires_grad_()
+            value = function(goal)
+            slope = torch.autograd.grad(value, goal, materialize_grads=True)[0] if value.requires_grad else 0 * goal
+        value, typical = float(value.detach()), VANISHING * float(function(x).abs().mean())
+        if abs(value) > typical or float((slope * extent).abs().max()) > typical:
+            return Missing(
+                f"{symbol} is {value:.3g}, of slope {_listed(slope)}, at {goal_in_words(problem)}",
+                "name target: in the config, or cost.goal, where the task has a goal",
+            )
+    return None
+
+
+def _modes(problem: Problem, around: Linearisation) -> list[Fact]:
     """The eigenvalues of ẋ = Ax + Bu around the goal, and whether u reaches them."""
-    system, goal, dt = problem.system, problem.goal, problem.horizon.dt
-    A = torch.autograd.functional.jacobian(system.f, goal)
-    assert isinstance(A, Tensor)
-    moving = [i for i in range(system.n) if i not in system.constants]
-    A, B = A[moving][:, moving], system.g(goal).detach()[moving]
+    if around.missing is not None:
+        return [Fact("modes", f"unknown: {around.missing.reason}", around.missing.remedy)]
+    moving = [i for i in range(problem.system.n) if i not in problem.system.constants]
+    A, B, dt = around.A[moving][:, moving], around.g[moving], problem.horizon.dt
+    extent = problem.initial_states.reach_from(problem.goal)[moving]
     values = torch.linalg.eigvals(A)
-    listed = ", ".join(_complex(value) for value in sorted(values.tolist(), key=lambda v: (-v.real, abs(v.imag))))
-    unreached = [value for value in values if _rank(A, B, value) < len(A)]
-    facts = [Fact("modes at the goal", f"{listed} 1/s")]
-    if not unreached:
+    facts = [Fact("modes", f"{_modes_in_words(values)} 1/s at the goal")]
+    unreached = unreached_modes(A, B, extent.where(extent > 0, 1))
+    if not len(unreached):
         facts.append(Fact("controllable", "yes, linearised at the goal"))
     else:
-        modes = ", ".join(_complex(complex(value)) for value in unreached)
-        grows = any(value.real > 1e-9 for value in unreached)
+        grows = bool((unreached.real > REACHED * float(A.abs().max())).any())
         facts.append(Fact(
-            "controllable", f"not linearised at the goal: u does not reach {modes}",
+            "controllable", f"not linearised at the goal: u does not reach {_modes_in_words(unreached)}",
             "what grows there cannot be held near the goal" if grows else "",
         ))  # fmt: skip
     method, z = problem.horizon.method, dt * values
@@ -120,10 +173,38 @@ def _linearisation(problem: Problem) -> list[Fact]:
     return facts
 
 
+def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
+    """The eigenvalues of the part of ẋ = Ax + Bu that u does not reach: by rotations, the states that B moves are split
+    off, then those that these move, and so on, until nothing moves what is left.
+
+    States are in units of their extents, and each control in that in which it moves them by one.
+
+    Source: Van Dooren, "The generalized eigenstructure problem in linear system theory", IEEE Transactions on Automatic
+    Control 1981 (the staircase form).
+    """
+    A, B = A * extent / extent[:, None], B / extent[:, None]
+    B = B / B.norm(dim=0).clamp_min(torch.finfo(B.dtype).tiny)
+    weakest = REACHED
+    size = float(A.norm()) or 1.0
+    while len(A):
+        rotation, moved, _ = torch.linalg.svd(B)
+        rank = int((moved > weakest).sum())
+        if not rank:
+            break
+        A = rotation.mT @ A @ rotation
+        A, B, weakest = A[rank:, rank:], A[rank:, :rank], REACHED * size
+    return torch.linalg.eigvals(A)
+
+
 def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
     """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
+    at_goal = riccati_or_reason(problem)
+    if isinstance(at_goal, Missing):
+        return Fact("stiffness", f"unknown: {at_goal.reason}; {at_goal.remedy}")
     g, R = problem.system.g(problem.goal), problem.cost.R(problem.goal)
-    weighted = torch.linalg.solve(R, g.mT @ riccati(problem).hessian @ g)
+    weighted = torch.linalg.solve(R, g.mT @ at_goal.hessian @ g)
+    if not weighted.isfinite().all():
+        return Fact("stiffness", "unknown: R⁻¹gᵀV_xx g is not finite at the goal; give every control a weight in R")
     gain = problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max())
     found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
     if gain <= STABLE:
@@ -134,12 +215,6 @@ def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
     return Fact("stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}")
 
 
-def _rank(A: Tensor, B: Tensor, value: Tensor) -> int:
-    """The rank of (A − λI, B): n where u reaches the mode (Popov, Belevitch, Hautus)."""
-    shifted = A.to(value.dtype) - value * torch.eye(len(A), dtype=value.dtype)
-    return int(torch.linalg.matrix_rank(torch.cat([shifted, B.to(value.dtype)], 1), rtol=1e-9))
-
-
 def _counted(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
@@ -148,5 +223,13 @@ def _listed(values: Tensor) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"
 
 
+def _modes_in_words(values: Tensor) -> str:
+    """Eigenvalues in decreasing order of their real parts, those that look alike once: "2, 0 (3 times), -1 ± 3i"."""
+    ordered = sorted(values.tolist(), key=lambda value: (-value.real, abs(value.imag)))
+    counts = Counter(_complex(value) for value in ordered if value.imag > -1e-9)
+    return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())
+
+
 def _complex(value: complex) -> str:
-    return f"{value.real + 0.0:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} {value.imag:+.3g}i"
+    """A real number, or a conjugate pair."""
+    return f"{value.real + 0.0:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} ± {value.imag:.3g}i"

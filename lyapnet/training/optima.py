@@ -1,6 +1,7 @@
 """Optimal trajectories from many states of X₀, each sought where its neighbours were found."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -19,6 +20,7 @@ from lyapnet.expansions import (
     path_under,
 )
 from lyapnet.problem import Problem
+from lyapnet.training.stages import Report, silent
 from lyapnet.types import State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
@@ -27,25 +29,33 @@ WILD = 100  # times the median of the greatest entries of V_xx, above which a tr
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
 
 
-def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State) -> Optimum:
+def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: Report = silent) -> Optimum:
     """Optimal trajectories from a batch of states.
 
     The first few are sought: from the controls that expansions ask for, or none if cheaper, and some of them by the
     oracle, where there is one, whose starts need not be trajectories. The others begin with the laws of the few that
     are nearest. Which local minimum a start leads to is luck, but the least cost is continuous in x₀: at last, what was
     found from one state is tried from the states around it.
+
+    Args:
+        report: is told what is being done.
     """
     exact = in_float64(problem)
     x0 = x0.double().cpu()[: _affordable(problem)]
     few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
-    optimum = optimal_trajectories(problem, few, cheapest([path_under(exact, law, few) for law in laws]).u)
-    optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR]))
+    progress = partial(report, f"optima from {len(few)} states of X₀")
+    progress(0, len(few))
+    u = cheapest([path_under(exact, law, few) for law in laws]).u
+    optimum = optimal_trajectories(problem, few, u, progress=progress)
+    optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR], report), report)
     if len(others):
+        progress = partial(report, f"optima from {len(others)} further states of X₀")
+        progress(0, len(others))
         columns = nearest(others, few).unbind(1)
         u = cheapest([_along(exact, optimum, column, others) for column in columns]).u
-        optimum = _joined(optimum, optimal_trajectories(problem, others, u))
-    return _followed(exact, optimum)
+        optimum = _joined(optimum, optimal_trajectories(problem, others, u, progress=progress))
+    return _followed(exact, optimum, report)
 
 
 def minima(problem: Problem, optimum: Optimum) -> Optimum:
@@ -62,12 +72,14 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
     return optimum.member(kept)
 
 
-def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:
+def _by_oracle(problem: Problem, optimum: Optimum, x0: State, report: Report) -> Optimum:
     """The first of some optima, exchanged for those of the oracle that cost less."""
+    progress = partial(report, "optima by the oracle")
+    progress(0, len(x0))
     oracle = optimal_cost(problem)
     if oracle is None:
         return optimum
-    found = oracle.solve(x0)
+    found = oracle.solve(x0, progress=progress)
     if found.u is None:
         return optimum
     better = torch.nonzero(found.cost < BETTER * optimum.path.cost[: len(x0)]).flatten()
@@ -76,10 +88,11 @@ def _by_oracle(problem: Problem, optimum: Optimum, x0: State) -> Optimum:
     return _with(optimum, better, optimal_trajectories(problem, x0[better], found.u[:, better]))
 
 
-def _followed(exact: Problem, optimum: Optimum) -> Optimum:
+def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
     """Optima of which each has been tried from the states around it."""
     x0 = optimum.path.x[0]
-    for _ in range(ROUNDS if len(x0) > 1 else 0):
+    for k in range(ROUNDS if len(x0) > 1 else 0):
+        report("optima of neighbours", k, ROUNDS)
         paths = [_along(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
         best = cheapest(paths)
         improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()

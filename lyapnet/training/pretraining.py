@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -15,6 +16,7 @@ from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
+from lyapnet.training.stages import Report, silent
 from lyapnet.types import PerState, State, StatePath
 
 STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
@@ -171,17 +173,22 @@ def relative_misfit(V: ValueFunction, examples: Examples) -> float:
         return float((own.maximum(least).log() - known.maximum(least).log()).square().mean().nan_to_num(torch.inf))
 
 
-def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:
+def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report = silent) -> None:
     """Lower both errors of V at examples from optimal trajectories, and then where its own law leads too.
 
     The second is repeated, ROUNDS times at most, until the law costs no more than GOOD times the optima. The V whose
     law cost least stays.
+
+    Args:
+        report: is told what is being done.
     """
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     for k in range(ROUNDS + 1):
-        _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)])
+        again = f", once more where its law leads ({k} of at most {ROUNDS} times)" if k else ""
+        progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again}")
+        _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)], progress)
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
@@ -192,13 +199,21 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples) -> None:
     learner.V.load_state_dict(best)
 
 
-def _lower(V: ValueFunction, examples: Examples, generator: torch.Generator, steps: int, rate: float) -> None:
+def _lower(
+    V: ValueFunction,
+    examples: Examples,
+    generator: torch.Generator,
+    steps: int,
+    rate: float,
+    progress: Callable[[int, int], None],
+) -> None:
     """Lower both errors at the examples, by Adam."""
     trained = [p for p in V.parameters() if p.requires_grad]
     examples = examples.to(trained[0])
     optimizer = torch.optim.Adam(trained, rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, rate / 1000)
-    for _ in range(steps):
+    for k in range(steps):
+        progress(k, steps)
         rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
         value_error, excess = errors(V, examples, rows)
         optimizer.zero_grad()

@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -117,10 +116,9 @@ class Returns:
         share = f"{self.plan.module.rate_share:.2g}"
         tried = f" {self.count} returns did not help, the last with {share} of the learning rate."
         if isinstance(member.rollout.closed_loop.policy, HJBPolicy):
-            with suppress(RuntimeError):  # of a problem whose linearisation is singular
-                stiff = stiffness(in_float64(member.problem))
-                if stiff.advice:
-                    return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
+            stiff = stiffness(in_float64(member.problem))
+            if stiff.advice:
+                return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
         if self.start is not None and self.start.chosen.finite < 1:
             known = f"{self.start.chosen.finite:.0%}"
             return f"{tried} The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."

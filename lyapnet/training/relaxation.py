@@ -1,12 +1,22 @@
 """How dear training makes it to come close to what the constraints exclude: found on optima before the first step."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from lyapnet.cost import PenaltyCost
-from lyapnet.expansions import Path, at_rest, cheapest, greedy_law, in_float64, optimal_trajectories, path_under
+from lyapnet.expansions import (
+    Expansion,
+    Path,
+    at_rest,
+    cheapest,
+    greedy_law,
+    in_float64,
+    optimal_trajectories,
+    path_under,
+)
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
+from lyapnet.training.stages import Report
 from lyapnet.training.start import expansions_of
 
 STATES = 24  # of X₀, from which optima are sought
@@ -36,7 +46,7 @@ class Relaxation(NamedTuple):
         return self._asdict()
 
 
-def find_relaxation(problem: Problem, report: Callable[[str], None]) -> Relaxation:
+def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     """The weight of a relaxed problem's penalty: the least of a series that keeps optima within h ≤ 0.
 
     The optima are those without constraints at first, and then follow the weight as it grows. Where none keeps all of
@@ -50,26 +60,29 @@ def find_relaxation(problem: Problem, report: Callable[[str], None]) -> Relaxati
     cost = exact.cost
     assert isinstance(cost, PenaltyCost)
     report("optima without constraints")
-    path = _free_optima(exact.replaced(cost=cost.cost, constraints=None))
+    path = _free_optima(exact.replaced(cost=cost.cost, constraints=None), report)
     finite = path.cost[path.cost.isfinite()]
     free = (float(finite.mean()) if len(finite) else 0.0) or 1.0
     tried = list[Relaxation]()
     for k in range(WEIGHTS):
         cost.weight.fill_(free / problem.horizon.duration * FIRST * FACTOR**k)
-        report(f"optima with a penalty of {float(cost.weight):.2g} per second")
-        path = optimal_trajectories(exact, path.x[0], path.u).path
+        progress = partial(report, f"optima with a penalty of {float(cost.weight):.2g} per second")
+        progress(0, 0)
+        path = optimal_trajectories(exact, path.x[0], path.u, progress=progress).path
         tried.append(Relaxation(float(cost.weight), _kept(exact, path), float(path.cost.mean()) / free, STATES))
         if tried[-1].kept == STATES:
             break
     return max(tried, key=lambda each: each.kept)
 
 
-def _free_optima(problem: Problem) -> Path:
+def _free_optima(problem: Problem, report: Report) -> Path:
     """Optimal trajectories of a problem from a few states of X₀."""
     x0 = problem.initial_states.sample(STATES, stream(0, START, 5))
-    laws = [*(greedy_law(problem, expansion) for _, expansion in expansions_of(problem)), at_rest(problem)]
+    expansions = [known for _, known in expansions_of(problem, report) if isinstance(known, Expansion)]
+    laws = [*(greedy_law(problem, expansion) for expansion in expansions), at_rest(problem)]
     path = cheapest([path_under(problem, law, x0) for law in laws])
-    return optimal_trajectories(problem, x0, path.u).path
+    progress = partial(report, "optima without constraints")
+    return optimal_trajectories(problem, x0, path.u, progress=progress).path
 
 
 def _kept(problem: Problem, path: Path) -> int:

@@ -4,6 +4,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -21,14 +22,15 @@ from lyapnet.expansions import (
     in_float64,
     optimal_trajectories,
     path_under,
-    riccati,
 )
+from lyapnet.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_reason, singular
 from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, kept_states
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, minima, optima_for
 from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, relative_misfit, typical
+from lyapnet.training.stages import Report, silent
 from lyapnet.types import State
 
 STATES = 64  # of X₀, on which a start is tried
@@ -38,22 +40,18 @@ SPREAD = 0.35  # of the distances from the goal along optima, in units of which 
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 CALM = "V = 0"
 LEVELS = tuple(4.0**-k for k in range(9))  # of the regulator's mean value on X₀, up to which it may be taken for right
+SMALLER = "choose a smaller X₀, or a shorter horizon"
 REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
-
-Report = Callable[[str], None]
-
-
-def silent(stage: str) -> None:
-    """Tell nobody."""
 
 
 class Candidate(NamedTuple):
-    """A start that was tried."""
+    """A start that was tried, or that could not be."""
 
     name: str
     cost: float  # mean J_N from states of X₀; infinite where a closed loop is not finite
     finite: float  # share of the closed loops
     seconds: float  # from when starts began to be sought until it was rolled out
+    missing: Missing | None = None  # why there is nothing to try
 
 
 class Start(NamedTuple):
@@ -96,7 +94,9 @@ class Start(NamedTuple):
         }
 
 
-def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start | None:
+def choose_start(
+    learners: Sequence[Learner], report: Report = silent, known: Callable[[Candidate], None] = lambda candidate: None
+) -> Start | None:
     """Put the best of what is known into the networks of learners of one problem; None where there is no place.
 
     Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws: V = 0, each
@@ -105,6 +105,7 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
 
     Args:
         report: told what is being done.
+        known: told each candidate as soon as it is.
     """
     if not has_place_for_start(learners):
         return None
@@ -112,29 +113,33 @@ def choose_start(learners: Sequence[Learner], report: Report = silent) -> Start 
     problem, kept = learners[0].problem, _kept(learners[0])
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
-    report("the optimum from the centre of X₀")
-    began, expansions, tried = time.perf_counter(), dict[str, Expansion](), list[Candidate]()
-    for name, expansion in expansions_of(problem):
+    trials, expansions = _Trials(learners[0], x0, report, known), dict[str, Expansion]()
+    for name, expansion in expansions_of(problem, report):
+        if isinstance(expansion, Missing):
+            trials.leave_out(name, expansion)
+            continue
         expansions[name] = expansion
         take(networks[0], problem, expansion, kept, x0)
-        tried.append(_tried(name, learners[0], x0, began))
+        trials.roll_out(name)
         networks[0].load_state_dict(calm[0])
     if not problem.horizon.stationary or not expansions:
-        tried.insert(0, _tried(CALM, learners[0], x0, began))
+        trials.roll_out(CALM)
     if expansions:
-        base = _best([each for each in tried if each.name != CALM])
+        base = _best([each for each in trials.tried if each.name != CALM])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
+        report(f"whether a step from there gains on {base.name}")
         if _can_be_improved(problem, expansions[base.name], x0[:FEW]):
-            tried += _fitted(learners, list(expansions.values()), calm, base, x0, began, report)
-    chosen = _best(tried)
+            _fit_to_optima(learners, list(expansions.values()), calm, base, trials)
+    chosen = _best(trials.tried)
     if chosen.name == CALM:
         for network, state in zip(networks, calm, strict=True):
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost > 0:
                 network.scale.fill_(chosen.cost)
     policy = learners[0].rollout.closed_loop.policy
-    return Start(chosen, tried, float(costs_of_plant(problem, policy, x0).mean()))
+    held_cost = float(costs_of_plant(problem, policy, x0).mean())
+    return Start(chosen, [*trials.tried, *trials.left_out], held_cost)
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -153,41 +158,46 @@ def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:
     return not bool((path.cost - better <= CLOSE * better.abs()).all())
 
 
-def _fitted(
+def _fit_to_optima(
     learners: Sequence[Learner],
     expansions: Sequence[Expansion],
     calm: Sequence[dict[str, Tensor]],
     base: Candidate,
-    x0: State,
-    began: float,
-    report: Report,
-) -> list[Candidate]:
-    """The candidate whose networks are fitted to optima; none where there are none.
+    trials: "_Trials",
+) -> None:
+    """Try networks that are fitted to optima, where there are any.
 
-    Where it is no better than the base, the networks are what they were before.
+    Where they are no better than the base, the networks are what they were before.
     """
-    problem, before = learners[0].problem, [copy.deepcopy(learner.V.state_dict()) for learner in learners]
+    problem, x0, report = learners[0].problem, trials.x0, trials.report
+    before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"optima from {OPTIMA} states of X₀")
     states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
-    optimum = minima(problem, optima_for(problem, expansions, states))
+    try:
+        optimum = minima(problem, optima_for(problem, expansions, states, report))
+    except LinAlgError as error:
+        trials.leave_out(f"{OPTIMA} optima from states of X₀", singular(error))
+        return
     found = len(optimum.path.cost)
     if not found:
-        return []
+        trials.leave_out(
+            f"{OPTIMA} optima from states of X₀", Missing("no minimum was found from any of them", SMALLER)
+        )
+        return
     examples = examples_of(problem, optimum, stream(0, START, 4))
     _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
-    without_fit = list[Candidate]()
+    rivals = [base]
     if problem.horizon.stationary:
-        without_fit.append(_tried("the regulator, up to where it is right", learners[0], x0, began))
-        if _best([base, *without_fit]) != base:
+        rivals.append(trials.roll_out("the regulator, up to where it is right"))
+        if _best(rivals) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
     report(f"fitting V to {found} optima")
     for learner in learners:
-        fit(learner, optimum, examples)
-    fitted = _tried(f"{found} optima from states of X₀", learners[0], x0, began)
-    if _best([base, *without_fit, fitted]) != fitted:
+        fit(learner, optimum, examples, report)
+    fitted = trials.roll_out(f"{found} optima from states of X₀")
+    if _best([*rivals, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
-    return [*without_fit, fitted]
 
 
 def _take_least_wrong(
@@ -230,31 +240,65 @@ def _best(candidates: Sequence[Candidate]) -> Candidate:
     return min(candidates, key=lambda each: (-each.finite, each.cost))
 
 
-def _tried(name: str, learner: Learner, x0: State, began: float) -> Candidate:
-    """What the closed loop of a learner costs as it is now."""
-    problem = learner.problem
-    cost = costs_of_holding(learner.rollout.closed_loop.policy, problem.horizon, problem, x0)
-    share = float(cost.isfinite().double().mean())
-    return Candidate(name, float(cost.mean()), share, time.perf_counter() - began)
+class _Trials:
+    """The candidates: each is told as soon as it is known."""
+
+    def __init__(self, learner: Learner, x0: State, report: Report, known: Callable[[Candidate], None]):
+        self.learner, self.x0, self.report, self.known = learner, x0, report, known
+        self.began, self.tried, self.left_out = time.perf_counter(), list[Candidate](), list[Candidate]()
+
+    def roll_out(self, name: str) -> Candidate:
+        """Find what the closed loop of the learner costs as it is now."""
+        self.report(f"closed loops from {name}")
+        problem = self.learner.problem
+        cost = costs_of_holding(self.learner.rollout.closed_loop.policy, problem.horizon, problem, self.x0)
+        share = float(cost.isfinite().double().mean())
+        candidate = Candidate(name, float(cost.mean()), share, time.perf_counter() - self.began)
+        self.tried.insert(0 if name == CALM else len(self.tried), candidate)
+        self.known(candidate)
+        return candidate
+
+    def leave_out(self, name: str, missing: Missing) -> None:
+        """Note that there is nothing to try, and why."""
+        candidate = Candidate(name, math.inf, 0.0, time.perf_counter() - self.began, missing)
+        self.left_out.append(candidate)
+        self.known(candidate)
 
 
-def expansions_of(problem: Problem) -> Iterator[tuple[str, Expansion]]:
-    """What can be known of the value function before training, by name, and finite; for controls in a box, or all."""
+def expansions_of(problem: Problem, report: Report = silent) -> Iterator[tuple[str, Expansion | Missing]]:
+    """What can be known of V before training, by name, or why it is not known; for controls in a box, or all.
+
+    Args:
+        report: told what is being done.
+    """
     if problem.controls.limits is None:
         return
-    at_goal, has_rest = riccati(problem), bool(problem.controls.contains(problem.rest))
-    if has_rest and all(part.isfinite().all() for part in at_goal):
+    report("the Riccati solution at the goal")
+    at_goal, has_rest = riccati_or_reason(problem), bool(problem.controls.contains(problem.rest))
+    if has_rest:
         yield "the Riccati solution at the goal", at_goal
     centre = problem.initial_states.center.double().cpu()
     if problem.horizon.stationary:
         return
     if has_rest and torch.equal(centre, problem.goal.double().cpu()):
         return
+    progress = partial(report, "the optimum from the centre of X₀")
+    progress(0, 0)
     guesses = _guesses(problem, centre, at_goal)
-    optimum = optimal_trajectories(problem, centre.expand(guesses.shape[1], -1), guesses, rivals=True)
+    states = centre.expand(guesses.shape[1], -1)
+    try:
+        optimum = optimal_trajectories(problem, states, guesses, rivals=True, progress=progress)
+    except LinAlgError as error:
+        yield "the optimum from the centre of X₀", singular(error)
+        return
     best = optimum.expansion.member(int(optimum.path.cost.argmin()))
-    if optimum.path.cost.isfinite().any() and all(part.isfinite().all() for part in best):
-        yield "the optimum from the centre of X₀", best
+    if not optimum.path.cost.isfinite().any():
+        missing = Missing("from there no trajectory that was tried is finite", SMALLER)
+    elif not all(part.isfinite().all() for part in best):
+        missing = Missing("V has no finite second order around it", TO_WRITE)
+    else:
+        missing = None
+    yield "the optimum from the centre of X₀", missing or best
 
 
 def take(
@@ -300,20 +344,23 @@ def _curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:
     return (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
 
 
-def _guesses(problem: Problem, x0: State, at_goal: Expansion) -> Tensor:
+def _guesses(problem: Problem, x0: State, at_goal: Expansion | Missing) -> Tensor:
     """Controls (N, guesses, m) from which an optimum from x₀ may be found: Riccati's, none, and random waves.
 
-    The waves cost about what the better of the first two does.
+    The waves cost about what the better of the first two does; without Riccati's there is one more of them.
     """
     N, m, waves = problem.horizon.steps, problem.system.m, torch.arange(1, 5)
     exact = in_float64(problem)
-    laws = greedy_law(exact, at_goal), at_rest(exact)
+    laws = [at_rest(exact)] if isinstance(at_goal, Missing) else [greedy_law(exact, at_goal), at_rest(exact)]
     paths = [path_under(exact, law, x0) for law in laws]
     cost = min(float(path.cost) for path in paths)
     dearest = float(torch.linalg.eigvalsh(exact.cost.R(x0))[..., -1])
     amplitude = math.sqrt(cost / (dearest * problem.horizon.duration)) if math.isfinite(cost) else 1.0
     phase = torch.arange(N).double()[:, None] / N * torch.pi * waves
-    weights = torch.randn(GUESSES, m, 2, len(waves), generator=stream(0, START, 1), dtype=torch.float64) / waves
+    weights = (
+        torch.randn(GUESSES + 2 - len(laws), m, 2, len(waves), generator=stream(0, START, 1), dtype=torch.float64)
+        / waves
+    )
     random = torch.einsum("gmaw,awn->ngm", weights, torch.stack([phase.sin(), phase.cos()]).mT)
     return torch.cat([*(path.u[:, None] for path in paths), amplitude * random], 1)
 
@@ -329,4 +376,6 @@ def _kept(learner: Learner) -> list[int]:
 
 
 def _shown(candidate: Candidate) -> str:
+    if candidate.missing is not None:
+        return f"none ({candidate.missing.reason})"
     return f"{candidate.cost:.4g}" if candidate.finite == 1 else f"not finite on {1 - candidate.finite:.0%}"

@@ -7,10 +7,11 @@ import pytest
 import torch
 import yaml
 
+from lyapnet.build import build_problem
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain
 from lyapnet.systems import Linear
-from lyapnet.training.build import build_learner, build_problem
+from lyapnet.training.build_learner import build_learner
 from lyapnet.training.facts import facts_of
 from lyapnet.training.start import Candidate, Start
 

@@ -10,7 +10,8 @@ from lyapnet.build import build_problem, build_program, build_rollout, build_val
 from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram, ValueProgram
-from lyapnet.training.build import build_data, build_module, build_pointwise
+from lyapnet.training.build import build_data, build_module
+from lyapnet.training.build_learner import build_pointwise
 
 SMALL = {
     "experiment": "small",

@@ -1,0 +1,73 @@
+"""From a config to what one seed trains. Nothing here imports Lightning, which takes two seconds."""
+
+import csv
+import io
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from lyapnet.build import Parts, build_program, build_rollout, build_value_function, entry_per_state
+from lyapnet.config import Config, to_plain
+from lyapnet.errors import UsageError
+from lyapnet.files import read_file
+from lyapnet.problem import Problem
+from lyapnet.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
+from lyapnet.rollout import Rollout
+from lyapnet.sets import Box
+from lyapnet.training.learner import Learner
+
+
+def build_learner(config: Config, problem: Problem, parts: Parts | None = None, label: str = "") -> Learner:
+    """What one seed of a config trains."""
+    parts = parts or Parts()
+    V = build_value_function(config, problem, parts.network)
+    rollout, program = build_rollout(config, problem, V), parts.program or build_program(config)
+    learner = Learner(problem, V, rollout, program, build_pointwise(config, rollout, program), config.seed, label)
+    learner.metadata = {"config": to_plain(config), "problem": problem.record()}
+    return learner
+
+
+def build_pointwise(config: Config, rollout: Rollout, program: Program) -> PointwiseCondition | None:
+    """The program's condition off the closed loops; None without weight.
+
+    Raises:
+        UsageError: a region or a file of counterexamples that does not fit the system.
+    """
+    options, problem = config.pointwise, rollout.problem
+    weight = program.pointwise if options.weight is None else options.weight
+    made = RegionCondition if isinstance(program, RegionProgram) else PointwiseCondition
+    if made is RegionCondition and not (problem.horizon.stationary and weight):
+        raise UsageError(
+            "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got none; its V has "
+            "no time, and points of D are what it is about."
+        )
+    if not weight:
+        return None
+    n, goal, initial_states = problem.system.n, problem.goal, problem.initial_states
+    furthest = initial_states.reach_from(goal)
+    extent = entry_per_state("pointwise.region", options.region, problem.system) or (1.5 * furthest).tolist()
+    if min(extent) <= 0:
+        raise UsageError("Expected pointwise.region, got none, and X₀ is thin; give a bound of each |x_i|.")
+    reach = torch.tensor(extent, dtype=torch.float64).to(goal)
+    region = Box(goal - reach, goal + reach)
+    further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(goal)
+    return made(rollout, program, region, weight, options.points, further, options.floor)
+
+
+def _points_of(path: Path, n: int) -> Tensor:
+    """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
+    try:
+        heading, *lines = csv.reader(io.StringIO(read_file(path).decode(), newline=""))
+        if heading[:1] != ["t"]:
+            raise ValueError("no heading t, …")
+        rows = [[float(entry) for entry in row] for row in lines]
+        points = torch.tensor(rows, dtype=torch.float64) if rows else torch.empty(0, 1 + n)
+        if points.shape[-1:] != (1 + n,) or not points.isfinite().all():
+            raise ValueError(f"{len(rows)} rows of {points.shape[-1]}, or not finite")
+    except (OSError, ValueError, csv.Error) as error:
+        raise UsageError(
+            f"Expected pointwise.counterexamples as a CSV of rows t, x_1, …, x_{n}, got {str(path)!r} ({error}); "
+            "see lyapnet certify --refine."
+        ) from error
+    return points

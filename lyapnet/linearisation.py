@@ -13,6 +13,8 @@ from lyapnet.types import InputMatrix, Matrix, State
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 TO_WRITE = "write √(v² + ε²) in the place of √(v²) and |v|, and √(p + ε) in the place of √p, with a small ε"
 
+NEARBY, NEAR = 8, 1e-3  # states around the goal, and how far away they are, in units of X₀
+
 
 class Missing(NamedTuple):
     """Why something is not known, and what to do about it."""
@@ -40,7 +42,7 @@ def linearised(problem: Problem) -> Linearisation:
         A = jacobian(f, x).detach()
     f, g = f.detach(), problem.system.g(problem.goal).detach()
     values = _missing_values(problem, f, g)
-    return Linearisation(f, g, A, values, values or _missing_slope(problem, "f", A))
+    return Linearisation(f, g, A, values, values or _missing_slope(problem, A))
 
 
 def riccati_or_reason(problem: Problem) -> Expansion | Missing:
@@ -88,25 +90,31 @@ def _missing_values(problem: Problem, f: State, g: InputMatrix) -> Missing | Non
     return None
 
 
-def _missing_slope(problem: Problem, symbol: str, slope: Tensor) -> Missing | None:
-    bad = torch.nonzero(~slope.isfinite())
-    if not len(bad):
+def _missing_slope(problem: Problem, A: Matrix) -> Missing | None:
+    if A.isfinite().all():
         return None
-    row, column = bad[0].tolist()
-    names = problem.system.state_names
-    return Missing(
-        f"{symbol} has no finite slope at {goal_in_words(problem)}: the rate of {names[row]} by {names[column]} has "
-        f"{float(slope[row, column])} there",
-        TO_WRITE,
-    )
+    by = torch.nonzero(~A.isfinite().all(0)).flatten()
+    rates = torch.nonzero(~A.isfinite().all(1) & _bent(problem, by)).flatten()
+    what, states = (", ".join(problem.system.state_names[i] for i in which) for which in (rates, by))
+    return Missing(f"f has no finite slope at the goal: that of the rate of {what}, by {states}", TO_WRITE)
+
+
+def _bent(problem: Problem, by: Tensor) -> Tensor:
+    """Which rates have slopes by some states that change near the goal, or all: at the goal a NaN spreads to others."""
+    extent = problem.initial_states.reach_from(problem.goal)
+    away = torch.randn(NEARBY, problem.system.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with torch.enable_grad():
+        x = (problem.goal + NEAR * away * extent.where(extent > 0, 1)).requires_grad_()
+        slopes = jacobian(problem.system.f(x), x).detach()[..., by]
+    bent = (slopes - slopes[0]).abs().amax((0, -1)) > 0
+    return bent if bent.any() else torch.ones_like(bent)
 
 
 def _missing_cost(problem: Problem) -> Missing | None:
     """Why the cost has no second order at the goal."""
-    place = goal_in_words(problem)
     R = problem.cost.R(problem.goal).detach()
     if not R.isfinite().all() or float(torch.linalg.eigvalsh(R).min()) <= 0:
-        return Missing(f"R is not positive definite at {place}: {R.tolist()}", "give every control a weight")
+        return Missing(f"R is not positive definite at the goal: {R.tolist()}", "give every control a weight")
     for symbol, function in (("q", problem.cost.state), ("φ", problem.cost.terminal)):
         with torch.enable_grad():
             x = problem.goal.clone().requires_grad_()
@@ -115,7 +123,7 @@ def _missing_cost(problem: Problem) -> Missing | None:
             curvature = jacobian(slope, x)
         for part, what in ((value[None], "value"), (slope, "slope"), (curvature, "second derivative")):
             if not part.isfinite().all():
-                return Missing(f"{symbol} has no finite {what} at {place}", TO_WRITE)
+                return Missing(f"{symbol} has no finite {what} at the goal", TO_WRITE)
     return None
 
 

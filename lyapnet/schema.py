@@ -150,16 +150,12 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
         elif annotation.startswith(("list[float]", "list[int]")) and type(value) in (int, float):
             found[f.name] = [value]
         elif annotation.startswith("list[") and _is_scalar(value):
-            of_numbers = annotation.startswith(("list[float]", "list[int]"))
-            raise UsageError(
-                f"Expected {key} as {'a number or ' * of_numbers}a list, got {value!r}; write it as [{value}], or correct it."
-            )
+            kind = "a list" if annotation.startswith("list[str]") else "a number or a list of numbers"
+            raise UsageError(f"Expected {key} as {kind}, got {value!r}; correct it: {f.metadata['doc']}")
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
             for name, entry in value.items():
                 if _is_scalar(entry) or type(entry) in (int, float):
-                    raise UsageError(
-                        f"Expected {key}.{name} as a list, got {entry!r}; write it in brackets: {f.metadata['doc']}"
-                    )
+                    raise UsageError(f"Expected {key}.{name} as a list, got {entry!r}; correct it: {f.metadata['doc']}")
     return found
 
 

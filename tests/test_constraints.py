@@ -24,6 +24,7 @@ from lyapnet.training.build_learner import build_learner
 from lyapnet.training.facts import facts_of
 from lyapnet.training.modules import ValueModule
 from lyapnet.training.relaxation import find_relaxation
+from lyapnet.training.stages import silent
 from tests.configs import objects
 from tests.problems import CONF
 
@@ -160,7 +161,7 @@ def test_a_state_from_which_a_limit_cannot_be_kept_has_no_optimum():
 def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
     monkeypatch.setattr("lyapnet.training.relaxation.STATES", 3)
     problem = bryson_denham(0.1).relaxed()
-    found, said = find_relaxation(problem, lambda stage: None), []
+    found, said = find_relaxation(problem, silent), []
     assert found.kept == found.states
     problem.cost.weight.fill_(found.weight)
     x0, idle = torch.tensor([[0.0, 1.0]]), torch.zeros(100, 1, 1)
@@ -173,7 +174,7 @@ def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
     monkeypatch.setattr("lyapnet.training.relaxation.WEIGHTS", 4)
     impossible = problem_of({**constrained(upper={"position": 1.01}), "controls": {"lower": -1, "upper": 1}})
     impossible = impossible.replaced(initial_states=lyapnet.Box([0.99, 0.1], [1.0, 0.2])).relaxed()
-    found = find_relaxation(impossible, said.append)
+    found = find_relaxation(impossible, lambda stage, *counts: said.append(stage))
     assert found.kept < found.states
     assert "no path was found" in str(found)
     assert said[0] == "optima without constraints"

@@ -3,6 +3,7 @@
 import gc
 import json
 import shlex
+import sys
 import textwrap
 import time
 from pathlib import Path
@@ -33,7 +34,8 @@ def check(
     from lyapnet.training.stages import Stages
 
     output = Console(highlight=False, markup=False)
-    shown = output if output.is_terminal and not as_json else Console(stderr=True, highlight=False, markup=False)
+    notes = Console(file=sys.stderr, highlight=False, markup=False)
+    shown = output if output.is_terminal and not as_json else notes
     facts, began = list[Any](), time.monotonic()
 
     def known(fact: Any) -> None:

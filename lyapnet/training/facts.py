@@ -22,6 +22,7 @@ from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, choose_star
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
+ROUNDED = 1e-9  # of the largest eigenvalue, below which a part of another one is zero
 VANISHING = 1e-3  # of what q and φ are on X₀, below which they vanish at the goal
 TRIED = 256  # states of X₀ for that
 
@@ -57,8 +58,11 @@ def facts_of(
         if (missing := around.missing_values or _goal_missing(exact)) is not None:
             tell(Fact("goal", f"none: {missing.reason}", missing.remedy))
         else:
-            tell(_goal(exact, around))
-            tell(*_modes(exact, around), stiffness(exact, learner.rollout))
+            tell(_goal(exact, around), *_modes(exact, around))
+            stiff = stiffness(exact, learner.rollout)
+            if around.missing is not None and around.missing.reason in stiff.found:
+                stiff = Fact("stiffness", "unknown, for the reason above")
+            tell(stiff)
     if isinstance(problem.cost, PenaltyCost):
         relaxation = find_relaxation(problem, report)
         problem.cost.weight.fill_(relaxation.weight)
@@ -136,7 +140,8 @@ def _goal_missing(problem: Problem) -> Missing | None:
         with torch.enable_grad():
             goal = problem.goal.clone().requires_grad_()
             value = function(goal)
-            slope = torch.autograd.grad(value, goal, materialize_grads=True)[0] if value.requires_grad else 0 * goal
+            slope = torch.autograd.grad(value, goal, materialize_grads=True)[0] if value.requires_grad else None
+        slope = torch.zeros_like(problem.goal) if slope is None else slope
         value, typical = float(value.detach()), VANISHING * float(function(x).abs().mean())
         if abs(value) > typical or float((slope * extent).abs().max()) > typical:
             return Missing(
@@ -225,11 +230,15 @@ def _listed(values: Tensor) -> str:
 
 def _modes_in_words(values: Tensor) -> str:
     """Eigenvalues in decreasing order of their real parts, those that look alike once: "2, 0 (3 times), -1 ± 3i"."""
+    size = ROUNDED * float(values.abs().max())
+    values = torch.complex(
+        values.real.where(values.real.abs() > size, 0), values.imag.where(values.imag.abs() > size, 0)
+    )
     ordered = sorted(values.tolist(), key=lambda value: (-value.real, abs(value.imag)))
-    counts = Counter(_complex(value) for value in ordered if value.imag > -1e-9)
+    counts = Counter(_complex(value) for value in ordered if value.imag >= 0)
     return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())
 
 
 def _complex(value: complex) -> str:
     """A real number, or a conjugate pair."""
-    return f"{value.real + 0.0:.3g}" if abs(value.imag) < 1e-9 else f"{value.real:.3g} ± {value.imag:.3g}i"
+    return f"{value.real + 0.0:.3g}" if not value.imag else f"{value.real + 0.0:.3g} ± {value.imag:.3g}i"

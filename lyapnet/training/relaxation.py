@@ -66,9 +66,8 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     tried = list[Relaxation]()
     for k in range(WEIGHTS):
         cost.weight.fill_(free / problem.horizon.duration * FIRST * FACTOR**k)
-        progress = partial(report, f"optima with a penalty of {float(cost.weight):.2g} per second")
-        progress(0, 0)
-        path = optimal_trajectories(exact, path.x[0], path.u, progress=progress).path
+        report("optima with a penalty, dearer each time", k, WEIGHTS)
+        path = optimal_trajectories(exact, path.x[0], path.u).path
         tried.append(Relaxation(float(cost.weight), _kept(exact, path), float(path.cost.mean()) / free, STATES))
         if tried[-1].kept == STATES:
             break

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rich.console import Console
 from rich.text import Text
@@ -10,6 +10,7 @@ from rich.text import Text
 QUIET = 5.0  # seconds after which a log without a terminal has another line
 
 
+@runtime_checkable
 class Report(Protocol):
     """Is told what is being done, and how many of how many are done where that is counted."""
 

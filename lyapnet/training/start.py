@@ -128,8 +128,9 @@ def choose_start(
         base = _best([each for each in trials.tried if each.name != CALM])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
-        report(f"whether a step from there gains on {base.name}")
-        if _can_be_improved(problem, expansions[base.name], x0[:FEW]):
+        progress = partial(report, f"whether the law of {base.name} can be improved")
+        progress(0, FEW)
+        if _can_be_improved(problem, expansions[base.name], x0[:FEW], progress):
             _fit_to_optima(learners, list(expansions.values()), calm, base, trials)
     chosen = _best(trials.tried)
     if chosen.name == CALM:
@@ -147,14 +148,14 @@ def has_place_for_start(learners: Sequence[Learner]) -> bool:
     return all(_network_of(learner.V) is not None for learner in learners)
 
 
-def _can_be_improved(problem: Problem, expansion: Expansion, x0: State) -> bool:
+def _can_be_improved(problem: Problem, expansion: Expansion, x0: State, progress: Callable[[int, int], None]) -> bool:
     """Whether differential dynamic programming gains on the law of an expansion, from any of some states.
 
     Of all its damping one step at least has to be tried.
     """
     x0 = x0.double().cpu()
     path = path_under(in_float64(problem), greedy_law(in_float64(problem), expansion), x0)
-    better = optimal_trajectories(problem, x0, path.u, iterations=TRIES + 1).path.cost
+    better = optimal_trajectories(problem, x0, path.u, iterations=TRIES + 1, progress=progress).path.cost
     return not bool((path.cost - better <= CLOSE * better.abs()).all())
 
 
@@ -174,15 +175,14 @@ def _fit_to_optima(
     report(f"optima from {OPTIMA} states of X₀")
     states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
     try:
-        optimum = minima(problem, optima_for(problem, expansions, states, report))
+        sought = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
-        trials.leave_out(f"{OPTIMA} optima from states of X₀", singular(error))
+        trials.leave_out("optima from states of X₀", singular(error))
         return
+    optimum = minima(problem, sought)
     found = len(optimum.path.cost)
     if not found:
-        trials.leave_out(
-            f"{OPTIMA} optima from states of X₀", Missing("no minimum was found from any of them", SMALLER)
-        )
+        trials.leave_out("optima from states of X₀", _why_none(sought))
         return
     examples = examples_of(problem, optimum, stream(0, START, 4))
     _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
@@ -198,6 +198,13 @@ def _fit_to_optima(
     if _best([*rivals, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
+
+
+def _why_none(sought: Optimum) -> Missing:
+    """Why there is no minimum with an expansion among trajectories."""
+    if sought.path.cost.isfinite().any():
+        return Missing("around none of those found has V a finite second order", TO_WRITE)
+    return Missing("no trajectory that was tried is finite", SMALLER)
 
 
 def _take_least_wrong(
@@ -295,7 +302,7 @@ def expansions_of(problem: Problem, report: Report = silent) -> Iterator[tuple[s
     if not optimum.path.cost.isfinite().any():
         missing = Missing("from there no trajectory that was tried is finite", SMALLER)
     elif not all(part.isfinite().all() for part in best):
-        missing = Missing("V has no finite second order around it", TO_WRITE)
+        missing = Missing("around what was found V has no finite second order", TO_WRITE)
     else:
         missing = None
     yield "the optimum from the centre of X₀", missing or best

@@ -5,6 +5,8 @@ Ground truth for tests and tables, never used in training. The model is the torc
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
+from io import StringIO
 
 import casadi
 import numpy as np
@@ -154,7 +156,8 @@ class Transcription(Oracle):
         guess = np.concatenate([start.u.ravel(), start.x.ravel()])
         scale = self._scale(torch.from_numpy(x0))
         least, greatest = self._held
-        result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=least, ubg=greatest)
+        with redirect_stderr(StringIO()):  # CasADi warns of what ends it; it goes on as a reason, or as what was raised
+            result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=least, ubg=greatest)
         status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()

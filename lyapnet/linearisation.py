@@ -24,11 +24,14 @@ class Missing(NamedTuple):
 
 
 class Linearisation(NamedTuple):
-    """ẋ ≈ f + A(x − x*) + g u around the goal x*; entries may not be finite."""
+    """ẋ ≈ f + gu* + A(x − x*) + g(u − u*) around the goal x* and the control u* that costs nothing.
+
+    Entries may not be finite.
+    """
 
     f: State
     g: InputMatrix
-    A: Matrix
+    A: Matrix  # ∂(f + gu*)/∂x
     missing_values: Missing | None  # why there is no f or no g at the goal
     missing: Missing | None  # the same, or why there is no A
 
@@ -38,9 +41,8 @@ def linearised(problem: Problem) -> Linearisation:
     problem = in_float64(problem)
     with torch.enable_grad():
         x = problem.goal.clone().requires_grad_()
-        f = problem.system.f(x)
-        A = jacobian(f, x).detach()
-    f, g = f.detach(), problem.system.g(problem.goal).detach()
+        A = jacobian(problem.system.dynamics(x, problem.rest), x).detach()
+    f, g = problem.system.f(problem.goal).detach(), problem.system.g(problem.goal).detach()
     values = _missing_values(problem, f, g)
     return Linearisation(f, g, A, values, values or _missing_slope(problem, A))
 
@@ -95,8 +97,8 @@ def _missing_slope(problem: Problem, A: Matrix) -> Missing | None:
         return None
     by = torch.nonzero(~A.isfinite().all(0)).flatten()
     rates = torch.nonzero(~A.isfinite().all(1) & _bent(problem, by)).flatten()
-    what, states = (", ".join(problem.system.state_names[i] for i in which) for which in (rates, by))
-    return Missing(f"f has no finite slope at the goal: that of the rate of {what}, by {states}", TO_WRITE)
+    what, states = (", ".join(problem.system.state_names[i] for i in which.tolist()) for which in (rates, by))
+    return Missing(f"f + gu* has no finite slope at the goal: that of the rate of {what}, by {states}", TO_WRITE)
 
 
 def _bent(problem: Problem, by: Tensor) -> Tensor:
@@ -105,7 +107,8 @@ def _bent(problem: Problem, by: Tensor) -> Tensor:
     away = torch.randn(NEARBY, problem.system.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with torch.enable_grad():
         x = (problem.goal + NEAR * away * extent.where(extent > 0, 1)).requires_grad_()
-        slopes = jacobian(problem.system.f(x), x).detach()[..., by]
+        rate = problem.system.dynamics(x, problem.rest.expand(NEARBY, -1))
+        slopes = jacobian(rate, x).detach()[..., by]
     bent = (slopes - slopes[0]).abs().amax((0, -1)) > 0
     return bent if bent.any() else torch.ones_like(bent)
 

@@ -22,7 +22,7 @@ from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, choose_star
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
-ROUNDED = 1e-9  # of the largest eigenvalue, below which a part of another one is zero
+ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
 VANISHING = 1e-3  # of what q and φ are on X₀, below which they vanish at the goal
 TRIED = 256  # states of X₀ for that
 
@@ -198,7 +198,7 @@ def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
             break
         A = rotation.mT @ A @ rotation
         A, B, weakest = A[rank:, rank:], A[rank:, :rank], REACHED * size
-    return torch.linalg.eigvals(A)
+    return _rounded(torch.linalg.eigvals(A), size)
 
 
 def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
@@ -237,6 +237,12 @@ def _modes_in_words(values: Tensor) -> str:
     ordered = sorted(values.tolist(), key=lambda value: (-value.real, abs(value.imag)))
     counts = Counter(_complex(value) for value in ordered if value.imag >= 0)
     return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())
+
+
+def _rounded(values: Tensor, size: float) -> Tensor:
+    """Complex numbers without parts that are only rounding, against a size."""
+    parts = torch.view_as_real(values)
+    return torch.view_as_complex(parts.where(parts.abs() > ROUNDED * size, 0))
 
 
 def _complex(value: complex) -> str:

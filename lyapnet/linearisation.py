@@ -97,7 +97,8 @@ def _missing_slope(problem: Problem, A: Matrix) -> Missing | None:
         return None
     by = torch.nonzero(~A.isfinite().all(0)).flatten()
     rates = torch.nonzero(~A.isfinite().all(1) & _bent(problem, by)).flatten()
-    what, states = (", ".join(problem.system.state_names[i] for i in which.tolist()) for which in (rates, by))
+    names = list(problem.system.state_names)
+    what, states = (", ".join(names[i] for i in which.tolist()) for which in (rates, by))
     return Missing(f"f + gu* has no finite slope at the goal: that of the rate of {what}, by {states}", TO_WRITE)
 
 

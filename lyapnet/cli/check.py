@@ -18,7 +18,7 @@ from lyapnet.errors import Interrupted
 
 NAMES = 14  # columns for the names of facts
 WIDEST = 120
-ORDER = ("task", "goal", "modes", "controllable", "stiffness", "constraints", "start")  # in which facts become known
+ORDER = ("task", "goal", "modes", "controllable", "stiffness", "start")  # in which facts become known
 
 
 def check(

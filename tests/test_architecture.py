@@ -26,7 +26,7 @@ LEVELS = (
     {"cluster", "constraints", "contracts", "cost", "devices", "horizon", "schema", "sets", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
-    {"policy"},
+    {"linearisation", "policy"},
     {"beyond", "rollout"},
     {"programs"},
     {"config"},
@@ -41,8 +41,8 @@ LEVELS = (
 )
 MATHEMATICS = {
     "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family", "files", "graphs",
-    "horizon", "interpolation", "linear_algebra", "networks", "policy", "problem", "programs", "random_streams",
-    "rollout", "sets", "shapes", "systems", "types",
+    "horizon", "interpolation", "linear_algebra", "linearisation", "networks", "policy", "problem", "programs",
+    "random_streams", "rollout", "sets", "shapes", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

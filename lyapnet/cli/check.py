@@ -50,13 +50,15 @@ def check(
         with stages:
             stages("reading the task")
             experiment = _check(config, overrides or [], stages, known)
-    except Interrupted as stop:
+    except BaseException as error:
+        if not _is_interrupt(error):
+            raise
         if as_json:
             _print_json(experiment, facts, _not_reached(facts))
         seconds = time.monotonic() - began
         raise Interrupted(
             f"Stopped after {seconds:.1f} s ({stages.now}); not reached: {', '.join(_not_reached(facts))}.", 130
-        ) from stop
+        ) from error
     if as_json:
         _print_json(experiment, facts, [])
         return
@@ -94,6 +96,11 @@ def print_fact(console: Console, fact: Any) -> None:
     for line in lines:
         console.print(Text(f"{name:{NAMES}}", "bold").append(line, "not bold"), soft_wrap=True)
         name = ""
+
+
+def _is_interrupt(error: BaseException) -> bool:
+    """Whether an error is Ctrl-C, or what an import made of it, as __set_name__ does."""
+    return isinstance(error, Interrupted) or isinstance(error.__cause__ or error.__context__, Interrupted)
 
 
 def _not_reached(facts: list[Any]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import torch
@@ -12,13 +12,21 @@ from lyapnet.build.classes import float64_defaults
 from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64
 from lyapnet.horizon import TABLEAUX
-from lyapnet.linearisation import Linearisation, Missing, goal_in_words, linearised, riccati_or_reason
+from lyapnet.linearisation import (
+    LinAlgError,
+    Linearisation,
+    Missing,
+    goal_in_words,
+    linearised,
+    riccati_or_reason,
+    singular,
+)
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, choose_start
+from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, Start, choose_start
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
@@ -63,23 +71,33 @@ def facts_of(
             if around.missing is not None and around.missing.reason in stiff.found:
                 stiff = Fact("stiffness", "unknown, for the reason above")
             tell(stiff)
-    if isinstance(problem.cost, PenaltyCost):
-        relaxation = find_relaxation(problem, report)
-        problem.cost.weight.fill_(relaxation.weight)
-        tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
-    start = choose_start([learner], report, lambda candidate: tell(_tried(candidate, facts)))
-    if start is None:
-        tell(Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V"))
+    try:
+        if isinstance(problem.cost, PenaltyCost):
+            relaxation = find_relaxation(problem, report)
+            problem.cost.weight.fill_(relaxation.weight)
+            tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
+        start = choose_start([learner], report, lambda candidate: tell(_tried(candidate, facts)))
+    except LinAlgError as error:
+        reason, remedy = singular(error)
+        tell(Fact("start", f"not found: {reason}", remedy))
         return facts
+    tell(*_chosen(start))
+    return facts
+
+
+def _chosen(start: Start | None) -> Iterator[Fact]:
+    """Where training starts from, and what its steps miss."""
+    if start is None:
+        yield Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")
+        return
     if start.steps_miss:
-        tell(Fact("steps", start.steps_miss, REMEDY))
+        yield Fact("steps", start.steps_miss, REMEDY)
     advice = ""
     if start.chosen.finite < 1:
         advice = f"no candidate is finite on all of X₀: {SMALLER}"
     elif start.chosen.name == CALM:
         advice = "nothing known is better than no control: expect a longer training"
-    tell(Fact("start", f"training starts from {start.chosen.name}", advice))
-    return facts
+    yield Fact("start", f"training starts from {start.chosen.name}", advice)
 
 
 def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:

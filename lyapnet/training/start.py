@@ -291,9 +291,9 @@ def expansions_of(problem: Problem, report: Report = silent) -> Iterator[tuple[s
         return
     progress = partial(report, "the optimum from the centre of X₀")
     progress(0, 0)
-    guesses = _guesses(problem, centre, at_goal)
-    states = centre.expand(guesses.shape[1], -1)
     try:
+        guesses = _guesses(problem, centre, at_goal)
+        states = centre.expand(guesses.shape[1], -1)
         optimum = optimal_trajectories(problem, states, guesses, rivals=True, progress=progress)
     except LinAlgError as error:
         yield "the optimum from the centre of X₀", singular(error)

@@ -208,6 +208,19 @@ def test_an_interrupt_leaves_one_json_object(tmp_path, capfd, monkeypatch):
     assert "Stopped after" in shown.err.splitlines()[-1]
 
 
+def test_a_failure_of_linear_algebra_is_a_fact(monkeypatch):
+    def fails(*arguments, **options):
+        return torch.linalg.eigh(torch.full((2, 2), torch.nan))
+
+    monkeypatch.setattr("lyapnet.training.start.optimal_trajectories", fails)
+    config = config_of(lower=[1, 0], upper=[2, 1])
+    facts = facts_of(build_learner(config, build_problem(config, Parts(system=UNSTABLE))))
+    left_out, last = facts[-3], facts[-1]
+    assert "no optimum from the centre of X₀: a matrix of second derivatives is singular" in left_out.found
+    assert last.found.startswith("not found: a matrix of second derivatives is singular")
+    assert "R" in last.advice
+
+
 def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch):
     """Nothing of LAPACK, CasADi or torch is on the terminal, and what cannot be is a fact."""
     (tmp_path / "growing.py").write_text(

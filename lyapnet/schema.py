@@ -136,7 +136,7 @@ def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
 
 
 def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str = "") -> dict[str, Any]:
-    """The content with [0.1] for a number 0.1 in the place of a list of numbers.
+    """The content with [0.1] for 0.1 in the place of a list of floats, which has one for each state, or one for all.
 
     Raises:
         UsageError: what stands in the place of a list is neither.
@@ -144,24 +144,27 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
     found = dict(content)
     for f in dataclasses.fields(schema):  # pyright: ignore
         key, value, annotation = f"{prefix}{f.name}", content.get(f.name), str(f.type)
+        of_floats = annotation.startswith("list[float]")
         if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
             if isinstance(value, Mapping):
                 found[f.name] = _with_numbers_as_lists(value, f.type, f"{key}.")
-        elif annotation.startswith(("list[float]", "list[int]")) and type(value) in (int, float):
+        elif of_floats and type(value) in (int, float):
             found[f.name] = [value]
-        elif annotation.startswith("list[") and _is_scalar(value):
-            kind = "a list" if annotation.startswith("list[str]") else "a number or a list of numbers"
-            raise UsageError(f"Expected {key} as {kind}, got {value!r}; correct it: {f.metadata['doc']}")
+        elif annotation.startswith("list["):
+            _refuse_scalar(
+                key, value, "a number or a list of numbers" if of_floats else "a list", f.metadata.get("doc", "")
+            )
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
             for name, entry in value.items():
-                if _is_scalar(entry) or type(entry) in (int, float):
-                    raise UsageError(f"Expected {key}.{name} as a list, got {entry!r}; correct it: {f.metadata['doc']}")
+                _refuse_scalar(f"{key}.{name}", entry, "a list", f.metadata.get("doc", ""))
     return found
 
 
-def _is_scalar(value: Any) -> bool:
-    """Whether a value is text or a truth value, and not an interpolation or what is still missing."""
-    return isinstance(value, bool) or (isinstance(value, str) and value != MISSING and "${" not in value)
+def _refuse_scalar(key: str, value: Any, kind: str, doc: str) -> None:
+    """Refuse a number, a truth value or a text that is neither missing nor an interpolation."""
+    text = isinstance(value, str) and value != MISSING and "${" not in value
+    if text or isinstance(value, int | float):
+        raise UsageError(f"Expected {key} as {kind}, got {value!r}; correct it: {doc}")
 
 
 def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:

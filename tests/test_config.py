@@ -10,6 +10,7 @@ import pytest
 import yaml
 from omegaconf import MISSING
 
+from lyapnet.build import build_problem
 from lyapnet.config import STANDARD, Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram
@@ -89,7 +90,11 @@ MISTYPED = {
     "network.hidden=64": ("network.hidden",),
     "network.hidden=[a]": ("network.hidden", "'a'"),
     "training.beta1=high": ("training.beta1", "'high'"),
-    "initial_states.lower=5": ("initial_states.lower",),
+    "initial_states.lower=five": ("initial_states.lower as a number or a list", "'five'"),
+    "initial_states.lower=true": ("initial_states.lower as a number or a list", "True"),
+    "target=here": ("target as a number or a list", "'here'"),
+    "loggers=csv": ("loggers as a list", "'csv'"),
+    "family.mass=3": ("family.mass as a list", "got 3"),
     "initial_states.lower=[a, b]": ("initial_states.lower", "'a'"),
     "trainer=5": ("trainer",),
     "system.parameters=5": ("system.parameters",),
@@ -158,6 +163,7 @@ OUT_OF_RANGE = {
     "cost.R=[-1]": ("cost", "R", "positive definite", "-1"),
     "cost.R=-1": ("cost", "R", "positive definite", "-1"),
     "cost.Q=-5": ("cost", "Q", "semidefinite", "-5"),
+    "initial_states.lower=5": ("initial_states", "lower ≤ upper", "5.0 > 1.0"),
     "initial_states.lower=[1, 2]": ("initial_states", "lower ≤ upper", "2.0 > 1.0"),
     "initial_states.lower=[-.inf, 0]": ("initial_states", "finite", "inf"),
 }
@@ -377,6 +383,16 @@ def test_command_line_overrides_file_overrides_defaults(tmp_path, plain):
     assert config.training.optimizer == "adam"
     assert config.initial_states.lower == [-2, -2]
     assert config.initial_states.upper == [1, 1]
+
+
+def test_a_number_stands_for_a_list_of_one(plain):
+    plain |= {"initial_states": {"lower": -2, "upper": 0.5}, "target": 0, "target_control": 0}
+    config = config_from_plain(plain, ["network.state_scale=3", "initial_states.upper=1"])
+    assert config.network.state_scale == [3]
+    problem = build_problem(config)
+    assert problem.initial_states.lower.tolist() == [-2, -2]
+    assert problem.initial_states.upper.tolist() == [1, 1]
+    assert problem.goal.tolist() == [0, 0]
 
 
 def test_one_key_of_the_trainer_section_keeps_the_others(plain):

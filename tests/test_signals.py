@@ -50,7 +50,7 @@ def test_what_waits_in_a_command_stops_at_once(monkeypatch, capsys):
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_an_oracle_stops_although_casadi_keeps_signals_to_itself():
+def test_an_oracle_stops_although_casadi_keeps_signals_to_itself(capfd):
     pytest.importorskip("casadi")
     from lyapnet.evaluation.oracles.transcription import Transcription
 
@@ -68,6 +68,7 @@ def test_an_oracle_stops_although_casadi_keeps_signals_to_itself():
         with pytest.raises(Interrupted, match="Stopped while seeking optima"):
             oracle.solve(x0, progress=progress)
         assert 0 < len(done) < len(x0)
+    assert "CasADi" not in capfd.readouterr().err
 
 
 def test_without_a_signal_nothing_stops():

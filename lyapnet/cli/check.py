@@ -1,5 +1,6 @@
 """lyapnet check."""
 
+import dataclasses
 import gc
 import json
 import shlex
@@ -49,7 +50,9 @@ def check(
     try:
         with stages:
             stages("reading the task")
-            experiment = _check(config, overrides or [], stages, known)
+            resolved = _resolved(config, overrides or [])
+            experiment = resolved.experiment
+            _find_facts(resolved, stages, known)
     except BaseException as error:
         if not _is_interrupt(error):
             raise
@@ -66,25 +69,26 @@ def check(
     output.print(f"{'train':{NAMES}}{command}", soft_wrap=True)
 
 
-def _check(config: Path, overrides: list[str], report: Any, known: Any) -> str:
-    """Find the facts; the name of the experiment."""
+def _resolved(config: Path, overrides: list[str]) -> Any:
+    """The config, for one seed."""
     gc.disable()  # of what is imported now nothing is garbage, and looking for it takes a seventh of the time
     try:
-        import torch
-
-        from lyapnet.build import build_problem, parts_of
         from lyapnet.config import load_config
-        from lyapnet.training.build_learner import build_learner
-        from lyapnet.training.facts import facts_of
     finally:
         gc.enable()
-    resolved = load_config(config, overrides)
-    resolved.seeds = 1
-    torch.set_num_threads(resolved.training.threads)
-    parts = parts_of(resolved)
-    learner = build_learner(resolved, build_problem(resolved, parts).relaxed(), parts)
-    facts_of(learner, report, known)
-    return resolved.experiment
+    return dataclasses.replace(load_config(config, overrides), seeds=1)
+
+
+def _find_facts(config: Any, report: Any, known: Any) -> None:
+    import torch
+
+    from lyapnet.build import build_problem, parts_of
+    from lyapnet.training.build_learner import build_learner
+    from lyapnet.training.facts import facts_of
+
+    torch.set_num_threads(config.training.threads)
+    parts = parts_of(config)
+    facts_of(build_learner(config, build_problem(config, parts).relaxed(), parts), report, known)
 
 
 def print_fact(console: Console, fact: Any) -> None:

@@ -108,7 +108,7 @@ def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:
             return Fact("start", f"{found}, for the reason above")
         return Fact("start", f"{found}: {reason}", remedy)
     cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
-    return Fact("start", f"from {candidate.name}: {cost}, known after {candidate.seconds:.2g} s")
+    return Fact("start", f"from {candidate.name}: {cost}, known after {_seconds(candidate.seconds)} s")
 
 
 def _task(problem: Problem) -> Fact:
@@ -244,6 +244,10 @@ def _counted(number: int, what: str) -> str:
 
 def _listed(values: Tensor) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"
+
+
+def _seconds(seconds: float) -> str:
+    return f"{seconds:.0f}" if seconds >= 10 else f"{seconds:.2g}"
 
 
 def _modes_in_words(values: Tensor) -> str:

@@ -186,7 +186,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     for k in range(ROUNDS + 1):
-        again = f", once more where its law leads ({k} of at most {ROUNDS} times)" if k else ""
+        again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again}")
         _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)], progress)
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])

@@ -128,7 +128,7 @@ def choose_start(
         base = _best([each for each in trials.tried if each.name != CALM])
         for network in networks:
             take(network, problem, expansions[base.name], kept, x0)
-        progress = partial(report, f"whether the law of {base.name} can be improved")
+        progress = partial(report, f"improving on {base.name}")
         progress(0, FEW)
         if _can_be_improved(problem, expansions[base.name], x0[:FEW], progress):
             _fit_to_optima(learners, list(expansions.values()), calm, base, trials)

@@ -11,17 +11,20 @@ from typing import Any
 
 from omegaconf import MISSING, OmegaConf
 
-from lyapnet.constraints import CONSTRAINTS
-from lyapnet.cost import COSTS
-from lyapnet.networks import ACTIVATIONS, NETWORKS
-from lyapnet.policy import POLICIES
-from lyapnet.programs import PROGRAMS
-from lyapnet.rollout import GRADIENTS, METHODS
-from lyapnet.schema import check_values, checked, differences, option, read_yaml
-from lyapnet.sets import CONTROL_SETS
+from lyapnet.schema import Names, check_values, checked, differences, option, read_yaml
 from lyapnet.sizes import THREADS, check_sizes
-from lyapnet.systems import SYSTEMS
 
+# what is registered, without what registers it: a misspelt key is refused before torch is loaded
+CONSTRAINTS = Names("constraints", "CONSTRAINTS")
+COSTS = Names("cost", "COSTS")
+ACTIVATIONS = Names("networks", "ACTIVATIONS")
+NETWORKS = Names("networks", "NETWORKS")
+POLICIES = Names("policy", "POLICIES")
+PROGRAMS = Names("programs", "PROGRAMS")
+GRADIENTS = Names("rollout", "GRADIENTS")
+METHODS = Names("rollout", "METHODS")
+CONTROL_SETS = Names("sets", "CONTROL_SETS")
+SYSTEMS = Names("systems", "SYSTEMS")
 SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
 
@@ -51,7 +54,10 @@ class ProgramConfig:
     """What is minimised; see Program for the loss and its units."""
 
     name: str = option(
-        MISSING, "A registered program, or module:Class of your own.", choices=tuple(PROGRAMS), user_class=True
+        MISSING,
+        "A registered program, or module:Class of your own.",
+        choices=PROGRAMS,
+        user_class=True,
     )
     constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
     terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
@@ -92,7 +98,10 @@ class SystemConfig:
     """The dynamics ẋ = f(x) + g(x)u."""
 
     name: str = option(
-        MISSING, "A registered system, or module:Class of your own.", choices=tuple(SYSTEMS), user_class=True
+        MISSING,
+        "A registered system, or module:Class of your own.",
+        choices=SYSTEMS,
+        user_class=True,
     )
     parameters: dict[str, Any] = option({}, "Arguments of its constructor, in SI units.")
 
@@ -101,7 +110,7 @@ class SystemConfig:
 class CostConfig:
     """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (one number: repeated), rows are a matrix."""
 
-    name: str = option("quadratic", "quadratic, or module:Class of your own.", choices=tuple(COSTS), user_class=True)
+    name: str = option("quadratic", "quadratic, or module:Class of your own.", choices=COSTS, user_class=True)
     Q: Any = option(None, "State weight, symmetric positive semidefinite.")
     R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
     Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
@@ -118,7 +127,7 @@ class ControlsConfig:
     lower: Any = option(None, "Least controls: a number, or one for each; null: no limit.")
     upper: Any = option(None, "Greatest controls, likewise.")
     name: str = option(
-        "unbounded", "A registered control set, or module:Class of your own.", choices=tuple(CONTROL_SETS),
+        "unbounded", "A registered control set, or module:Class of your own.", choices=CONTROL_SETS,
         user_class=True,
     )  # fmt: skip
     parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
@@ -133,7 +142,7 @@ class ConstraintsConfig:
     outside: list[dict[str, Any]] = option([], "Balls to stay out of, each as {center: {state: …}, radius: …}.")
     inside: list[dict[str, Any]] = option([], "Balls to stay in, likewise.")
     name: str = option(
-        "listed", "listed: those above; or module:Class of your own, besides.", choices=tuple(CONSTRAINTS),
+        "listed", "listed: those above; or module:Class of your own, besides.", choices=CONSTRAINTS,
         user_class=True,
     )  # fmt: skip
     parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
@@ -162,10 +171,13 @@ class NetworkConfig:
     """V(t, x). Fields left at null take the network's own default."""
 
     name: str = option(
-        "expansion", "A registered network, or module:Class of your own.", choices=tuple(NETWORKS), user_class=True
+        "expansion",
+        "A registered network, or module:Class of your own.",
+        choices=NETWORKS,
+        user_class=True,
     )
     hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
-    activation: str | None = option(None, "A smooth activation.", choices=tuple(ACTIVATIONS))
+    activation: str | None = option(None, "A smooth activation.", choices=ACTIVATIONS)
     ignored_states: list[str] = option([], "Names of states on which V does not depend.")
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
@@ -181,7 +193,7 @@ class NetworkConfig:
 class RolloutConfig:
     """How the closed loop is integrated and differentiated; see Rollout."""
 
-    policy: str = option("hjb", "The control law that V defines.", choices=tuple(POLICIES))
+    policy: str = option("hjb", "The control law that V defines.", choices=POLICIES)
     method: str = option("euler", "The integrator.", choices=METHODS)
     gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
     compile: str = option(
@@ -287,6 +299,17 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     return config_from_plain({"experiment": Path(path).stem, **content}, overrides)
 
 
+def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The config of a YAML file with its keys and types checked, and the values of its horizon: known without torch.
+
+    Raises:
+        UsageError: as load_config, for these.
+    """
+    config = checked(Config, {**STANDARD, "experiment": Path(path).stem, **read_yaml(path, Config)}, overrides)
+    check_values(config.horizon, "horizon.")
+    return config
+
+
 def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
     """The config of plain nested dictionaries, checked like a file.
 
@@ -317,7 +340,9 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     if program in ("value", "region") and gradient == "discrete" and limited:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
-    known = PROGRAMS.get(program)
+    from lyapnet import programs  # loads torch
+
+    known = programs.PROGRAMS.get(program)
     weights = {} if known is None else known.recommended
     return {**content, **standard, "program": {**weights, **standard["program"]}}
 

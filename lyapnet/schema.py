@@ -8,6 +8,8 @@ import operator
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
+from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -17,6 +19,23 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from lyapnet.errors import UsageError, did_you_mean, one_line
 from lyapnet.files import LARGEST_TEXT, read_file
+
+
+class Names(Sequence[str]):
+    """The names of a registry of lyapnet, which is loaded, with torch, when they are first asked for."""
+
+    def __init__(self, home: str, registry: str):
+        self._home, self._registry = home, registry
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
+        return tuple(getattr(import_module(f"lyapnet.{self._home}"), self._registry))
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._names[index]
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 def option(
@@ -33,7 +52,7 @@ def option(
     """A field with its sentence and the values it admits; `user_class` also admits module:Class, and `folder` only what
     does not leave the folder that it is in."""
     bounds = {">": above, "≥": at_least, "<": below}
-    rule = {"doc": doc, "choices": tuple(choices), "user_class": user_class, "folder": folder, "bounds": bounds}
+    rule = {"doc": doc, "choices": choices, "user_class": user_class, "folder": folder, "bounds": bounds}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=rule)
     return field(default=default, metadata=rule)

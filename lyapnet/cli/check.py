@@ -19,7 +19,16 @@ from lyapnet.errors import Interrupted
 
 NAMES = 14  # columns for the names of facts
 WIDEST = 120
-ORDER = ("task", "goal", "modes", "controllable", "stiffness", "start")  # in which facts become known
+ORDER = (
+    "horizon",
+    "X₀",
+    "system",
+    "goal",
+    "modes",
+    "controllable",
+    "stiffness",
+    "start",
+)  # in which facts become known
 
 
 def check(
@@ -50,9 +59,8 @@ def check(
     try:
         with stages:
             stages("reading the task")
-            resolved = _resolved(config, overrides or [])
-            experiment = resolved.experiment
-            _find_facts(resolved, stages, known)
+            experiment = _tell_what_is_written(config, overrides or [], known)
+            _find_facts(config, overrides or [], stages, known)
     except BaseException as error:
         if not _is_interrupt(error):
             raise
@@ -69,26 +77,33 @@ def check(
     output.print(f"{'train':{NAMES}}{command}", soft_wrap=True)
 
 
-def _resolved(config: Path, overrides: list[str]) -> Any:
-    """The config, for one seed."""
+def _tell_what_is_written(config: Path, overrides: list[str], known: Any) -> str:
+    """Tell the facts that need no torch; the name of the experiment."""
+    from lyapnet.config import outline
+    from lyapnet.training.fact import facts_of_config
+
+    written = outline(config, overrides)
+    for fact in facts_of_config(written):
+        known(fact)
+    return written.experiment
+
+
+def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> None:
+    """Tell the facts of the problem and of its start."""
     gc.disable()  # of what is imported now nothing is garbage, and looking for it takes a seventh of the time
     try:
+        import torch
+
+        from lyapnet.build import build_problem, parts_of
         from lyapnet.config import load_config
+        from lyapnet.training.build_learner import build_learner
+        from lyapnet.training.facts import facts_of
     finally:
         gc.enable()
-    return dataclasses.replace(load_config(config, overrides), seeds=1)
-
-
-def _find_facts(config: Any, report: Any, known: Any) -> None:
-    import torch
-
-    from lyapnet.build import build_problem, parts_of
-    from lyapnet.training.build_learner import build_learner
-    from lyapnet.training.facts import facts_of
-
-    torch.set_num_threads(config.training.threads)
-    parts = parts_of(config)
-    facts_of(build_learner(config, build_problem(config, parts).relaxed(), parts), report, known)
+    resolved = dataclasses.replace(load_config(config, overrides), seeds=1)
+    torch.set_num_threads(resolved.training.threads)
+    parts = parts_of(resolved)
+    facts_of(build_learner(resolved, build_problem(resolved, parts).relaxed(), parts), report, known)
 
 
 def print_fact(console: Console, fact: Any) -> None:

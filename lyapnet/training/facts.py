@@ -3,7 +3,6 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +22,7 @@ from lyapnet.linearisation import (
 )
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
+from lyapnet.training.fact import Fact, listed
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
@@ -33,14 +33,6 @@ REACHED = 1e-9  # of A, with states and controls in units of their own, above wh
 ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
 VANISHING = 1e-3  # of what q and φ are on X₀, below which they vanish at the goal
 TRIED = 256  # states of X₀ for that
-
-
-class Fact(NamedTuple):
-    """A line: what it is about, what was found, and what to do where that is a reason to."""
-
-    name: str
-    found: str
-    advice: str = ""
 
 
 def facts_of(
@@ -112,15 +104,14 @@ def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:
 
 
 def _task(problem: Problem) -> Fact:
-    horizon, system, controls = problem.horizon, problem.system, problem.controls
+    system, controls = problem.system, problem.controls
     limits = ""
     if controls.limited:
         sides = None if controls.limits is None else [_listed(side.expand(system.m)) for side in controls.limits]
         limits = f" in {type(controls).__name__}" if sides is None else f" between {sides[0]} and {sides[1]}"
     return Fact(
-        "task",
-        f"{system.title}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}; "
-        f"T = {horizon.duration:g} s in {_counted(horizon.steps, 'step')}",
+        "system",
+        f"{system.title}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}",
     )
 
 
@@ -243,7 +234,7 @@ def _counted(number: int, what: str) -> str:
 
 
 def _listed(values: Tensor) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"
+    return listed(values.tolist())
 
 
 def _seconds(seconds: float) -> str:

@@ -58,7 +58,7 @@ def test_modes_and_controllability():
 
 def test_limits_and_what_they_do_not_admit():
     task = linear([[0, 1], [0, 0]], [[0], [1]], controls={"lower": -1, "upper": 2})
-    assert "1 control between (-1) and (2)" in facts(task)["task"].found
+    assert "1 control between (-1) and (2)" in facts(task)["system"].found
     assert facts(task)["goal"].found == "an equilibrium without control"
     away = facts({**task, "controls": {"lower": 1, "upper": 2}})
     assert away["goal"].found == "u = (0) is beyond its limits"
@@ -149,13 +149,15 @@ def test_the_command(tmp_path, capsys):
     path.write_text(yaml.safe_dump(TASK))
     assert main(["check", str(path)]) == 0
     shown = capsys.readouterr().out
-    assert shown.startswith("mine.yaml, before training\ntask          Pendulum: 2 states")
+    assert shown.startswith("mine.yaml, before training\nhorizon       T = 1 s in 20 steps of 0.05 s\n")
     assert f"lyapnet train --config {path}" in shown
     assert main(["check", str(path), "horizon.steps=10", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["experiment"] == "mine"
     assert report["complete"]
-    assert report["facts"][0]["found"].endswith(": 2 states, 1 control; T = 0.5 s in 10 steps")
+    assert [fact["found"] for fact in report["facts"][:3]] == [
+        "T = 0.5 s in 10 steps of 0.05 s", "between (-0.5, -0.5) and (0.5, 0.5)", "Pendulum: 2 states, 1 control",
+    ]  # fmt: skip
     assert report["facts"][-1]["found"] == "training starts from 12 optima from states of X₀"
     assert main(["check", str(path), "network.name=fcn", "--json"]) == 0
     assert "expansion" in json.loads(capsys.readouterr().out)["facts"][-1]["advice"]

@@ -51,7 +51,7 @@ def test_every_config(path):
         return
     config.seeds = 1
     names = [fact.name for fact in facts_before_optima(config)]
-    assert names[:4] == ["task", "goal", "modes", "controllable"]
+    assert names[:4] == ["system", "goal", "modes", "controllable"]
     assert "stiffness" in names
 
 
@@ -147,7 +147,7 @@ def test_tasks_of_other_kinds(kind):
 def test_a_cost_without_rest_has_no_goal():
     config = config_of(cost={"name": "own:Profit"})
     told = facts_before_optima(config, Parts(system=STIFF, cost=Profit()))
-    assert [fact.name for fact in told] == ["task", "goal"]
+    assert [fact.name for fact in told] == ["system", "goal"]
     assert "none: φ is 3, of slope (-1, 0), at the origin" in told[-1].found
 
 
@@ -186,7 +186,7 @@ def test_an_interrupt_leaves_the_facts(tmp_path):
     lines = shown.splitlines()
     assert lines[0] == "long.yaml, before training"
     assert [line.split()[0] for line in lines if not line.startswith(" ")][1:] == [
-        "task", "goal", "modes", "controllable", "stiffness", "start",
+        "horizon", "X₀", "system", "goal", "modes", "controllable", "stiffness", "start",
     ]  # fmt: skip
     assert max(map(len, lines)) <= 80
     *stages, last = notes.splitlines()
@@ -210,7 +210,7 @@ def test_an_interrupt_leaves_one_json_object(tmp_path, capfd, monkeypatch):
 
 def test_a_failure_of_linear_algebra_is_a_fact(monkeypatch):
     def fails(*arguments, **options):
-        return torch.linalg.eigh(torch.full((2, 2), torch.nan))
+        raise torch.linalg.LinAlgError("linalg.eigh: it failed to converge")
 
     monkeypatch.setattr("lyapnet.training.start.optimal_trajectories", fails)
     config = config_of(lower=[1, 0], upper=[2, 1])

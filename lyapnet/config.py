@@ -305,7 +305,10 @@ def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UsageError: as load_config, for these.
     """
-    config = checked(Config, {**STANDARD, "experiment": Path(path).stem, **read_yaml(path, Config)}, overrides)
+    content = {"experiment": Path(path).stem, **read_yaml(path, Config)}
+    given = {key: content.get(key, {}) for key in STANDARD}
+    standard = {key: {**STANDARD[key], **section} for key, section in given.items() if isinstance(section, Mapping)}
+    config = checked(Config, {**content, **standard}, overrides)
     check_values(config.horizon, "horizon.")
     return config
 

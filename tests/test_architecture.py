@@ -149,6 +149,12 @@ def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
     assert heavy & loaded("import lyapnet.evaluation.figures") == {"torch", "matplotlib"}
 
 
+def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning():
+    assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.config")
+    slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
+    assert not slow & loaded("import lyapnet.build, lyapnet.training.build_learner, lyapnet.training.facts")
+
+
 def test_training_loads_neither_bench_nor_comparison():
     found = loaded("import lyapnet", "lyapnet.train")
     assert "lyapnet.training.experiment" in found

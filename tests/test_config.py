@@ -11,7 +11,7 @@ import yaml
 from omegaconf import MISSING
 
 from lyapnet.build import build_problem
-from lyapnet.config import STANDARD, Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.config import STANDARD, Config, config_from_plain, load_config, outline, to_plain, to_yaml
 from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram
 from lyapnet.training.build import build_module
@@ -393,6 +393,21 @@ def test_a_number_stands_for_a_list_of_one(plain):
     assert problem.initial_states.lower.tolist() == [-2, -2]
     assert problem.initial_states.upper.tolist() == [1, 1]
     assert problem.goal.tolist() == [0, 0]
+
+
+def test_an_outline_has_what_is_written(tmp_path, plain):
+    path = tmp_path / "outlined.yaml"
+    path.write_text(yaml.safe_dump({**plain, "program": {"margin": 0.5}}), encoding="utf-8")
+    written = outline(path, ["horizon.steps=7"])
+    assert written.horizon.steps == 7
+    assert written.program.margin == 0.5
+    assert written.initial_states == load_config(path).initial_states
+    for override, words in (
+        ("horizon.stepz=7", "did you mean horizon.steps"),
+        ("horizon.steps=0", "horizon.steps ≥ 1"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            outline(path, [override])
 
 
 def test_one_key_of_the_trainer_section_keeps_the_others(plain):

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from rich.console import Console
 from rich.text import Text
 
-QUIET = 5.0  # seconds after which a log without a terminal has another line
+QUIET = 8.0  # seconds after which a log without a terminal has another line
 
 
 @runtime_checkable

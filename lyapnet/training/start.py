@@ -74,15 +74,16 @@ class Start(NamedTuple):
 
     def __str__(self) -> str:
         others = "; ".join(self._beside(other) for other in self.candidates if other != self.chosen)
-        finite = "" if self.chosen.finite == 1 else f", {_shown(self.chosen)} of X₀"
-        return f"start: {self.chosen.name}, the cheapest of {len(self.candidates)}{finite}" + (
-            others and f" ({others})"
-        )
+        finite = "" if self.chosen.finite == 1 else f", {format_cost(self.chosen)} of X₀"
+        tried = sum(each.missing is None for each in self.candidates)
+        return f"start: {self.chosen.name}, the cheapest of {tried}{finite}" + (others and f" ({others})")
 
     def _beside(self, other: Candidate) -> str:
-        """A candidate against the chosen one: a ratio, as the states are not those of which a training tells costs."""
+        """What is said of a candidate that was not chosen: a ratio, as other states than these are told costs of."""
+        if other.missing is not None:
+            return f"no {other.name.removeprefix('the ')}: {other.missing.reason}"
         if other.finite < 1 or not 0 < self.chosen.cost < math.inf:
-            return f"{other.name}: {_shown(other)}"
+            return f"{other.name}: {format_cost(other)}"
         return f"{other.name}: {other.cost / self.chosen.cost:.4g} times its cost"
 
     def as_json(self) -> dict[str, Any]:
@@ -382,7 +383,6 @@ def _kept(learner: Learner) -> list[int]:
     return kept_states(learner.V, learner.problem.system.n)
 
 
-def _shown(candidate: Candidate) -> str:
-    if candidate.missing is not None:
-        return f"none ({candidate.missing.reason})"
+def format_cost(candidate: Candidate) -> str:
+    """A mean cost, or on what share of the states it is not finite."""
     return f"{candidate.cost:.4g}" if candidate.finite == 1 else f"not finite on {1 - candidate.finite:.0%}"

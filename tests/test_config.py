@@ -397,15 +397,13 @@ def test_a_number_stands_for_a_list_of_one(plain):
 
 def test_an_outline_has_what_is_written(tmp_path, plain):
     path = tmp_path / "outlined.yaml"
-    path.write_text(yaml.safe_dump({**plain, "program": {"margin": 0.5}}), encoding="utf-8")
-    written = outline(path, ["horizon.steps=7"])
-    assert written.horizon.steps == 7
-    assert written.program.margin == 0.5
-    assert written.initial_states == load_config(path).initial_states
-    for override, words in (
-        ("horizon.stepz=7", "did you mean horizon.steps"),
-        ("horizon.steps=0", "horizon.steps ≥ 1"),
-    ):
+    task = {key: plain[key] for key in ("system", "cost", "initial_states", "horizon")}
+    path.write_text(yaml.safe_dump({**task, "program": {"constraint": 0.5}}), encoding="utf-8")
+    written, whole = outline(path, ["horizon.steps=7"]), load_config(path, ["horizon.steps=7"])
+    assert written.horizon == whole.horizon
+    assert written.program.constraint == whole.program.constraint == 0.5
+    assert written.initial_states == whole.initial_states
+    for override, words in (("horizon.stepz=7", "did you mean horizon.st"), ("horizon.steps=0", "horizon.steps ≥ 1")):
         with pytest.raises(UsageError, match=words):
             outline(path, [override])
 

@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import json
 import shlex
+import signal
 import sys
 import textwrap
 import time
@@ -15,20 +16,12 @@ from rich.console import Console
 from rich.text import Text
 
 from lyapnet.cli.options import Debug
-from lyapnet.errors import Interrupted
+from lyapnet.errors import Interrupted, signals_taken
 
 NAMES = 14  # columns for the names of facts
 WIDEST = 120
-ORDER = (
-    "horizon",
-    "X₀",
-    "system",
-    "goal",
-    "modes",
-    "controllable",
-    "stiffness",
-    "start",
-)  # in which facts become known
+# names of facts in the order in which they become known
+ORDER = ("horizon", "X₀", "system", "goal", "modes", "controllable", "stiffness", "start")
 
 
 def check(
@@ -46,9 +39,15 @@ def check(
     output = Console(highlight=False, markup=False)
     notes = Console(file=sys.stderr, highlight=False, markup=False)
     shown = output if output.is_terminal and not as_json else notes
-    facts, began = list[Any](), time.monotonic()
+    facts, began, stops = list[Any](), time.monotonic(), list[Interrupted]()
+
+    def stop(number: int, frame: Any) -> None:
+        stops.append(Interrupted(signal.Signals(number).name, 130))
+        raise stops[-1]
 
     def known(fact: Any) -> None:
+        if stops:  # a module that was being imported kept it to itself
+            raise stops[-1]
         facts.append(fact)
         if not as_json:
             print_fact(output, fact)
@@ -57,12 +56,12 @@ def check(
         output.print(Text(f"{config.name}, before training", "bold"), soft_wrap=True)
     stages, experiment = Stages(shown, "check"), config.stem
     try:
-        with stages:
+        with signals_taken(stop), stages:
             stages("reading the task")
             experiment = _tell_what_is_written(config, overrides or [], known)
             _find_facts(config, overrides or [], stages, known)
     except BaseException as error:
-        if not _is_interrupt(error):
+        if not stops and not isinstance(error, Interrupted):
             raise
         if as_json:
             _print_json(experiment, facts, _not_reached(facts))
@@ -115,11 +114,6 @@ def print_fact(console: Console, fact: Any) -> None:
     for line in lines:
         console.print(Text(f"{name:{NAMES}}", "bold").append(line, "not bold"), soft_wrap=True)
         name = ""
-
-
-def _is_interrupt(error: BaseException) -> bool:
-    """Whether an error is Ctrl-C, or what an import made of it, as __set_name__ does."""
-    return isinstance(error, Interrupted) or isinstance(error.__cause__ or error.__context__, Interrupted)
 
 
 def _not_reached(facts: list[Any]) -> list[str]:

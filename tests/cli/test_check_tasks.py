@@ -1,5 +1,6 @@
 """lyapnet check on every config and on tasks of other kinds: what it says before the first optimum is sought."""
 
+import contextlib
 import json
 import math
 import signal
@@ -206,6 +207,21 @@ def test_an_interrupt_leaves_one_json_object(tmp_path, capfd, monkeypatch):
     assert report["not_reached"] == ["the best start"]
     assert [fact["fact"] for fact in report["facts"]][-2:] == ["stiffness", "start"]
     assert "Stopped after" in shown.err.splitlines()[-1]
+
+
+def test_an_interrupt_that_an_import_keeps_to_itself_counts(tmp_path, capfd, monkeypatch):
+    def keeps(*arguments):
+        with contextlib.suppress(BaseException):
+            signal.raise_signal(signal.SIGINT)
+        return load_config(*arguments)
+
+    path = tmp_path / "short.yaml"
+    path.write_text(yaml.safe_dump(LONG))
+    monkeypatch.setattr("lyapnet.config.load_config", keeps)
+    assert main(["check", str(path)]) == 130
+    shown = capfd.readouterr()
+    assert shown.out.splitlines()[1].startswith("horizon ")
+    assert "not reached: system, goal, modes" in shown.err
 
 
 def test_a_failure_of_linear_algebra_is_a_fact(monkeypatch):

@@ -32,7 +32,7 @@ def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
     x0, expansions, batches = problem.initial_states.sample(9), [riccati(problem)], []
     expected = optima_for(problem, expansions, x0)
 
-    def counted(problem, x0, u):
+    def counted(problem, x0, u, **progress):
         batches.append(len(x0))
         return optimal_trajectories(problem, x0, u)
 
@@ -54,10 +54,10 @@ def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without
     monkeypatch.setattr(optima, "FAR", 3)
     good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
-    def solve(states):
+    def solve(states, **progress):
         return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])
 
-    def spoiled(problem, x0, u):
+    def spoiled(problem, x0, u, **progress):
         batches.append(len(x0))
         return optimal_trajectories(problem, x0, u) if batches[1:] else optimal_trajectories(problem, x0, 0 * u, 0)
 
@@ -75,7 +75,7 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     expected = optima_for(problem, expansions, x0).path.cost
     begun = []
 
-    def spoiled(problem, x0, u):
+    def spoiled(problem, x0, u, **progress):
         found = optimal_trajectories(problem, x0, u)
         if begun:
             return found

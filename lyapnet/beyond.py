@@ -118,8 +118,6 @@ class Regulator(nn.Module):
         super().__init__()
         if problem.system.constants:
             raise ValueError(f"Expected a single problem for {purpose}, got a family; {instead} or receding.")
-        from scipy.linalg import solve_discrete_are  # loaded where it is asked for: it takes a tenth of a second
-
         exact = in_float64(problem)
         x, u = exact.goal, exact.rest
         if float(exact.system.dynamics(x, u).abs().max()) > 1e-6:
@@ -129,19 +127,19 @@ class Regulator(nn.Module):
         (Q, S), (_, R) = (
             [np.asarray(part) / 2 for part in row] for row in hessian(lambda *z: exact.step(*z)[1], (x, u))
         )
-        try:
-            P, K = _stabilising(A, B, Q, S, R)
-        except (ValueError, np.linalg.LinAlgError) as error:
-            Q_T = np.asarray(hessian(exact.cost.terminal, x)) / 2
+        of_end = np.asarray(hessian(exact.cost.terminal, x)) / 2 / exact.horizon.steps
+        reason: Exception | None = None
+        for weights in (Q, Q + of_end) if spread else (Q,):
             try:
-                if not spread:
-                    raise
-                P, K = _stabilising(A, B, Q + Q_T / exact.horizon.steps, S, R)
-            except (ValueError, np.linalg.LinAlgError):
-                raise ValueError(
-                    f"Expected a goal that a linear law stabilises, and a cost q that sees every mode which does not "
-                    f"decay, for {purpose}, got others ({error}); give Q more weights, or {instead}."
-                ) from error
+                P, K = _stabilising(A, B, weights, S, R)
+                break
+            except (ValueError, np.linalg.LinAlgError) as error:
+                reason = error
+        else:
+            raise ValueError(
+                f"Expected a goal that a linear law stabilises, and a cost q that sees every mode which does not "
+                f"decay, for {purpose}, got others ({reason}); give Q more weights, or {instead}."
+            ) from reason
         self.problem = problem
         self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
         self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
@@ -166,6 +164,8 @@ def _stabilising(
     if not counts.any():
         raise ValueError("no state has a part in it")
     A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
+    from scipy.linalg import solve_discrete_are  # loaded where it is asked for: it takes a tenth of a second
+
     P = solve_discrete_are(A, B, Q, R, s=S)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
     slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())

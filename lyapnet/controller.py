@@ -89,9 +89,9 @@ class Controller:
         self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient="backprop")
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
-        policy = self.closed_loop.policy
-        assert isinstance(policy, ValuePolicy)  # as it has a V
-        self._continued = ContinuedPolicy(problem, policy, beyond)
+        law = self.closed_loop.policy
+        assert isinstance(law, ValuePolicy)  # as it has a V
+        self._continued = ContinuedPolicy(problem, law, beyond)
 
     @property
     def config(self) -> Config:

@@ -16,6 +16,7 @@ from torch.func import vmap
 from lyapnet.graphs import elementary_functions, taylor
 from lyapnet.graphs.bound_rules import ARRANGEMENTS, OF_SHAPE, RULES
 from lyapnet.graphs.bounds import BoundedFunction
+from lyapnet.graphs.rounding import ROUNDED
 from lyapnet.graphs.taylor import box_form
 
 aten = torch.ops.aten
@@ -146,6 +147,8 @@ CASES = {
     aten.index_put.default: (
         lambda a, b, c: aten.index_put(pair(a, b), [torch.tensor([1, 1])], pair(a, c), True)[1],
         lambda a, b, c: a + b + c),
+    ROUNDED: (  # any result within θ of a is to lie within the bounds
+        lambda a, b, c: ROUNDED(a, b, 2**-24, 1e-45, 3e38), lambda a, b, c: a * (1 + mpmath.mpf(2)**-24)),
 }  # fmt: skip
 CHAINED = [
     aten.relu.default, aten.mul.Tensor, aten.div.Tensor, aten.exp.default, aten.log.default, aten.sqrt.default,
@@ -239,8 +242,8 @@ def points_in(lower, upper, seed, points=4):
 def outside(names, seed, most=30):
     """Of cases, by name: the values outside of their bounds, those held against them, and those of 60 digits.
 
-    A value that does not exist, as log −1, lies outside of all bounds but infinite ones; but of a chain, of which a
-    comparison may make a truth again, such points are left out.
+    A value that does not exist, as log −1, lies outside of all bounds but infinite ones. Of a chain, in which a
+    comparison makes a truth of such a value again, what torch has counts.
     """
     lower, upper = boxes_of_every_magnitude(BOXES, seed)
     points = points_in(lower, upper, seed)
@@ -261,19 +264,21 @@ def outside(names, seed, most=30):
             point, box = divmod(at, len(lower))
             if known[box]:
                 exact[name] += 1
-                ends = float(low[box]), float(high[box])
-                found[name] += not is_within(true, points[point, box].tolist(), *ends, undefined=" > " in name)
+                value = value_of(true, points[point, box].tolist())
+                if value is None and " > " in name:
+                    value = float(torch_function(*points[point, box]))
+                found[name] += value is None or not float(low[box]) <= value <= float(high[box])
     return found, tried, exact
 
 
-def is_within(function, point, low, high, undefined):
-    """Whether a value of 60 digits lies within bounds; `undefined` where there is none."""
+def value_of(function, point):
+    """A value of 60 digits; None where there is none."""
     with mpmath.workdps(60):
         try:
             value = function(*map(mpmath.mpf, point))
         except (ZeroDivisionError, ValueError, TypeError):  # the last of comparing complex numbers
-            return undefined
-        return undefined if isinstance(value, mpmath.mpc) else low <= value <= high
+            return None
+        return None if isinstance(value, mpmath.mpc) else value
 
 
 def test_every_rule_has_a_case():

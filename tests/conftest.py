@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import logging
 import os
 
 os.environ["MPLBACKEND"] = "Agg"
@@ -60,6 +61,7 @@ from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
 from tests.problems import Quadratic  # noqa: E402
 
 torch.set_num_threads(1)
+logging.getLogger("torch.__trace").disabled = True  # no reader of logs in a test wants what torch writes of a trace
 torch.set_warn_always(True)  # else a warning, an error here, would be raised by the first test that earns it only
 hypothesis.settings.register_profile("lyapnet", database=None, derandomize=True, deadline=None, max_examples=30)
 hypothesis.settings.load_profile("lyapnet")

@@ -248,7 +248,7 @@ def gain_over_step(problem: Problem, V: ValueFunction) -> float:
     for t in (times[0], times[len(times) // 2], times[-2]):
         with torch.enable_grad():
             z = x.detach().requires_grad_()
-            g = problem.system.g(z).detach()
+            g = problem.system.g(x)
             bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1].to(g)), z).detach()
         weighted = torch.linalg.solve(problem.cost.R(x).to(bent), multiply(bent, g.to(bent))).nan_to_num()
         greatest = max(greatest, problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max()))

@@ -22,7 +22,7 @@ from lyapnet.certification.kept_proofs import FORMAT, read_proofs, write_proofs
 from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.cli import main
 from lyapnet.files import appending
-from lyapnet.importing.onnx_function import read_onnx
+from lyapnet.importing.onnx_file import read_onnx
 from tests.importing.models import linear, onnx
 
 SECONDS = 2.0  # of this process, which other work of the machine does not lengthen

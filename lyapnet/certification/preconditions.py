@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.certification.condition import DecreaseCondition, OwnOperations, own_constraints
-from lyapnet.contracts import Memory, called, check_batch_sizes, check_function, check_memory, reaches_own_code
+from lyapnet.contracts import Memory, called, check_function, check_memory, reaches_own_code
+from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS

@@ -1,10 +1,9 @@
 """The gates for what others wrote: functions of each state alone, in batches of every size, that remember nothing."""
 
-from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.contracts.functions import called, check_function, copied, initialised, remedy
 from lyapnet.contracts.memory import Memory, check_memory, differences, reaches_own_code, state_of
 
 __all__ = [
-    "Memory", "called", "check_batch_sizes", "check_function", "check_memory", "copied", "differences",
+    "Memory", "called", "check_function", "check_memory", "copied", "differences",
     "initialised", "reaches_own_code", "remedy", "state_of",
 ]  # fmt: skip

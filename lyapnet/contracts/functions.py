@@ -11,7 +11,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.contracts.memory import reaches_own_code
 from lyapnet.errors import UsageError, raised
 
@@ -82,6 +81,8 @@ def check_function(
             "choose an X₀ that avoids this state."
         )
     if any_size and reaches_own_code(function):
+        from lyapnet.contracts.batch_sizes import check_batch_sizes  # loads sympy: a second
+
         check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
     _check_each_for_itself(name, function, arguments, value)
     if differentiable:

@@ -9,7 +9,8 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config
-from lyapnet.contracts import called, check_batch_sizes, check_memory, copied, reaches_own_code
+from lyapnet.contracts import called, check_memory, copied, reaches_own_code
+from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.policy import ValuePolicy

@@ -80,7 +80,8 @@ class OnnxFunction(nn.Module):
         self.precision = " and ".join(NAMES[kind] for kind in sorted(kinds & NAMES.keys()))
 
     def forward(self, x: State) -> Tensor:
-        return self._of_one(x[0])[None] if len(x) == 1 else torch.vmap(self._of_one)(x)
+        is_one = isinstance(x.shape[0], int) and len(x) == 1  # a size without a value stands for many
+        return self._of_one(x[0])[None] if is_one else torch.vmap(self._of_one)(x)
 
     def _of_one(self, x: State) -> Tensor:
         x = x[None] if self.batched else x

@@ -88,7 +88,7 @@ def test_the_command(capsys, tmp_path):
     command = ["certify", "tube", str(tiny_checkpoint(tmp_path)), "--two-sided", "--beta", "0.8", "--delta", "0.5"]
     command += ["--set=-3:3,-4:4"]
     capsys.readouterr()
-    main([*command, "--seconds", "4", "--json", "--report", str(tmp_path / "r")])
+    main([*command, "--seconds", "8", "--json", "--report", str(tmp_path / "r")])
     result = json.loads(capsys.readouterr().out)
     assert result["kind"] == "tube"
     assert (result["beta"], result["delta"]) == (0.8, 0.5)

@@ -40,7 +40,7 @@ def certificate_table(title: str, result: Mapping[str, Any], labels: Mapping[str
 
 def certificate_rows(result: Mapping[str, Any], labels: Mapping[str, str]) -> list[tuple[str, str]]:
     """What the numbers of a claim are called, and the numbers; without those that are not known."""
-    known = {key: label for key, label in labels.items() if result.get(key) not in (None, [])}
+    known = {key: label for key, label in labels.items() if result.get(key) not in (None, [], {})}
     return [(label, _shown(key, result[key])) for key, label in known.items()]
 
 

@@ -8,15 +8,14 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lyapnet.config import Config, to_plain, to_yaml
 from lyapnet.training.curves import loggers_of_each
 
-# the paper's panels: constraint loss beside trajectory cost
-LAYOUT = {
-    "lyapnet": {
-        "constraint loss": ["Multiline", ["constraint_loss/train", "constraint_loss/val"]],
-        "trajectory cost": ["Multiline", ["trajectory_cost/train", "trajectory_cost/val"]],
-        "optimality gap and value error": ["Multiline", ["optimality_gap/val", "value_error/val"]],
-        "satisfied and decreasing": ["Multiline", ["satisfied_fraction/val", "falling_fraction/val"]],
-    }
+# a panel for each measure, a chart for each curve in it: TensorBoard gives all curves of a run one colour
+PANELS = {
+    "constraint loss": ("constraint_loss/train", "constraint_loss/val"),
+    "trajectory cost": ("trajectory_cost/train", "trajectory_cost/val"),
+    "optimality": ("optimality_gap/val", "value_error/val"),
+    "condition": ("satisfied_fraction/val", "falling_fraction/val"),
 }
+LAYOUT = {panel: {curve: ["Multiline", [curve]] for curve in curves} for panel, curves in PANELS.items()}
 
 
 class Dashboard(Callback):

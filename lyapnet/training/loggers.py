@@ -60,10 +60,11 @@ def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Log
 
 
 def take_back_after(run: Run, step: int | None) -> None:
-    """Remove from a run's folder what it logged after a step; everything, if it stands where it began.
+    """Remove from a run's folder what it logged after a step, everything if it stands where it began, and hparams.yaml.
 
     TensorBoard keeps all event files of a resumed run: the next one tells it what to purge.
     """
+    (run.folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(missing_ok=True)  # written anew, with what was changed
     if step is not None:
         MetricsFile(run.folder).drop_after(step)
         return
@@ -93,7 +94,9 @@ def _tensorboard(config: Config, run: Run, resumed_at: int | None) -> Logger:
     # have of it and of later ones; the mark of the first process makes the second one's count as a restart.
     first = 0 if resumed_at is None else resumed_at + 1
     folder = run.folder
-    return TensorBoardLogger(folder.parent, name="", version=folder.name, default_hp_metric=False, purge_step=first)
+    logger = TensorBoardLogger(folder.parent, name="", version=folder.name, default_hp_metric=False, purge_step=first)
+    logger.hparams = to_plain(config)  # what its first `save` writes to hparams.yaml
+    return logger
 
 
 def _wandb(config: Config, run: Run, resumed_at: int | None) -> Logger:

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
@@ -130,6 +131,7 @@ def test_run_tells_where_it_is_and_what_comes_next(reference):
     assert reference.errors.read_text() == ""
     for text in (f"step {STEPS}/{STEPS}", "cost / optimum", "logs/small/version_0", "tensorboard --logdir logs"):
         assert text in output
+    assert "resuming" not in output
     for command in ("lyapnet evaluate", "--finetune", 'lyapnet.load("'):
         assert command in output
 
@@ -187,8 +189,17 @@ def test_config_hyperparameters_and_layout_are_in_tensorboard(reference):
     assert {"cost_mean", "cost_ratio", "value_error", "satisfied_fraction"} <= final
     layout = Layout.FromString(values(reference.run, "custom_scalars__config__")[0])
     charts = [list(chart.multiline.tag) for category in layout.category for chart in category.chart]
-    assert charts[:2] == [[f"{name}/train", f"{name}/val"] for name in ("constraint_loss", "trajectory_cost")]
-    assert {tag for chart in charts for tag in chart} <= curves.keys()
+    assert charts[:2] == [["constraint_loss/train"], ["constraint_loss/val"]], "curves of one run share a colour"
+    assert {tag for (tag,) in charts} <= curves.keys()
+
+
+def test_hparams_file_has_the_config(reference, finished):
+    def written(desk):
+        return config_from_plain(yaml.safe_load((desk.run / "hparams.yaml").read_text()))
+
+    assert written(reference) == load_config(reference.run / "config.yaml")
+    assert finished.train("--resume", "last", "training.iterations=18", prepare=without_figures)[0] == 0
+    assert written(finished).training.iterations == 18
 
 
 def test_the_loss_falls(reference):
@@ -411,8 +422,9 @@ def test_resuming_a_finished_run_says_so(reference, ask):
 
 def test_raising_the_iterations_goes_on(finished):
     earlier = logged(finished.run)
-    status, _, _ = finished.train("--resume", "last", "training.iterations=21", prepare=without_figures)
+    status, output, _ = finished.train("--resume", "last", "training.iterations=21", prepare=without_figures)
     assert status == 0
+    assert f"resuming from step {STEPS} of 21 (logs/small/version_0/checkpoints/last.ckpt)\n" in output
     assert finished.runs == ["version_0"]
     assert read_checkpoint(finished.last)["global_step"] == 21
     curves = logged(finished.run)

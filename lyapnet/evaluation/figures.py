@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
 from lyapnet.constraints import StateLimits, parts_of
@@ -219,14 +220,22 @@ def value_slices(V: Value, problem: Problem) -> Figure:
         return figure
     first, second = (numpy_of(g) for g in region.grid)
     panels = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
-    for panel, t, value in zip(panels, times, values, strict=True):
-        surface = numpy_of(value).reshape(len(first), len(second)).T
-        filled = panel.contourf(first, second, surface, levels=12, cmap="cividis")
-        figure.colorbar(filled, ax=panel)
+    surfaces = [numpy_of(value).reshape(len(first), len(second)).T for value in values]
+    levels = _levels(np.stack(surfaces))
+    for panel, t, surface in zip(panels, times, surfaces, strict=True):
+        filled = panel.contourf(first, second, surface, levels=levels, cmap="cividis")
         panel.set_title("V(x)" if stationary else f"V(t, x) at t = {t:.2f} s", fontsize=9)
         panel.set_xlabel(system.state_labels[region.axes[0]])
     panels[0].set_ylabel(system.state_labels[region.axes[1]])
+    figure.colorbar(filled, ax=panels, label="V (cost)")
     return figure
+
+
+def _levels(values: np.ndarray) -> np.ndarray:
+    """Some 20 round levels from the least to the largest finite value: one scale for all panels."""
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    return MaxNLocator(20).tick_values(low, high if high > low else low + 1.0)
 
 
 def optimality(table: StateTable) -> Figure:

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from lyapnet.build import build_problem, build_rollout, build_value_function
@@ -93,6 +94,19 @@ def test_figures_are_drawn_with_units(drawing):
     states = {f"{name} ({unit})" for name, unit in zip(system.state_names, system.state_units, strict=True)}
     controls = {f"{name} ({unit})" for name, unit in zip(system.control_names, system.control_units, strict=True)}
     assert states | controls | {"time (s)"} <= labels(paths)
+
+
+def test_slices_of_V_share_one_labelled_scale(drawing):
+    _, problem, V, _ = drawing
+    figure = figures.value_slices(V, problem)
+    filled = [c for axes in figure.axes for c in axes.collections if isinstance(c, QuadContourSet)]
+    if not filled:
+        assert "V(t, x) (cost)" in labels(figure), "curves over one state share an axis"
+        return
+    assert len(filled) == 3
+    assert len({tuple(c.levels) for c in filled}) == 1
+    assert "V (cost)" in labels(figure)
+    assert len(figure.axes) == 4, "three panels, one colour bar"
 
 
 def test_a_stationary_V_is_drawn_once(drawing):

@@ -231,7 +231,7 @@ def value_slices(V: Value, problem: Problem) -> Figure:
     return figure
 
 
-def _levels(values: np.ndarray) -> np.ndarray:
+def _levels(values: np.ndarray) -> Sequence[float]:
     """Some 20 round levels from the least to the largest finite value: one scale for all panels."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)

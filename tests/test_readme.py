@@ -23,7 +23,8 @@ def commands(program: str, language_blocks: list[str] | None = None) -> list[lis
     """The arguments of every line of a bash block that calls the program, in the pages' order, none twice."""
     joined = [block.replace("\\\n", " ") for block in language_blocks or blocks("bash")]
     lines = [part.strip() for block in joined for line in block.splitlines() for part in line.split("&&")]
-    return [shlex.split(line.removeprefix(program)) for line in dict.fromkeys(lines) if line.startswith(program)]
+    found = [line.removeprefix(program) for line in dict.fromkeys(lines) if line.startswith(program)]
+    return [shlex.split(line, comments=True) for line in found]
 
 
 @pytest.fixture

@@ -231,11 +231,11 @@ def value_slices(V: Value, problem: Problem) -> Figure:
     return figure
 
 
-def _levels(values: np.ndarray) -> Sequence[float]:
+def _levels(values: np.ndarray) -> list[float]:
     """Some 20 round levels from the least to the largest finite value: one scale for all panels."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    return MaxNLocator(20).tick_values(low, high if high > low else low + 1.0)
+    return list(MaxNLocator(20).tick_values(low, high if high > low else low + 1.0))
 
 
 def optimality(table: StateTable) -> Figure:

@@ -9,6 +9,7 @@ import socket
 import sys
 import time
 import zipfile
+from contextlib import chdir
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,6 +65,9 @@ def _imported(tmp_path_factory):
 
     assert checking, experiment
     lyapnet.load(ZOO)
+    with chdir(tmp_path_factory.mktemp("first")):
+        Path("task.yaml").write_text(TASK)
+        assert main([argument.replace("FILE", "absent") for argument in READERS["onnx"]]) != 0
 
 
 @pytest.fixture

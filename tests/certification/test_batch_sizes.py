@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import nn
 
-from lyapnet.contracts import check_batch_sizes
+from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.errors import UsageError
 from tests.certification.test_false_attempts import Bowl, Paid, System, claim
 from tests.certification.test_memory import Law

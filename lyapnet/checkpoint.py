@@ -28,6 +28,7 @@ UNREADABLE = (
     pickle.UnpicklingError, zipfile.BadZipFile,
 )  # fmt: skip
 KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
+AFTER_HORIZON = "after_horizon"  # under KEY: the law after T that training found
 ZOO = Path(__file__).parent / "zoo"  # the controllers that come with lyapnet, NAME.ckpt with NAME.json
 DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.3
 
@@ -233,6 +234,16 @@ def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
             f"Expected to write checkpoint {str(path)!r}, got {error.strerror}; make room and continue with --resume "
             f"last: {'the previous checkpoint is untouched' if Path(path).exists() else 'there is no earlier one yet'}."
         ) from error
+
+
+def note_in_checkpoint(path: str | Path, **notes: Any) -> None:
+    """Add plain data to what a checkpoint file says of itself, beside its config.
+
+    Raises:
+        CheckpointError: it cannot be read, or not be written; then it is untouched.
+    """
+    content = read_checkpoint(path)
+    write_checkpoint({**content, KEY: {**content[KEY], **notes}}, path)
 
 
 def _words(error: Exception) -> str:

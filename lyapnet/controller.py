@@ -10,6 +10,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from lyapnet.after_horizon import AfterHorizon, choose_law
 from lyapnet.beyond import ContinuedPolicy, LaterPolicy, slack
 from lyapnet.build import Parts, build_problem, build_rollout, member
 from lyapnet.calculus import ValueFunction
@@ -59,6 +60,7 @@ class Controller:
         beyond: str | None = None,
         parts: Parts | None = None,
         policy: type[ValuePolicy] | None = None,
+        after_horizon: AfterHorizon | None = None,
     ):
         """A controller of parts.
 
@@ -71,10 +73,12 @@ class Controller:
             rollout: the closed loop of V; None: that of its law.
             program: what V was trained for, and so what a certificate asks of it; None: the value program.
             config: of the run that trained it, where there was one.
-            beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load.
+            beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load; None: the first of riccati,
+                receding and hold that holds closed loops at the goal, tried when it is first asked for.
             parts: the user's own parts that stood in the place of the config's.
             policy: the control law of V, where no rollout has one; None: the one that V is made for, and the HJB law
                 where nobody knows, with a note if that matters.
+            after_horizon: what an earlier choice of the law after T found.
 
         Raises:
             UsageError: V says that it is made for what is no control law.
@@ -91,7 +95,8 @@ class Controller:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
         law = self.closed_loop.policy
         assert isinstance(law, ValuePolicy)  # as it has a V
-        self._continued = ContinuedPolicy(problem, law, beyond)
+        self._after_horizon = after_horizon
+        self._continued = ContinuedPolicy(problem, law, beyond, self.after_horizon, noted=after_horizon is not None)
 
     @property
     def config(self) -> Config:
@@ -153,6 +158,18 @@ class Controller:
     def law(self) -> ContinuedPolicy:
         """u(t, x) for all t ≥ 0 as a module, with its V."""
         return self._continued
+
+    def after_horizon(self) -> AfterHorizon:
+        """The law after T, and how many closed loops it holds at the goal up to 5 T; sought once, where none is known.
+
+        Raises:
+            DivergenceError: ẋ or ℓ is not finite on states of X₀.
+        """
+        if self._after_horizon is None:
+            self._after_horizon = choose_law(
+                self.problem, lambda law, x0, steps: self.continued(law).rollout(x0, steps).x
+            )
+        return self._after_horizon
 
     @overload
     def value(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyapnet.after_horizon import REMEDY, from_plain
 from lyapnet.build import REGISTRIES, Parts, build_problem, build_program, build_rollout, build_value_function
 from lyapnet.calculus import ValueFunction
-from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.checkpoint import AFTER_HORIZON, KEY, read_checkpoint
 from lyapnet.config import Config, config_from_plain
 from lyapnet.constraints import Constraints
 from lyapnet.controller import Controller
@@ -44,7 +45,7 @@ def load(
         network: likewise, the class of a network that is not one of NETWORKS.
         device: where the tensors go.
         beyond: the law after T: hold, that of t = T; receding, that of t = 0; riccati, the linear-quadratic regulator
-            of the goal; or error. None: hold, with a note when it first counts.
+            of the goal; or error. None: that which training found to hold the goal; where it found none, with a note.
 
     Raises:
         UsageError: no such file or device; or a part of the user's own that was not passed.
@@ -60,14 +61,19 @@ def load(
     V = build_value_function(config, problem, network)
     load_value_function(V, content, path)
     problem.check_value_function(V)
+    after_horizon = from_plain(content[KEY].get(AFTER_HORIZON))
     if others := problem.differences(content[KEY].get("problem")):
+        after_horizon = None  # it was found for another problem
         logging.getLogger(__name__).warning(
             "note: %s was trained for a problem with other %s; what follows is about the one that is given here.",
             path, ", ".join(others),
         )  # fmt: skip
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
-    return Controller(problem, V, build_rollout(config, problem, V), own, config, beyond, parts)
+    if beyond is None and after_horizon is not None and not after_horizon.holds:
+        logging.getLogger(__name__).warning("note: %s; to choose, %s.", after_horizon, REMEDY)
+    rollout = build_rollout(config, problem, V)
+    return Controller(problem, V, rollout, own, config, beyond, parts, after_horizon=after_horizon)
 
 
 def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:

@@ -26,7 +26,7 @@ LEVELS = (
     {"cluster", "constraints", "contracts", "cost", "devices", "horizon", "schema", "sets", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
-    {"linearisation", "policy"},
+    {"after_horizon", "linearisation", "policy", "regulator"},
     {"beyond", "rollout"},
     {"programs"},
     {"config"},
@@ -40,9 +40,9 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family", "files", "graphs",
-    "horizon", "interpolation", "linear_algebra", "linearisation", "networks", "policy", "problem", "programs",
-    "random_streams", "rollout", "sets", "shapes", "systems", "types",
+    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family",
+    "files", "graphs", "horizon", "interpolation", "linear_algebra", "linearisation", "networks", "policy", "problem",
+    "programs", "random_streams", "regulator", "rollout", "sets", "shapes", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

@@ -8,18 +8,27 @@ import torch
 from scipy.linalg import solve_discrete_are
 from torch.testing import assert_close
 
+import lyapnet
 from lyapnet import Controller
-from lyapnet.beyond import BEYOND, Regulator
+from lyapnet.after_horizon import AfterHorizon, is_held
+from lyapnet.beyond import BEYOND
+from lyapnet.build import Parts, build_problem, member
+from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.config import load_config
+from lyapnet.constraints import Constraints
 from lyapnet.cost import QuadraticCost, TargetCost
+from lyapnet.cost.base import quadratic_form
 from lyapnet.errors import UsageError
-from lyapnet.evaluation.afterwards import afterwards, in_plain_data
+from lyapnet.evaluation.afterwards import afterwards, in_plain_data, share_at_goal
 from lyapnet.evaluation.afterwards_figure import distances
 from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.interpolation import Table
 from lyapnet.policy import POLICIES, HJBPolicy
+from lyapnet.regulator import Regulator
 from lyapnet.rollout import Rollout
-from lyapnet.sets import ControlBox
+from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator, Linear, Pendulum
-from tests.problems import Formula, Quadratic, problem_of
+from tests.problems import CONF, Formula, Quadratic, problem_of
 
 T = 1.0
 X = torch.tensor([[0.5, -0.3], [1.0, 0.2]], dtype=torch.float64)
@@ -51,13 +60,18 @@ def test_before_the_end_nothing_changes(beyond, logged):
     assert not logged()
 
 
-def test_unless_told_it_holds_and_says_so_once(logged):
-    own = controller(None)
-    assert_close(own.policy(T, X), own.policy(7.0, X))
-    assert_close(own.policy(8.0, X), own.policy(T, X))
+def test_unless_told_it_is_what_holds_the_goal_and_says_so_once(logged):
+    """Before the note V and u at T are those of the choice too, so that nothing depends on what was asked first."""
+    own, chosen = controller(None), controller("riccati")
+    assert_close(own.policy(T, X), chosen.policy(T, X))
+    assert not logged()
+    for t in (7.0, 8.0, T):
+        assert_close(own.policy(t, X), chosen.policy(t, X))
     (note,) = logged()
-    assert note.startswith("note: the control law is for 1 s; after that it holds the law of t = T.")
-    assert_close(own.value(7.0, X), own.value(T, X))
+    assert note.startswith("note: the control law is for 1 s; after T follows riccati (the linear-quadratic regulator")
+    assert "holds 64 of 64 closed loops at the goal up to 5 T" in note
+    assert_close(own.value(7.0, X), chosen.value(7.0, X))
+    assert_close(own.rollout(X, steps=20).x, chosen.rollout(X, steps=20).x)
 
 
 @pytest.mark.parametrize("law", ["hjb", "sampled"])
@@ -195,11 +209,166 @@ def test_a_longer_rollout_begins_as_the_horizon_has_it(method):
         assert_close(other.terminal_cost, own.cost.terminal(other.x[-1]))
 
 
+def leaning(*, equilibrium=True, V=None, upper=2.0):
+    """A pendulum that is to stay at 0.6 rad, from nearby."""
+    system, target = Pendulum().double(), torch.tensor([0.6, 0.0], dtype=torch.float64)
+    holding, _ = system.holding_control(target)
+    about_zero = QuadraticCost(torch.eye(2), [[1.0]], torch.eye(2))
+    costs = [TargetCost(about_zero, target, u) for u in (holding, [0.0])]
+    held, other = (problem_of(system, cost, 10, 0.05, controls=ControlBox(-9.0, upper)) for cost in costs)
+    P, lift = Regulator(held).P, 2 * float(holding) / float(system.g(target)[1, 0])
+    if not equilibrium:  # u* = 0, and V asks for what holds
+        V = V or Formula(lambda t, x: quadratic_form(P, x - target) - lift * x[..., 1] + 0 * t)
+    problem = (held if equilibrium else other).replaced(initial_states=Box(target - 0.02, target + 0.02))
+    return Controller(problem, V or Formula(lambda t, x: quadratic_form(P, x - target) + 0 * t), policy=HJBPolicy)
+
+
+def weak(t, x):
+    """A V whose law is zero: under it the pendulum falls."""
+    return 1.0 + 0 * x.sum(-1) + 0 * t
+
+
+def test_the_regulator_is_the_first_choice():
+    assert leaning().after_horizon() == AfterHorizon("riccati", 64, 64)
+
+
+def test_the_receding_law_where_there_is_no_regulator():
+    """The law of V stays near the goal, which is no equilibrium of the control that costs nothing."""
+    found = leaning(equilibrium=False).after_horizon()
+    assert (found.beyond, found.held, found.reason) == ("receding", 64, "")
+
+
+def test_the_law_at_the_end_where_no_other_holds():
+    """V(0, ·) does nothing, and V(T, ·) holds."""
+    strong = leaning(equilibrium=False).V
+    V = Formula(lambda t, x: torch.where(t < 0.4, 0.0, 1.0) * strong(t, x))
+    assert leaning(equilibrium=False, V=V).after_horizon().beyond == "hold"
+
+
+def test_no_choice_where_nothing_holds_says_why(logged):
+    own = leaning(equilibrium=False, V=Formula(weak))
+    found = own.after_horizon()
+    assert not found.holds
+    assert found.held < 64
+    for word in ("riccati: Expected a goal that is an equilibrium", "receding: ", "hold: "):
+        assert word in found.reason
+    own.policy(9.0, X)
+    (note,) = logged()
+    assert "no law was found that holds closed loops at the goal up to 5 T (riccati: Expected a goal" in note
+
+
+def test_a_plant_without_derivatives_is_no_failure():
+    """The closed loop of a V whose gradient is known asks none of f and g."""
+
+    class Plain(DoubleIntegrator):
+        def dynamics(self, x, u):
+            return super().dynamics(torch.from_numpy(x.numpy()), u)
+
+    found = Controller(problem_of(Plain()), Quadratic(torch.eye(2))).after_horizon()
+    assert found.beyond in ("receding", "hold")
+    assert "riccati: " in found.reason
+
+
+def test_limits_that_are_too_narrow_hold_nothing():
+    """Gravity is stronger than what the limits leave."""
+    pendulum = leaning()
+    assert leaning(upper=float(pendulum.problem.rest) + 1e-3).after_horizon().held < 64
+
+
+def test_constraints_count_after_the_end():
+    """A regulator that swings through a wall which the closed loop keeps until T is none."""
+    own = leaning()
+    inside = Table([[0.5, 0.62]], [-0.1, 0.02])
+
+    class Wall(Constraints):
+        names = ("wall",)
+
+        def forward(self, x):
+            return inside(x[..., :1])[..., None]
+
+    x = torch.full((51, 2, 2), 0.6, dtype=torch.float64)
+    x[20, 1, 0] = 0.63
+    assert is_held(own.problem, x).tolist() == [True, True]
+    assert is_held(own.problem.replaced(constraints=Wall()), x).tolist() == [True, False]
+
+
+def test_what_the_cost_does_not_weigh_may_go_anywhere():
+    problem = problem_of(
+        DoubleIntegrator(), QuadraticCost(torch.diag(torch.tensor([0.0, 1.0])), [[1.0]], [[0.0] * 2] * 2)
+    )
+    x = torch.zeros(51, 1, 2, dtype=torch.float64)
+    x[:, 0, 0] = torch.arange(51)
+    assert is_held(problem, x).tolist() == [True]
+    assert is_held(problem_of(DoubleIntegrator()), x).tolist() == [False]
+
+
+def test_a_long_horizon_is_not_tried():
+    own = Controller(problem_of(DoubleIntegrator(), None, 5000, 1e-3), Quadratic(torch.eye(2)))
+    found = own.after_horizon()
+    assert (found.beyond, found.loops, found.holds) == ("hold", 0, False)
+    assert "not tried" in found.reason
+    assert share_at_goal(own, X) is None
+
+
+def test_the_regulator_of_a_family_is_that_of_each_member():
+    """Along pole mass and length of a cart-pole, between the nodes of its polynomials too; outside, that of the end."""
+    config = load_config(CONF / "cartpole_family.yaml")
+    problem = build_problem(config)
+    regulator, system = Regulator(problem, spread=True), problem.system
+    generator = torch.Generator().manual_seed(1)
+    for z in problem.initial_states.sample(4, generator).double():
+        p = z[list(system.constants)]
+        own, parts, _ = member(config, Parts(), system, dict(zip(config.family, p.tolist(), strict=True)))
+        expected = Regulator(build_problem(own, parts), spread=True)
+        offset = 0.1 * torch.randn(5, system.system.n, generator=generator, dtype=torch.float64)
+        x = expected.problem.goal + offset
+        whole = torch.cat([x, p.expand(5, -1)], -1)
+        assert_close(regulator(whole.float()), expected(x.float()), rtol=1e-3, atol=1e-4)
+        assert_close(regulator.cost(whole.float()), expected.cost(x.float()), rtol=1e-2, atol=1e-5)
+
+
+def test_what_a_checkpoint_says_is_taken(tmp_path, logged):
+    path = checkpoint_that_says(tmp_path, {"beyond": "receding", "held": 64, "loops": 64, "reason": ""})
+    own = lyapnet.load(path)
+    assert_close(own.policy(1e3, X), own.continued("receding").policy(1e3, X))
+    assert not logged()
+
+
+def test_what_does_not_hold_is_said_at_load(tmp_path, logged):
+    lyapnet.load(
+        checkpoint_that_says(tmp_path, {"beyond": "hold", "held": 3, "loops": 64, "reason": "riccati: 2 of 64"})
+    )
+    (note,) = logged()
+    assert "no law was found that holds closed loops at the goal up to 5 T (riccati: 2 of 64)" in note
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        None, "riccati", {}, {"beyond": "riccati"}, {"beyond": "error", "held": 1, "loops": 1, "reason": ""},
+        {"beyond": ["riccati"], "held": 1, "loops": 1, "reason": ""},
+        {"beyond": "riccati", "held": True, "loops": 1, "reason": ""},
+        {"beyond": "riccati", "held": 1, "loops": 1, "reason": "", "more": 1},
+    ],
+)  # fmt: skip
+def test_what_a_checkpoint_cannot_mean_is_found_anew(said, tmp_path):
+    found = lyapnet.load(checkpoint_that_says(tmp_path, said)).after_horizon()
+    assert found == AfterHorizon("riccati", 64, 64)
+
+
+def checkpoint_that_says(folder, said):
+    content = read_checkpoint("zoo:double_integrator")
+    content[KEY]["after_horizon"] = said
+    path = folder / "said.ckpt"
+    write_checkpoint(content, path)
+    return path
+
+
 @pytest.mark.parametrize(("steps", "dt"), [(90, 1 / 30), (49, 0.1 / 3)])
 def test_the_last_node_is_within_the_horizon_in_single_precision(steps, dt, logged):
     problem = problem_of(DoubleIntegrator(), None, steps, dt).float()
     V = Quadratic(torch.eye(2)).float()
-    for beyond in ("error", None):
+    for beyond in ("error", "hold"):
         own = Controller(problem, V, beyond=beyond)
         own.policy(problem.horizon.times(problem.goal)[-1], X.float())
         own.policy(-1e-9, X.float())
@@ -207,29 +376,29 @@ def test_the_last_node_is_within_the_horizon_in_single_precision(steps, dt, logg
 
 
 def test_another_word_is_refused():
-    with pytest.raises(ValueError, match="Expected beyond as one of hold, receding, riccati, error, got 'stop'"):
+    with pytest.raises(ValueError, match="Expected beyond as one of riccati, receding, hold, error, got 'stop'"):
         controller("stop")
 
 
 def test_what_each_law_after_the_end_does():
     own = controller(None)
     found = {one.beyond: one for one in afterwards(own, X, 3)}
-    assert set(found) == {"hold", "receding", "riccati"}
+    assert list(found) == ["riccati", "receding", "hold"]
     for beyond, one in found.items():
         assert_close(one.distance, controller(beyond).rollout(X, steps=30).x.norm(dim=-1))
-    hold, receding, riccati = (row["distances"] for row in in_plain_data(list(found.values()), own, 3))
+    riccati, receding, hold = (row["distances"] for row in in_plain_data(list(found.values()), own, 3))
     assert [at["time"] for at in hold] == pytest.approx([1.0, 1.2, 2.0, 3.0])
     assert hold[0]["mean"] == receding[0]["mean"] == riccati[0]["mean"]
     assert len({at[-1]["mean"] for at in (hold, receding, riccati)}) == 3
     (panel,) = distances(list(found.values()), own).axes
-    assert [line.get_label() for line in panel.lines] == ["hold", "receding", "riccati", "T"]
+    assert [line.get_label() for line in panel.lines] == ["riccati", "receding", "hold", "T"]
     assert panel.lines[0].get_xdata()[-1] == pytest.approx(3.0)
 
 
 def test_a_law_that_cannot_follow_says_why():
     """There is no regulator of a plant that no control reaches."""
     problem = problem_of(Linear([[1.0]], [[0.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
-    hold, receding, riccati = afterwards(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
+    riccati, receding, hold = afterwards(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
     assert len(hold.distance) == 12, "one step after T at the least"
     assert hold.refused == ""
     assert riccati.distance is None
@@ -241,12 +410,12 @@ def test_a_law_that_leaves_the_finite_numbers_says_so():
     """V(T, ·) = 0 leaves an unstable plant alone, whose states grow by eleven with each step."""
     problem = problem_of(Linear([[100.0]], [[1.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
     own = Controller(problem, Formula(lambda t, x: torch.where(t < 0.95, 105.0, 0.0) * (x**2).sum(-1)))
-    hold, receding, riccati = found = afterwards(own, X[:, :1], 40)
+    riccati, receding, hold = found = afterwards(own, X[:, :1], 40)
     assert hold.distance is None
     assert "the closed loop diverges" in hold.refused
     assert float(receding.distance[-1].max()) < 1e-6
     assert float(riccati.distance[-1].max()) < 1e-6
-    assert in_plain_data(found, own, 40)[0]["distances"][-1]["mean"] is None
+    assert in_plain_data(found, own, 40)[-1]["distances"][-1]["mean"] is None
     assert "none of hold" in distances(found, own).axes[0].get_title()
 
 

@@ -238,8 +238,15 @@ def test_what_a_member_is_asked_for_and_cannot_be(trained):
         controller.policy(0, [0.0, 0.0, 1.0, 1.0], mass=1, length=1)
     with pytest.raises(UsageError, match=r"Expected mass as one number, got \[1, 1\]"):
         member(controller.config, Parts(), controller.system, {"mass": [1, 1], "length": 1})
-    with pytest.raises(ValueError, match="Expected a single problem for beyond=riccati, got a family"):
-        lyapnet.load(trained, beyond="riccati")
+
+
+def test_a_member_keeps_the_law_after_the_end(trained):
+    """That of the family is a polynomial in its parameters; that of a member its own regulator."""
+    x = np.array([0.1, -0.2])
+    for beyond in (None, "riccati"):
+        family = lyapnet.load(trained, beyond=beyond)
+        own = family.with_(mass=0.9, length=1.1).policy(1e3, x)
+        assert family.policy(1e3, x, mass=0.9, length=1.1) == pytest.approx(own, rel=1e-3)
 
 
 def test_a_disturbed_parameter_is_told_where_v_knows_it(trained):

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.beyond import Regulator
 from lyapnet.build import build_problem
 from lyapnet.config import load_config
 from lyapnet.cost import QuadraticCost, TargetCost
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati
 from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.policy import HJBPolicy, LookaheadPolicy, SampledPolicy
+from lyapnet.regulator import Regulator
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import DoubleIntegrator, Linear, Pendulum

@@ -2,10 +2,10 @@
 
 import torch
 
-from lyapnet.beyond import Regulator
 from lyapnet.cost import RegulatorTail
 from lyapnet.errors import UsageError
 from lyapnet.problem import Problem
+from lyapnet.regulator import Regulator
 
 PURPOSE, INSTEAD = "horizon.stationary", "choose another goal, or stationary: false"
 FREE, STATES = 1e-3, 256  # of the mean q at states of X₀: what staying at the goal may cost per second

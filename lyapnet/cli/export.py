@@ -15,7 +15,9 @@ def export(
     to: Annotated[str, typer.Option(help="c, onnx or torch.")],
     out: Annotated[Path, typer.Option(help="A folder for c, else a file.", metavar="PATH")],
     name: Annotated[str, typer.Option(help="What the names in C begin with.")] = "lyapnet",
-    beyond: Annotated[str, typer.Option(help="The law after T: hold, receding or riccati.")] = "hold",
+    beyond: Annotated[
+        str | None, typer.Option(help="The law after T: hold, receding or riccati; else that which holds the goal.")
+    ] = None,
     debug: Debug = False,
 ) -> None:
     """Write the control law for use without lyapnet, and hold it against the controller on 10 000 states.
@@ -25,10 +27,12 @@ def export(
     """
     from lyapnet.export import export as write
 
-    controller = given.load().continued(beyond)
+    controller = given.load() if beyond is None else given.load().continued(beyond)
     notes = Console(highlight=False, markup=False)
     with notes.status("writing and verifying …"):
         paths, agreement = write(controller, out, to, given.checkpoint, name)
+    if beyond is None:
+        notes.print(f"law: {controller.after_horizon()}", soft_wrap=True)
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)

@@ -10,11 +10,13 @@ from rich.table import Column, Table
 
 from lyapnet.cli.options import Debug
 
+LEAST_SHOWN = 1e-12  # of a distance to the goal
 STATES = 1000  # that a demonstration draws for its certificate
 
 
 def zoo(
     exports: Annotated[bool, typer.Option("--exports", help="How far each export is from its controller.")] = False,
+    after: Annotated[bool, typer.Option("--after", help="What follows T, and how near the goal it stays.")] = False,
     debug: Debug = False,
 ) -> None:
     """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
@@ -24,6 +26,9 @@ def zoo(
     console = Console(highlight=False, markup=False)
     if exports:
         console.print(_exports(entries()))
+        return
+    if after:
+        console.print(_after(entries()))
         return
     table = Table(Column("zoo:", no_wrap=True), "cost / optimum", "worst state", "error of V", "certified share of X₀")
     table.title = "Controllers that come with lyapnet"
@@ -62,7 +67,7 @@ def demo(
         folder.mkdir(parents=True, exist_ok=True)
         trajectories(shown, controller.problem).savefig(folder / "trajectories.png", dpi=150)
         Film(shown, controller.problem, controller.value).write(folder / "closed_loops.gif")
-    console.print(_table(one.name, trajectory, ratio, error, certificate))
+    console.print(_table(one.name, controller, trajectory, ratio, error, certificate))
     console.print(f"{'made by':<10}{one.record['command']}", soft_wrap=True)
     console.print(f"{'wrote':<10}{folder / 'trajectories.png'}, {folder / 'closed_loops.gif'}", soft_wrap=True)
     for what, command in (
@@ -86,13 +91,30 @@ def _exports(found: list[Any]) -> Table:
     return table
 
 
-def _table(name: str, trajectory: Any, ratio: float, error: float, certificate: Any) -> Table:
+def _after(found: list[Any]) -> Table:
+    """The law after T of each, how many closed loops it holds, and how far from the goal they are."""
+    multiples = list(found[0].record["afterwards"]["distance"])
+    headings = ("‖x − x*‖ at T" if k == "1" else f"at {k} T" for k in multiples)
+    table = Table(Column("zoo:", no_wrap=True), "after T", "at the goal at 5 T", *headings, title="What follows T")
+    for one in found:
+        later = one.record["afterwards"]
+        distances = (later["distance"][k] for k in multiples)
+        shown = (f"{d:.2g}" if d > LEAST_SHOWN else f"< {LEAST_SHOWN:g}" for d in distances)
+        table.add_row(one.name, later["beyond"], f"{later['held']} of {later['loops']}", *shown)
+    table.caption = "Mean distance of 64 closed loops, in the states that the cost weighs."
+    return table
+
+
+def _table(name: str, controller: Any, trajectory: Any, ratio: float, error: float, certificate: Any) -> Table:
     from lyapnet.certification.tables import floored
+    from lyapnet.evaluation.afterwards import law_after, share_at_goal
 
     states = trajectory.x.shape[1]
     table = Table("measure", "value", title=f"zoo:{name}, {states} states of X₀ that no training saw")
     table.add_row("cost / optimum, ratio of the means", f"{ratio:.4f}")
     table.add_row("value error, mean |V(0, x₀) − J*| / mean J*", f"{error:.2%}")
+    if (share := share_at_goal(controller, trajectory.x[0])) is not None:
+        table.add_row(f"after T, by {law_after(controller)}: at the goal at 5 T, share of closed loops", f"{share:.1%}")
     *conditions, _ = certificate.in_formulas()
     share = f"share of X₀ with {', '.join(conditions)}, from {STATES} further states, confidence 0.999"
     table.add_row(share, f"≥ {floored(certificate.claim.probability_lower_bound)}")

@@ -8,13 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.beyond import BEYOND
+from lyapnet.after_horizon import LAWS, LONGEST, MULTIPLE, is_held
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.types import State
 
-LAWS = tuple(name for name in BEYOND if name != "error")
 DIVERGES = "the closed loop diverges"
 
 
@@ -51,6 +50,26 @@ def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterw
         return Afterwards(beyond, None, f"{DIVERGES}: {error}")
     distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
     return Afterwards(beyond, distance, "") if distance.isfinite().all() else Afterwards(beyond, None, DIVERGES)
+
+
+def share_at_goal(controller: Controller, x0: State) -> float | None:
+    """The share of closed loops that the law after T holds at the goal up to MULTIPLE T; None where that is not asked.
+
+    It is not asked of an error, and of a time of more than LONGEST steps.
+    """
+    steps = MULTIPLE * controller.horizon.steps
+    if controller.law.beyond == "error" or steps > LONGEST:
+        return None
+    try:
+        x = controller.continued(law_after(controller)).rollout(x0, steps).x
+    except DivergenceError:
+        return 0.0
+    return float(is_held(controller.problem, x).double().mean())
+
+
+def law_after(controller: Controller) -> str:
+    """The name of the law after T; where nobody chose one, it is found now."""
+    return controller.law.beyond or controller.after_horizon().beyond
 
 
 def check_multiple(controller: Controller, multiple: float, states: int) -> None:

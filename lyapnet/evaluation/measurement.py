@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 import torch
 
+from lyapnet.after_horizon import LOOPS
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
+from lyapnet.evaluation.afterwards import law_after, share_at_goal
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
@@ -47,6 +49,8 @@ class Evaluation(NamedTuple):
     corner: Corner
     held_cost: PerState  # of the table's states in continuous time, u held for Δt; infinite where it diverges
     lqr_cost: PerState | None  # of the table's states under LQR, likewise; None where there is no such law
+    at_goal: float | None  # share of closed loops at the goal at 5 T; None where it is not asked
+    after: str  # the law after T
     optimum_of: str = ""  # of which steps, or of continuous time; empty where no optimum was sought
 
     def result(self) -> dict[str, Any]:
@@ -71,6 +75,7 @@ class Evaluation(NamedTuple):
             "terminal_errors": terminal,
             **used,
             **counts,
+            **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
             "worst_corner": self.corner._asdict(),
@@ -158,7 +163,8 @@ def evaluation(
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     corner, problem = dearest_corner(controller), controller.problem
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
-    further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0))
+    later = share_at_goal(controller, first.x0[:LOOPS]), law_after(controller)
+    further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0), *later)
     if not optimum:
         return Evaluation(first, paper, ["not asked for"] * samples, *further)
     try:

@@ -22,6 +22,7 @@ ROWS = {
     "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
     "constraint_loss": "constraint loss, mean",
     "terminal_error": "terminal error, mean ‖x(T)‖",
+    "at_goal_fraction": "at the goal at 5 T, share of closed loops",
     "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
     "falling_fraction": "V falls by half of each step's cost, within 1e-6 of V(0, x₀)",
     "largest_rise": "largest rise of V in a step, relative to V(0, x₀)",
@@ -89,6 +90,7 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
         notes = {f"optimum: of {about}": None, **notes}
+    notes |= {f"after T: {result['after_T']}": None for result in results if "after_T" in result}
     return Text("; ".join(notes)) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.text import Text
 
 from lyapnet.build import Parts
+from lyapnet.checkpoint import AFTER_HORIZON, note_in_checkpoint
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
 from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
 from lyapnet.evaluation import evaluate
@@ -192,6 +193,7 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
     for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
         controller = load(run.best, **vars(plan.parts))
+        note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
         with optimum_progress(console) as progress:
             results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
         log_result(own, one, results[-1], trainer.global_step)

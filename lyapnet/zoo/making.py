@@ -16,8 +16,9 @@ from typing import Any
 
 import torch
 
+from lyapnet.after_horizon import LOOPS, distance_to_goal
 from lyapnet.certification.sampling_certificates import statistical_certificate
-from lyapnet.checkpoint import KEY, ZOO, read_checkpoint, write_checkpoint
+from lyapnet.checkpoint import AFTER_HORIZON, KEY, ZOO, note_in_checkpoint, read_checkpoint, write_checkpoint
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.measurement import evaluation
@@ -35,6 +36,7 @@ TASKS: dict[str, list[str]] = {  # name ↦ arguments of lyapnet train --config
     "cartpole_limited": ["conf/cartpole_swingup.yaml", "controls={lower: -20, upper: 20}"],
     "reacher_limited": ["conf/reacher.yaml", "controls={lower: [-1.03, -0.37], upper: [1.03, 0.37]}"],
 }
+MULTIPLES = (1, 5, 20)  # of T, at which the distance to the goal is recorded
 SAMPLES, KEPT = 256, 32  # states of the evaluation, and those whose optima the record keeps
 PACKAGES = ("lyapnet", "torch", "lightning", "python")
 PRECISIONS = ("float64", "float32")
@@ -54,11 +56,13 @@ def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
     kept, checkpoint = {**known, "config": config}, folder / f"{name}.ckpt"
     slim = {"state_dict": content["state_dict"], "global_step": content["global_step"], KEY: kept}
     write_checkpoint(slim, checkpoint)
+    afterwards = choose_law_after(checkpoint)
     record = {
         "command": shlex.join(["lyapnet", "train", "--config", *TASKS[name]]),
         "seed": config["seed"],
         **_origin(trained),
         **_measurements(load(checkpoint), checkpoint),
+        "afterwards": afterwards,
         "seconds": round(time.monotonic() - began),
     }
     write_json(folder / f"{name}.json", record)
@@ -86,6 +90,17 @@ def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
         "states": measured.table.x0[known][:KEPT].tolist(),
         "optima": optima[known][:KEPT].tolist(),
     }
+
+
+def choose_law_after(checkpoint: Path) -> dict[str, Any]:
+    """Find what follows T, and note it in the checkpoint; with the mean distance to the goal at some multiples of T."""
+    controller = load(checkpoint)
+    found, problem = controller.after_horizon(), controller.problem
+    note_in_checkpoint(checkpoint, **{AFTER_HORIZON: found._asdict()})
+    x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(1))
+    N, other = problem.horizon.steps, controller.continued(found.beyond)
+    distance = distance_to_goal(problem, other.rollout(x0, max(MULTIPLES) * N).x).mean(1)
+    return {**found._asdict(), "distance": {str(k): float(distance[k * N]) for k in MULTIPLES}}
 
 
 def _agreements(checkpoint: Path, precision: str) -> dict[str, dict[str, float]]:
@@ -118,9 +133,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("names", nargs="*", choices=[*TASKS, []], metavar="NAME", help=", ".join(TASKS))
     parser.add_argument("--from", dest="trained", type=Path, metavar="CKPT", help="a checkpoint; of one NAME")
     parser.add_argument("--out", type=Path, default=ZOO, help="the folder")
+    parser.add_argument("--after", action="store_true", help="only find again what follows T, without training")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
     for name in given.names or TASKS:
+        if given.after:
+            path = given.out / f"{name}.json"
+            afterwards = choose_law_after(given.out / f"{name}.ckpt")
+            write_json(path, {**read_json(path, "make it first"), "afterwards": afterwards})
+            continue
         with tempfile.TemporaryDirectory() as logs:
             record = make(name, given.trained or train(name, Path(logs)), given.out)
         found = record["evaluation"]

@@ -71,7 +71,7 @@ def test_what_follows_the_horizon_is_told_where_it_is_asked_for(run, capsys, tmp
     options = ["--no-optimum", "--until", "2"]
     later = json.loads(evaluated(run, capsys, "--json", "--figures", str(tmp_path), *options))["afterwards"]
     horizon = load(run / "checkpoints" / "best.ckpt").horizon
-    assert [law["beyond"] for law in later] == ["hold", "receding", "riccati"]
+    assert [law["beyond"] for law in later] == ["riccati", "receding", "hold"]
     assert later[0]["distances"][-1]["time"] == pytest.approx(2 * horizon.duration)
     assert (tmp_path / "afterwards.png").is_file()
     shown = " ".join(evaluated(run, capsys, *options).split())

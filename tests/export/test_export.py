@@ -326,6 +326,11 @@ def test_the_command(tmp_path, capsys):
     header = (tmp_path / "law" / "policy.h").read_text()
     assert digest_of_file(checkpoint) in header
     assert "receding" in header
+    assert "after T follows" not in printed
+    assert main(["export", str(checkpoint), "--to", "c", "--out", str(tmp_path / "law")]) == 0
+    found = lyapnet.load(checkpoint).after_horizon()
+    assert f"law: after T follows {found.beyond} (" in capsys.readouterr().out
+    assert f"after that {found.beyond}" in (tmp_path / "law" / "policy.h").read_text()
     assert "position (m), velocity (m/s)" in header
     assert main(["export", str(checkpoint), "--to", "cobol", "--out", str(tmp_path / "law")]) == 2
     assert "Expected a format among" in capsys.readouterr().err

@@ -1,0 +1,98 @@
+"""What follows T where a goal is to be held: the law under which closed loops stay there."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from lyapnet.errors import DivergenceError, one_line
+from lyapnet.problem import Problem
+from lyapnet.types import PerState, State
+
+LAWS = {  # those that can follow T, the one that is preferred first
+    "riccati": "the linear-quadratic regulator of the goal, for an infinite horizon",
+    "receding": "V(0, x) and its law, as if the horizon began at every step",
+    "hold": "V(T, x) and its law",
+}
+LOOPS, MULTIPLE = 64, 5  # closed loops that are tried, and up to how many T
+NEAR = 0.01  # share of the largest distance at t = 0 that counts as being at the goal
+LONGEST = 20_000  # steps of a closed loop that is tried
+REMEDY = "load with beyond=hold, receding, riccati or error to choose"
+
+
+class AfterHorizon(NamedTuple):
+    """A law after T, and how it was found to hold the goal."""
+
+    beyond: str  # a key of LAWS
+    held: int  # closed loops that it holds up to MULTIPLE T
+    loops: int  # of how many; 0 where none was tried
+    reason: str = ""  # why no law holds all of them; empty where this one does
+
+    @property
+    def holds(self) -> bool:
+        """Whether every closed loop that was tried stays at the goal."""
+        return 0 < self.loops == self.held
+
+    def __str__(self) -> str:
+        law = f"after T follows {self.beyond} ({LAWS[self.beyond]})"
+        if self.holds:
+            return f"{law}, which holds {self.held} of {self.loops} closed loops at the goal up to {MULTIPLE} T"
+        return f"{law}; no law was found that holds closed loops at the goal up to {MULTIPLE} T ({self.reason})"
+
+
+def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State]) -> AfterHorizon:
+    """The first of LAWS that holds closed loops from X₀ at the goal up to MULTIPLE T; else the one that holds most.
+
+    Args:
+        closed_loops: (a key of LAWS, x₀ (b, n), steps) ↦ the states (steps + 1, b, n) under that law after T.
+    """
+    if MULTIPLE * problem.horizon.steps > LONGEST:
+        return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
+    x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))
+    held, reasons = dict[str, int](), []
+    for law in LAWS:
+        try:
+            stays = is_held(problem, closed_loops(law, x0, MULTIPLE * problem.horizon.steps))
+        except DivergenceError:
+            held[law] = 0
+        except Exception as refusal:  # of any kind: f, g and the cost, whose derivatives are asked, may be the user's
+            reasons.append(f"{law}: {one_line(refusal)}")
+            continue
+        else:
+            held[law] = int(stays.sum())
+        if held[law] == LOOPS:
+            return AfterHorizon(law, LOOPS, LOOPS)
+        reasons.append(f"{law}: {held[law]} of {LOOPS}")
+    most = max(reversed(held), key=lambda law: held[law])
+    return AfterHorizon(most, held[most], LOOPS, "; ".join(reasons))
+
+
+def is_held(problem: Problem, x: State) -> Bool[Tensor, " batch"]:
+    """Whether closed loops x (nodes, batch, n) that go on after T are at the goal at their last node.
+
+    In the states that the cost weighs, ‖x − x*‖ is then no larger than at T, or than NEAR times the largest at t = 0;
+    and no constraint was violated after T by more than before.
+    """
+    N, distance = problem.horizon.steps, distance_to_goal(problem, x)
+    stays = distance[-1] <= distance[N].clamp(min=NEAR * float(distance[0].max()))
+    if problem.constraints is None:
+        return stays
+    h = problem.constraints(x)
+    return stays & (h[N:] <= h[: N + 1].amax(0).clamp(min=0.0)).all(-1).all(0)
+
+
+def distance_to_goal(problem: Problem, x: State) -> PerState:
+    """‖x − x*‖ in the states that the cost weighs."""
+    n = problem.system.n
+    weighed = [i for i in range(n) if i not in problem.system.constants and not problem.cost.ignores(i, n)]
+    return torch.linalg.vector_norm(problem.cost.from_goal(x)[..., weighed], dim=-1)
+
+
+def from_plain(content: Any) -> AfterHorizon | None:
+    """What a checkpoint says, as _asdict had it; None where it says nothing that can be read."""
+    types = {"beyond": str, "held": int, "loops": int, "reason": str}
+    if not isinstance(content, dict) or {key: type(value) for key, value in content.items()} != types:
+        return None
+    return AfterHorizon(**content) if content["beyond"] in LAWS else None

@@ -18,6 +18,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from lyapnet import sizes
 from lyapnet.errors import LyapnetError
 
@@ -94,11 +96,11 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
         raise
     for other in [other for other in path.parent.iterdir() if other.name.startswith(prefix)]:
         try:
-            os.kill(int(other.name.split(".")[-3]), 0)
-        except ProcessLookupError:
+            alive = psutil.pid_exists(int(other.name.split(".")[-3]))
+        except (IndexError, ValueError, OverflowError):  # no name of ours
+            continue
+        if not alive:
             other.unlink(missing_ok=True)
-        except (IndexError, ValueError, OverflowError, PermissionError):  # no such name, or another user's process
-            pass
 
 
 def digest_of_file(path: Path) -> str:

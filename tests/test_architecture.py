@@ -15,6 +15,7 @@ LEVELS = (
         "errors",
         "interpolation",
         "linear_algebra",
+        "machine",
         "provenance",
         "random_streams",
         "shapes",
@@ -153,6 +154,13 @@ def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning
     assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.config")
     slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
     assert not slow & loaded("import lyapnet.build, lyapnet.training.build_learner, lyapnet.training.facts")
+
+
+def test_training_and_comparing_import_no_module_of_unix_alone():
+    without = "sys.modules |= dict.fromkeys(['fcntl', 'resource'])"
+    psutil = "import sys, psutil"  # which on Linux imports them itself
+    found = loaded(psutil, without, "import lyapnet.training.experiment, lyapnet.comparison.execution")
+    assert "lyapnet.training.run_lock" in found
 
 
 def test_training_loads_neither_bench_nor_comparison():

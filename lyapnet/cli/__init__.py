@@ -25,6 +25,8 @@ from lyapnet.cli.view import view
 from lyapnet.cli.zoo import demo, zoo
 from lyapnet.errors import Interrupted, LyapnetError, one_line, raised, signals_taken
 
+CLOSED_OUTPUT = 141  # the exit status of what the signal SIGPIPE ended, which not every system knows
+
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
@@ -55,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
             return status
     except (Exception, SystemExit) as error:  # the outermost frame: one line for the user, whatever happened
         if _is_closed_output(error):
-            return 128 + signal.SIGPIPE
+            return CLOSED_OUTPUT
         if "--debug" in arguments:
             raise
         line, status = _explain(error)

@@ -1,6 +1,5 @@
 """One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
 
-import fcntl
 import json
 import time
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from rich.console import Console
 
 from lyapnet.build import parts_of
@@ -42,8 +42,8 @@ def run_job(job: Job, console: Console) -> Result:
         LyapnetError: the training fails.
     """
     job.folder.mkdir(parents=True, exist_ok=True)
-    with (job.folder / LOCK).open("w") as lock:  # another process may be at it: one that outlived its parent
-        fcntl.flock(lock, fcntl.LOCK_EX)
+    # another process may be at it: one that outlived its parent
+    with FileLock(job.folder / LOCK, fallback_to_soft=False):  # a soft one would outlive a process that is killed
         require_same(job)
         if (done := job.result) is not None:
             return done

@@ -4,7 +4,6 @@ What it compiles goes to the folder of machine code, from where the run takes it
 So a run computes the same with it and without.
 """
 
-import os
 import pickle
 import signal
 import subprocess
@@ -14,6 +13,7 @@ from typing import Any
 import torch
 
 from lyapnet.errors import LyapnetError
+from lyapnet.machine import usable_cores
 
 PATIENCE = 10  # seconds in which it may end by itself
 
@@ -27,7 +27,7 @@ class CompilingAhead:
 
     def __init__(self, module: Any, batch_size: int):
         self._process: subprocess.Popen[bytes] | None = None
-        if len(os.sched_getaffinity(0)) <= torch.get_num_threads():
+        if usable_cores() <= torch.get_num_threads():
             return
         try:
             order = pickle.dumps((sys.path, torch.get_num_threads(), torch.get_default_dtype()))

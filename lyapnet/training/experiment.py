@@ -1,6 +1,5 @@
 """One experiment, from its config to the evaluation of what it trained."""
 
-import resource
 import shlex
 import statistics
 import time
@@ -21,6 +20,7 @@ from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
 from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
 from lyapnet.loading import load
+from lyapnet.machine import peak_memory
 from lyapnet.training.build import build_data
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
@@ -181,9 +181,9 @@ def _prepare_folder(plan: Plan) -> None:
 
 def _note_what_it_took(run: Run, seconds: float) -> None:
     """Add this process's share to the run's record."""
-    record, peak = run.record(), 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # Linux counts in KiB
+    record = run.record()
     total = record["training_seconds"] + seconds
-    run.note(training_seconds=round(total, 2), peak_bytes=max(record["peak_bytes"], peak))
+    run.note(training_seconds=round(total, 2), peak_bytes=max(record["peak_bytes"], peak_memory()))
 
 
 def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:

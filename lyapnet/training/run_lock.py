@@ -1,13 +1,16 @@
 """The lock in a run's folder: one process trains a run at a time."""
 
-import fcntl
+import errno
 import os
 import socket
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from lyapnet.errors import LyapnetError, UsageError
 
 LOCK = ".lock"
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # what a file system without locks answers
 
 
 class RunLock:
@@ -19,31 +22,42 @@ class RunLock:
     """
 
     def __init__(self, folder: Path):
+        self._lock = FileLock(
+            folder / LOCK, blocking=False, thread_local=False, fallback_to_soft=False, preserve_lock_file=True,
+            on_acquired=_write_holder,
+        )  # fmt: skip
         try:
-            self._file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        except OSError as error:
-            raise LyapnetError(
-                f"Expected a writable folder of a run, got {str(folder)!r} ({error.strerror}); check its permissions."
-            ) from error
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            holder = " ".join(os.read(self._file, 200).decode(errors="replace").split()) or "another process"
+            self._lock.acquire()
+        except Timeout as error:
             raise UsageError(
-                f"Expected a run that nobody trains, got {str(folder)!r}, which {holder} is training; wait for it, or "
-                "stop it with Ctrl-C, which saves."
+                f"Expected a run that nobody trains, got {str(folder)!r}, which {_holder(folder / LOCK)} is training; "
+                "wait for it, or stop it with Ctrl-C, which saves."
             ) from error
-        except OSError:  # a file system without locks
-            pass
-        os.ftruncate(self._file, 0)
-        os.write(self._file, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise LyapnetError(
+                    f"Expected a writable folder of a run, got {str(folder)!r} ({error.strerror}); check its "
+                    "permissions."
+                ) from error
 
     def __enter__(self) -> "RunLock":
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if (held := self.__dict__.pop("_file", None)) is not None:
-            os.close(held)
+        self._lock.release()
 
-    def __del__(self) -> None:
-        self.__exit__()
+
+def _write_holder(file: int) -> None:
+    """Write which process holds the lock into its file, from the second byte on: Windows locks the first."""
+    os.ftruncate(file, 0)
+    os.write(file, f"\nprocess {os.getpid()} on {socket.gethostname()}\n".encode())
+
+
+def _holder(path: Path) -> str:
+    """The process that holds the lock."""
+    try:
+        with path.open("rb", buffering=0) as file:
+            file.seek(1)
+            return " ".join(file.read(200).decode(errors="replace").split()) or "another process"
+    except OSError:
+        return "another process"

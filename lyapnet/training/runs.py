@@ -120,11 +120,11 @@ def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock |
         try:
             draft.chmod(0o755)
             write_json(draft / RUN_RECORD, _provenance(config, finetuned_from))
-            lock = RunLock(draft)
-            return Run(_numbered(draft)), lock
+            run = Run(_numbered(draft))
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)
             raise
+        return run, RunLock(run.folder)  # only now: Windows renames no folder of an open file
     except OSError as error:
         raise LyapnetError(
             f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."

@@ -153,7 +153,7 @@ class Noting:
 
 @pytest.fixture
 def cores(monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    monkeypatch.setattr("lyapnet.training.compiling_ahead.usable_cores", lambda: 2)
 
 
 def test_compiling_ahead_happens_in_another_process(tmp_path, cores):
@@ -185,7 +185,7 @@ def test_compiling_ahead_ends_with_what_it_is_beside(tmp_path, cores):
 
 
 def test_without_a_core_for_it_nothing_is_compiled_ahead(tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(torch.get_num_threads())))
+    monkeypatch.setattr("lyapnet.training.compiling_ahead.usable_cores", torch.get_num_threads)
     assert CompilingAhead(Noting(tmp_path / "note"), 7)._process is None
 
 

@@ -3,6 +3,8 @@
 import ast
 import csv
 import ctypes
+import errno
+import fcntl
 import functools
 import io
 import json
@@ -641,6 +643,30 @@ def test_lock_is_no_way_to_another_file(desk):
     with pytest.raises(LyapnetError, match="Expected a writable folder"):
         RunLock(desk.folder / "run")
     assert precious.read_text() == "kept"
+
+
+def test_lock_ends_with_its_block_and_with_its_last_name(tmp_path):
+    with RunLock(tmp_path), pytest.raises(UsageError, match=f"which process {os.getpid()} on"):
+        RunLock(tmp_path)
+    held = RunLock(tmp_path)
+    with pytest.raises(UsageError):
+        RunLock(tmp_path)
+    del held
+    with RunLock(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("code", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP])
+def test_run_on_a_file_system_without_locks_goes_on(code, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with RunLock(tmp_path):
+        pass
+    with RunLock(tmp_path):
+        pass
+    assert {path.name for path in tmp_path.iterdir()} <= {".lock"}
 
 
 @pytest.mark.parametrize("removed", ["version_0", "small", "logs"])

@@ -1,7 +1,6 @@
 """The files of a report: Markdown, LaTeX, comma-separated values, figures, and TensorBoard."""
 
 import io
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,6 +20,7 @@ from lyapnet.controller import Controller
 from lyapnet.drawing import pixels
 from lyapnet.errors import UsageError
 from lyapnet.files import write_atomically
+from lyapnet.machine import usable_cores
 from lyapnet.provenance import versions
 from lyapnet.tables import Table, csv_text, latex, markdown
 
@@ -138,11 +138,10 @@ def _facts() -> list[str]:
     """When and with what the report was written."""
     made = versions(*PACKAGES)
     python, platform = made.pop("python"), made.pop("platform")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return [
         f"written {datetime.now(UTC).isoformat(timespec='seconds')}",
         f"{', '.join(f'{name} {version}' for name, version in made.items())}, Python {python}",
-        f"{platform}, {cores} cores for this process",
+        f"{platform}, {usable_cores()} cores for this process",
     ]
 
 

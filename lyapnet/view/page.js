@@ -4,6 +4,7 @@ const [BLUE, ORANGE, GREEN, VERMILION, GREY] = ["#0072B2", "#E69F00", "#009E73",
 const CYCLE = [BLUE, VERMILION, "#CC79A7", ORANGE, "#56B4E9", "#222222"];
 const TIME = -1; // as an axis
 const n = facts.states.length, m = facts.controls.length, T = facts.steps * facts.dt;
+const phone = matchMedia("(max-width: 600px)"); // a window as narrow as that of one
 const chosen = { t: 0, axes: facts.axes, layer: "V", x: facts.start.slice(), loops: [], count: 0 };
 const element = (id) => document.getElementById(id);
 const short = (number) => String(Number(number.toPrecision(4)));
@@ -33,9 +34,17 @@ function limited(u) {
 }
 const hasLimits = facts.controls.some(({ lower, upper }) => lower !== null || upper !== null);
 
+// Whether state k lies between its bounds in X0, and whether all do.
+function between(x, k) {
+  const { lower, upper } = facts.initialStates, room = 1e-9 * (1 + Math.abs(lower[k]) + Math.abs(upper[k]));
+  return x[k] >= lower[k] - room && x[k] <= upper[k] + room;
+}
+const inX0 = (x) => facts.states.every((_, k) => between(x, k));
+
 // The closed loop from x0 at t = 0, until T or until it leaves the finite numbers.
 function closedLoop(x0) {
-  const loop = { x: [], u: [], V: [], paid: [0], worst: -Infinity, atLimit: 0, color: CYCLE[chosen.count % CYCLE.length] };
+  const loop = { x: [], u: [], V: [], paid: [0], worst: -Infinity, atLimit: 0, outside: !inX0(x0) };
+  loop.color = CYCLE[chosen.count % CYCLE.length];
   let x = Float64Array.from(x0);
   for (let k = 0; k <= facts.steps; k++) {
     const { u, V } = looked(k * facts.dt, x);
@@ -54,7 +63,7 @@ function closedLoop(x0) {
   loop.cost = whole ? loop.paid[facts.steps] + told(x).end : NaN;
   loop.toGo = loop.paid.map((paid) => loop.cost - paid);
   loop.t = loop.x.map((_, k) => k * facts.dt);
-  loop.name = `closed loop ${++chosen.count}`;
+  loop.name = `closed loop ${++chosen.count}${loop.outside ? ", from outside X₀" : ""}`;
   return loop;
 }
 
@@ -114,10 +123,11 @@ function region(name, layer, height, color, fill) {
 function layers({ across: x, up: y, V, u, limited, worst, funnel }) {
   const k = chosen.layer === "V" ? null : Number(chosen.layer), place = { x, y };
   const [h, v] = chosen.axes.map((i) => axis(i).label);
-  const colour = k === null
-    ? { z: V, colorscale: "Cividis", colorbar: { title: { text: "V (cost)", side: "right" } } }
-    : { z: u[k], colorscale: "RdBu", colorbar: { title: { text: facts.controls[k].label, side: "right" } } };
-  const what = k === null ? "V" : facts.controls[k].label;
+  const what = k === null ? "V" : facts.controls[k].label, text = k === null ? "V (cost)" : what;
+  const colorbar = phone.matches // above the plane, which is then as wide as the window
+    ? { title: { text, side: "top" }, orientation: "h", thickness: 14, y: 1, yanchor: "bottom" }
+    : { title: { text, side: "right" } };
+  const colour = { z: k === null ? V : u[k], colorscale: k === null ? "Cividis" : "RdBu", colorbar };
   const found = [
     { type: "heatmap", ...place, ...colour, zsmooth: "best", opacity: 0.8,
       hovertemplate: `${h}: %{x:.4g}<br>${v}: %{y:.4g}<br>${what}: %{z:.4g}<extra></extra>` },
@@ -137,7 +147,7 @@ function layers({ across: x, up: y, V, u, limited, worst, funnel }) {
 function marks() {
   const [i, j] = chosen.axes, { lower, upper } = facts.initialStates, found = [];
   const goal = told(chosen.x).goal;
-  const through = chosen.x.every((x, k) => [i, j].includes(k) || (x >= lower[k] - 1e-9 && x <= upper[k] + 1e-9));
+  const through = facts.states.every((_, k) => [i, j].includes(k) || between(chosen.x, k));
   const ends = (k) => (k === TIME ? [0, 0] : [lower[k], upper[k]]);
   const [[left, right], [bottom, top]] = [ends(i), ends(j)];
   found.push({
@@ -154,7 +164,8 @@ function marks() {
     const node = Math.min(loop.x.length - 1, Math.round(chosen.t / facts.dt)), [a, b] = [along(i), along(j)];
     const outline = { color: "#ffffff", width: 4.5 };
     found.push({ x: a, y: b, mode: "lines", line: outline, showlegend: false, hoverinfo: "skip" });
-    found.push({ x: a, y: b, mode: "lines", name: loop.name, line: { color: loop.color, width: 2.5 }, hoverinfo: "skip" });
+    const line = { color: loop.color, width: 2.5, dash: loop.outside ? "dash" : "solid" };
+    found.push({ x: a, y: b, mode: "lines", name: loop.name, line, hoverinfo: "skip" });
     found.push({
       x: [a[node]], y: [b[node]], mode: "markers", showlegend: false, hoverinfo: "skip",
       marker: { size: 11, color: loop.color, line: { color: "#ffffff", width: 2 } },
@@ -162,12 +173,12 @@ function marks() {
   }
   return found;
 }
-const CONFIG = { responsive: true, displaylogo: false };
+const CONFIG = { displaylogo: false };
 function drawPlane() {
   const [across, up] = chosen.axes.map(axis), line = { color: "#ffffff", width: 2, dash: "dash" };
   const clock = { type: "line", x0: chosen.t, x1: chosen.t, yref: "paper", y0: 0, y1: 1, line };
   Plotly.react("plane", [...layers(grid()), ...marks()], {
-    height: 600, margin: { l: 70, r: 10, t: 30, b: 110 }, hovermode: "closest", dragmode: "zoom",
+    height: 600, margin: { l: phone.matches ? 52 : 70, r: 10, t: 30, b: 110 }, hovermode: "closest", dragmode: "zoom",
     uirevision: chosen.axes.join(), shapes: chosen.axes.includes(TIME) ? [clock] : [],
     xaxis: { title: { text: across.label }, range: [across.low, across.high], zeroline: false },
     yaxis: { title: { text: up.label }, range: [up.low, up.high], zeroline: false },
@@ -181,9 +192,10 @@ const panels = [
   ...facts.controls.map((c, k) => ({ label: c.label, of: (loop) => loop.u.map((u) => u[k]), limits: [c.lower, c.upper] })),
   { label: "cost", of: (loop) => loop.V, beside: (loop) => loop.toGo },
 ];
-const columns = panels.length < 6 ? 1 : panels.length < 13 ? 2 : 3, rows = Math.ceil(panels.length / columns);
 function drawCourses() {
   const traces = [], shapes = [], layout = {};
+  const columns = phone.matches || panels.length < 6 ? 1 : panels.length < 13 ? 2 : 3;
+  const rows = Math.ceil(panels.length / columns);
   panels.forEach((panel, p) => {
     const id = p ? p + 1 : "", names = { xaxis: `x${id}`, yaxis: `y${id}` }, column = Math.floor(p / rows), row = p % rows;
     const gap = columns > 1 ? 0.1 : 0, width = (1 - gap * (columns - 1)) / columns, height = 1 / rows;
@@ -218,6 +230,13 @@ function drawCourses() {
     legend: { orientation: "h", x: 0, y: -70 / (125 * rows), yanchor: "top" },
   }, CONFIG);
 }
+// A line while the last closed loop starts outside X0, where only a proved funnel says something.
+function warn(loop) {
+  const held = loop && facts.funnel && depth({ t: 0, x: loop.x[0], V: loop.V[0] }) > 0;
+  element("outside").hidden = !loop?.outside;
+  element("outside").textContent = "This start lies outside the initial states X₀ that the controller was trained on: " +
+    (held ? "only the proved funnel holds it." : "nothing is said about it.");
+}
 function tell() {
   const head = ["", "J(x₀)", "V(0, x₀)", "time at a limit", "constraints"];
   const shown = head.map((_, c) => c < 3 || (c === 3 ? hasLimits : facts.constraints.length > 0));
@@ -225,6 +244,7 @@ function tell() {
     loop.name, Number.isFinite(loop.cost) ? short(loop.cost) : "diverges", short(loop.V[0]),
     `${(100 * loop.atLimit).toFixed(0)} %`, loop.worst > 0 ? "violated" : "kept",
   ]);
+  warn(chosen.loops.at(-1));
   element("loops").replaceChildren(...(lines.length ? [head, ...lines] : []).map((cells, r) => {
     const row = document.createElement("tr");
     row.append(...cells.filter((_, c) => shown[c]).map((text) => {
@@ -234,6 +254,13 @@ function tell() {
     }));
     return row;
   }));
+}
+
+// Where X0 is too thin to be hit by a click, what is close to it is on it.
+function onThin(value, k) {
+  const { low, high } = axis(k), middle = (facts.initialStates.lower[k] + facts.initialStates.upper[k]) / 2;
+  const thin = facts.initialStates.upper[k] - facts.initialStates.lower[k] < 0.01 * (high - low);
+  return thin && Math.abs(value - middle) < 0.02 * (high - low) ? middle : value;
 }
 
 // What the user sets.
@@ -325,6 +352,7 @@ moveTo(0);
 element("plane").on("plotly_click", ({ points: [point], event }) => {
   const box = document.querySelector("#plane .nsewdrag").getBoundingClientRect();
   const { x } = at(point.xaxis.p2d(event.clientX - box.left), point.yaxis.p2d(event.clientY - box.top));
+  for (const k of chosen.axes) if (k !== TIME) x[k] = onThin(x[k], k);
   start(x);
 });
 let waiting = false; // a slider may tell more often than the plane can be drawn
@@ -338,4 +366,7 @@ element("t").addEventListener("input", () => {
 element("across").addEventListener("change", (event) => choose(0, Number(event.target.value)));
 element("up").addEventListener("change", (event) => choose(1, Number(event.target.value)));
 element("layer").addEventListener("change", (event) => { chosen.layer = event.target.value; drawPlane(); });
+const watched = new ResizeObserver((changes) => changes.forEach(({ target }) => Plotly.Plots.resize(target)));
+for (const id of ["plane", "courses"]) watched.observe(element(id));
+phone.addEventListener("change", () => { drawPlane(); drawCourses(); });
 element("clear").addEventListener("click", () => { chosen.loops = []; drawPlane(); drawCourses(); tell(); });

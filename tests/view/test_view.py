@@ -10,9 +10,11 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
+from lyapnet.certification.checking import KeptSide
 from lyapnet.cli import main
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
+from lyapnet.sets import Box
 from lyapnet.view import page_of
 from tests.problems import Formula, untrained
 
@@ -27,27 +29,32 @@ ACT = """<script>window.addEventListener("load", async () => {
     element("t").dispatchEvent(new Event("input"));
     await pause(300);
   };
-  const click = async () => {
+  const click = async (a, b) => {
     const drag = document.querySelector("#plane .nsewdrag"), box = drag.getBoundingClientRect();
-    const place = { clientX: box.left + 0.3 * box.width, clientY: box.top + 0.4 * box.height };
+    const { xaxis, yaxis } = element("plane")._fullLayout;
+    const place = { clientX: box.left + xaxis.d2p(a), clientY: box.top + yaxis.d2p(b) };
     const send = (to, kind) => to.dispatchEvent(new MouseEvent(kind, { ...place, bubbles: true, view: window }));
     send(drag, "mousemove"); await pause(300);
     send(drag, "mousedown"); await pause(20);
     send(document.querySelector(".dragcover") || drag, "mouseup"); await pause(500);
   };
-  tell(); await slide(); tell(); await click(); tell();
+  await (async () => { DO })();
   document.title = told.join(" ");
 });</script></body>"""
+SLIDE_AND_CLICK = "tell(); await slide(); tell(); await click(-0.4, 0.1); tell();"
+WARNED = """told.push([!element("outside").hidden, element("plane").data.at(-2).line.dash,
+                       element("plane").data.at(-2).name.includes("outside")].join());"""
 
 
-def shown(page, folder):
+def shown(page, folder, act=SLIDE_AND_CLICK, width=1300):
     """What a browser makes of a page: the title that ACT leaves, and the line of the check."""
     if BROWSER is None:
         pytest.skip("no chromium-headless-shell or chromium")
     path = folder / "page.html"
-    path.write_text(ACT.join(page.rsplit("</body>", 1)), encoding="utf-8")
-    options = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--virtual-time-budget=10000", "--dump-dom"]
-    done = subprocess.run([BROWSER, *options, f"file://{path}"], capture_output=True, text=True, timeout=60, check=True)
+    path.write_text(ACT.replace("DO", act).join(page.rsplit("</body>", 1)), encoding="utf-8")
+    options = ["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--virtual-time-budget=10000"]
+    command = [BROWSER, *options, f"--window-size={width},900", "--dump-dom", f"file://{path}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
     return re.findall(r"<title>(.*?)</title>", done.stdout)[0], re.findall(r'id="check"[^>]*>(.*?)</p>', done.stdout)[0]
 
 
@@ -89,6 +96,50 @@ def test_a_page_that_differs_from_the_controller_says_so(tmp_path):
     page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
     wrong = page.replace('"V": [', '"V": [9e9, ')
     assert "do not use it" in shown(wrong, tmp_path)[1]
+
+
+def test_a_start_outside_of_the_initial_states_is_told(tmp_path):
+    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    places = ("0.9, -0.6", "1.07, 0.1", "-0.9, 0.6", "0.1, -0.75")  # X₀ is |position| ≤ 1, |velocity| ≤ 0.7
+    title, _ = shown(page, tmp_path, " ".join(f"await click({place}); {WARNED}" for place in places))
+    inside, outside = "false,solid,false", "true,dash,true"
+    assert title.split() == [inside, outside, inside, outside]
+
+
+def test_the_warning_goes_with_the_closed_loops(tmp_path):
+    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    hidden = 'told.push(element("outside").hidden);'
+    title, _ = shown(page, tmp_path, f'{hidden} await click(1.07, 0.1); {hidden} element("clear").click(); {hidden}')
+    assert title.split() == ["true", "false", "true"]
+
+
+def test_the_warning_says_where_a_proved_funnel_holds(tmp_path):
+    controller = untrained("double_integrator", "horizon.steps=6")
+    states = Box(torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]))
+    funnel = KeptSide(0.1, 0.0, states, None, degree=2, rho=1e9, seconds=1.0)
+    page = page_of(controller, "double integrator", funnel)
+    says = 'await click(1.5, 0.1); told.push(element("outside").textContent.includes("only the proved funnel"));'
+    assert shown(page, tmp_path, says)[0] == "true"
+    assert shown(page.replace('"rho": 1000000000.0', '"rho": -1.0'), tmp_path, says)[0] == "false"
+
+
+def test_a_click_beside_thin_initial_states_starts_in_them(tmp_path):
+    page = page_of(untrained("cartpole_family", "horizon.steps=6", "network.hidden=[8]"), "cart-pole family")
+    at_side = f"await click(share * axis(0).high, 3.2); {WARNED}"
+    title, _ = shown(page, tmp_path, f"for (const share of [0.03, 0.5]) {{ {at_side} }}")
+    assert title.split() == ["false,solid,false", "true,dash,true"]  # the cart's position is 0 in X₀
+
+
+@pytest.mark.parametrize(("name", "width"), [("three_link_arm", 420), ("keep_out", 420), ("double_integrator", 800)])
+def test_a_page_fits_its_window(name, width, tmp_path):
+    page = page_of(untrained(name, "horizon.steps=6", "network.hidden=[8]"), f"controller of {name}")
+    act = """await click(0, 0.1); const right = (found) => found.getBoundingClientRect().right;
+    told.push([innerWidth, Math.max(...[...document.querySelectorAll("body *")].map(right))].join());"""
+    window, right = map(float, shown(page, tmp_path, act, width)[0].split(","))
+    assert window == width
+    assert right <= width
+    wide = page.replace("</style>", "#plane { width: 900px; }</style>")
+    assert float(shown(wide, tmp_path, act, width)[0].split(",")[1]) > width
 
 
 def test_a_missing_plotly_is_named(monkeypatch):

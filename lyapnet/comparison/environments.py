@@ -13,7 +13,7 @@ import torch
 from gymnasium import spaces
 
 from lyapnet.comparison.reference_problems import BoundedProblem, bounded_problem
-from lyapnet.errors import DivergenceError
+from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.problem import Problem
 from lyapnet.types import PerState, State
 
@@ -104,22 +104,31 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         task: a reference task by name, a config file, or a Problem; lyapnet/Task-v0 makes an environment of any.
         control_scale: max |u_i|; known for the reference tasks.
         observe_time: join t in s to the observation: the optimal control depends on it.
+        render_mode: "rgb_array": `render` returns a picture of the present, as `lyapnet animate` draws it.
 
     Raises:
-        UsageError: see bounded_problem.
+        UsageError: another render_mode; or see bounded_problem.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012  (Gymnasium's own declaration)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 100}  # noqa: RUF012  (Gymnasium's own declaration)
 
     def __init__(
         self,
         task: str | Path | Problem | None = None,
         control_scale: float | Sequence[float] | None = None,
         observe_time: bool = False,
+        render_mode: str | None = None,
     ):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UsageError(f'Expected render_mode="rgb_array" or none, got {render_mode!r}; it is the only one.')
         self._episode = Episodes(bounded_problem(task, control_scale), observe_time)
         self.observation_space, self.action_space = self._episode.observation_space, self._episode.action_space
-        self.render_mode = None
+        self.metadata = {**self.metadata, "render_fps": round(1 / self.problem.horizon.dt, 3)}  # real time
+        self.render_mode, self._picture = render_mode, None
+        if render_mode is not None:
+            from lyapnet.evaluation.scenes import Picture  # matplotlib, which learning does without
+
+            self._picture = Picture(self.problem)
 
     @property
     def problem(self) -> Problem:
@@ -151,13 +160,31 @@ class Environment(gymnasium.Env[np.ndarray, np.ndarray]):
         if x0.shape != drawn.shape:
             raise ValueError(f'Expected options["state"] of shape {drawn.shape}, got {x0.shape}; give one state.')
         self._episode.start(torch.as_tensor(x0).to(box.lower))
+        if self._picture is not None:
+            self._picture.begin(self.state)
         return self._episode.observation, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         reward = float(self._episode.advance(action))
         self._episode.require_finite()
         info = {"control": self._episode.control.numpy().copy(), "clipped": bool((np.abs(action) >= 1).any())}
+        if self._picture is not None:
+            self._picture.go_on(self.state, info["control"])
         return self._episode.observation, reward, False, self._episode.over, info
+
+    def render(self) -> np.ndarray | None:
+        """The present as (height, width, 3) bytes; None without a render_mode.
+
+        Raises:
+            ResetNeeded: no episode has begun.
+            UsageError: the system's `draw` fails.
+        """
+        if self._picture is None:
+            gymnasium.logger.warn('render() shows nothing without render_mode="rgb_array".')
+            return None
+        if not self._picture.path:
+            raise gymnasium.error.ResetNeeded("Expected reset() before render(), got none; call it first.")
+        return self._picture.frame()
 
 
 IDS = {

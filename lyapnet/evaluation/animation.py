@@ -16,18 +16,16 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, FancyArrowPatch
-from matplotlib.patches import Polygon as Patch
 from PIL import Image
 
 from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
 from lyapnet.errors import UsageError, one_line
-from lyapnet.evaluation.figures import Slice, widest_axes
+from lyapnet.evaluation.figures import Slice
+from lyapnet.evaluation.scenes import artist_of, plane_axes, set_plane, set_stage, shapes_of
 from lyapnet.files import write_atomically
 from lyapnet.problem import Problem
 from lyapnet.rollout import Trajectory
-from lyapnet.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
+from lyapnet.shapes import Shape, corners_of
 from lyapnet.types import Value
 
 SHORTEST, LONGEST = 3.0, 10.0  # seconds of an animation whose speed nobody gave
@@ -152,23 +150,12 @@ class Film:
         """The panel of the system's shapes; what puts those of a node into it."""
         panel, problem = self._left(), self.problem
         shown = [self._shapes(node, loop) for node in self.nodes for loop in range(self.x.shape[1])]
-        goal = shapes_of(problem, numpy_of(problem.goal), numpy_of(problem.rest))
-        corners = np.concatenate([corners_of(shape) for shapes in (*shown, goal) for shape in shapes])
-        low, high = corners.min(0), corners.max(0)
-        side = 1.1 * max(float((high - low).max()), 1e-9) / 2
-        panel.set(xlim=(low + high)[0] / 2 + [-side, side], ylim=(low + high)[1] / 2 + [-side, side])
-        panel.set_aspect("equal")
-        panel.set_xlabel("(m)", fontsize=8)
-        panel.tick_params(labelsize=7)
-        panel.grid(color="#EEEEEE", linewidth=0.6)
-        panel.set_axisbelow(True)
-        for shape in goal:
-            panel.add_artist(_artist(shape, VERMILION, 0.35))
+        set_stage(panel, problem, np.concatenate([corners_of(shape) for shapes in shown for shape in shapes]))
 
         def put(node: int) -> Iterator[Artist]:
             for loop in reversed(range(self.x.shape[1])):
                 for shape in self._shapes(node, loop):
-                    yield panel.add_artist(_artist(shape, BLUE, BEHIND if loop else 1.0))
+                    yield panel.add_artist(artist_of(shape, BLUE, BEHIND if loop else 1.0))
 
         return put
 
@@ -177,16 +164,8 @@ class Film:
         panel, problem = self._left(), self.problem
         if problem.system.n < 2:
             raise UsageError(f"Expected {problem.system.title}.draw, got none, and one state has no plane; write it.")
-        i, j = (*widest_axes(problem.initial_states), 1, 0)[:2]
-        for axis, index in (("x", i), ("y", j)):
-            getattr(panel, f"set_{axis}label")(problem.system.state_labels[index], fontsize=8)
-        low, high = self.x.min((0, 1))[[i, j]], self.x.max((0, 1))[[i, j]]
-        margin = 0.06 * np.maximum(high - low, 1e-9)
-        panel.set_xlim(low[0] - margin[0], high[0] + margin[0])
-        panel.set_ylim(low[1] - margin[1], high[1] + margin[1])
-        panel.tick_params(labelsize=7)
-        panel.plot(*numpy_of(problem.goal)[[i, j]], "*", color=VERMILION, markersize=10)
-        region = _grid(problem, (i, j), low - margin, high + margin)
+        axes = plane_axes(problem)
+        region = _grid(problem, axes, *set_plane(panel, problem, axes, self.x.reshape(-1, problem.system.n)))
         first = self._values(0, region)
         levels = np.quantile(first, np.linspace(0.03, 0.97, 9))
         levels = levels[np.append(True, np.diff(levels) > 0)]
@@ -195,7 +174,7 @@ class Film:
             coordinates = [numpy_of(line) for line in region.grid]
             yield panel.contour(*coordinates, self._values(node, region), levels=levels, colors=GREY, linewidths=0.7)
             for loop in range(self.x.shape[1]):
-                path = self.x[: node + 1, loop][:, [i, j]]
+                path = self.x[: node + 1, loop][:, axes]
                 yield from panel.plot(*path.T, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
                 yield from panel.plot(*path[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
 
@@ -241,46 +220,6 @@ class Film:
         return [(lines[0], times, values[:, 0])]
 
 
-def shapes_of(problem: Problem, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
-    """What the system draws in a state (n,) under a control (m,).
-
-    Raises:
-        UsageError: its `draw` fails, or returns something else.
-    """
-    system = problem.system
-    try:
-        shapes = list(system.draw(np.asarray(x, dtype=float), np.asarray(u, dtype=float)))
-        finite = all(isinstance(s, Shape) and np.isfinite(corners_of(s)).all() and corners_of(s).size for s in shapes)
-    except Exception as error:  # of any kind: the system may be the user's
-        raise UsageError(
-            f"Expected {system.title}.draw(x, u) of arrays ({system.n},) and ({system.m},), got {one_line(error)}; "
-            "return Line, Disk, Polygon and Arrow of lyapnet.shapes."
-        ) from error
-    if not finite:
-        raise UsageError(
-            f"Expected {system.title}.draw to return Line, Disk, Polygon and Arrow of lyapnet.shapes at finite points "
-            f"(x, y), got {shapes}; correct it."
-        )
-    return shapes
-
-
-def _artist(shape: Shape, color: str, alpha: float) -> Artist:
-    match shape:
-        case Line(points, width, faint):
-            tint = GREY if faint else color
-            return Line2D(*np.asarray(points).T, color=tint, linewidth=width, alpha=alpha, solid_capstyle="round")
-        case Disk(center, radius):
-            return Circle(tuple(np.asarray(center)), radius, color=color, alpha=alpha, linewidth=0)
-        case Polygon(points):
-            return Patch(np.asarray(points), closed=True, color=color, alpha=alpha, linewidth=0)
-        case Arrow(tail, head):
-            tint = ORANGE if color == BLUE else color
-            return FancyArrowPatch(
-                tuple(np.asarray(tail)), tuple(np.asarray(head)), arrowstyle="-|>", mutation_scale=9, color=tint,
-                alpha=alpha, shrinkA=0, shrinkB=0, linewidth=1.5,
-            )  # fmt: skip
-
-
 def _palette() -> Image.Image:
     """The colours of all figures, each in steps to white, and greys: at most 256."""
     named = [to_rgb(color) for color in (BLUE, GREEN, ORANGE, VERMILION, GREY, "black")]
@@ -290,7 +229,7 @@ def _palette() -> Image.Image:
     return palette
 
 
-def _grid(problem: Problem, axes: tuple[int, int], low: np.ndarray, high: np.ndarray, points: int = 41) -> Slice:
+def _grid(problem: Problem, axes: list[int], low: np.ndarray, high: np.ndarray, points: int = 41) -> Slice:
     """A grid of two states, the others at the centre of X₀."""
     like = problem.initial_states.center
     grid = [torch.linspace(float(a), float(b), points).to(like) for a, b in zip(low, high, strict=True)]

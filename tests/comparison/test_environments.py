@@ -80,7 +80,6 @@ def test_checkers_pass(name, observe_time):
     environment = gymnasium.make(IDS[name], observe_time=observe_time).unwrapped
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*(minimum|maximum) value is.*infinity.*")  # a state has no bounds
-        warnings.filterwarnings("ignore", ".*render.*")
         gymnasium_check(environment)
     sb3_check(environment)
 

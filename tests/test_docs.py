@@ -83,7 +83,7 @@ def pictures(page: Path) -> list[Path]:
 
 
 def test_every_picture_is_on_one_page():
-    shown = [picture for page in PAGES for picture in pictures(page)]
+    shown = [picture for page in (*PAGES, *ROOT.glob("docs/tutorials/*.md")) for picture in pictures(page)]
     assert all(picture.is_file() for picture in shown)
     assert len(shown) == len(set(shown))
     assert {*shown, *pictures(REPORT)} == {*ROOT.glob("docs/**/*.png"), *ROOT.glob("docs/**/*.gif")}

@@ -1,10 +1,12 @@
 """The documentation site: what it needs from elsewhere, that its figures are on record, and that its tutorials run."""
 
+import ast
 import csv
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -77,6 +79,44 @@ def test_links_that_lead_nowhere_are_found(tmp_path):
     assert broken_links(tmp_path) == ["a.html: #here", "sub/b.html: ../a.html#here", "sub/b.html: ../picture.png"]
 
 
+def silent_cells(page: str) -> list[str]:
+    """The cells of a tutorial that print or end in an expression, without what they printed behind them."""
+    cells = re.findall(r"```\{code-cell\} ipython3\n(.*?)```\n\n?(```text\n|!\[)?", page, re.DOTALL)
+    return [cell for cell, printed in cells if shows(cell) and not printed]
+
+
+def shows(cell: str) -> bool:
+    if re.search(r"^!|\bprint\(|\.train\(|\.fit\(", re.sub(r'""".*?"""', "", cell, flags=re.DOTALL), re.MULTILINE):
+        return True
+    code = "\n".join(line for line in cell.splitlines() if not line.startswith(("%", ":")))
+    return isinstance(ast.parse(code).body[-1], ast.Expr)
+
+
+TUTORIALS = [page for page in sorted((DOCS / "tutorials").glob("*.md")) if "{code-cell}" in page.read_text("utf-8")]
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_a_tutorial_says_what_its_cells_printed(page):
+    text = page.read_text(encoding="utf-8")
+    assert silent_cells(text) == []
+    last = re.findall(r"```text\n.*?\n```\n", text, re.DOTALL)[-1]
+    assert len(silent_cells(text.replace(last, ""))) == 1
+
+
+def test_tutorials_that_are_run_lose_what_they_printed_before(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS / "_extensions")
+    from printed_outputs import without_printed  # pyright: ignore[reportMissingImports]
+
+    for page in TUTORIALS:
+        text = page.read_text(encoding="utf-8")
+        for mode, kept in (("off", True), ("force", False)):
+            app, source = SimpleNamespace(config=SimpleNamespace(nb_execution_mode=mode)), [text]
+            without_printed(app, f"tutorials/{page.stem}", source)
+            assert ("```text" in source[0], "printed_" in source[0]) == (kept, kept and "printed_" in text)
+            assert source[0].count("{code-cell}") == text.count("{code-cell}")
+            assert source[0].count("```") % 2 == 0
+
+
 @pytest.mark.slow
 def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_path):
     pytest.importorskip("myst_nb")
@@ -87,3 +127,4 @@ def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_pa
     assert broken_links(tmp_path) == []
     assert re.search(loaded, '<script async src="https://cdn.example.org/mathjax.js">')
     assert not [page for page in tmp_path.rglob("*.html") if re.search(loaded, page.read_text(encoding="utf-8"))]
+    assert not list(tmp_path.rglob("printed_*")), "the outputs are those of this run"

@@ -95,6 +95,12 @@ def _float64_and_seed_0():
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def _commands_say_no_more_than_they_find(monkeypatch):
+    """On a slow machine they would also say what they are doing."""
+    monkeypatch.setattr("lyapnet.cli.options.FIRST", float("inf"))
+
+
 @pytest.fixture
 def traced() -> bool | None:
     """Whether rollouts with the discrete costate run in a trace, or as they are written; None is their own choice.

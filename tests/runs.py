@@ -21,7 +21,7 @@ from tensorboard.backend.event_processing.plugin_event_accumulator import EventA
 from tensorboard.util import tensor_util
 
 from lyapnet.checkpoint import read_checkpoint
-from lyapnet.cli import main
+from lyapnet.cli import main, options
 
 SMALL = {
     "experiment": "small",
@@ -114,6 +114,7 @@ def _train(folder, arguments, prepare):
     for name, descriptor in (("output.txt", 1), ("errors.txt", 2)):
         os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
     torch.set_num_threads(1)
+    options.FIRST = float("inf")  # as in the tests themselves
     newest = max((path.stat().st_ctime for path in Path().rglob("events.out.tfevents.*")), default=0)
     while int(newest) == int(time.time()):  # event files are sorted by the second in which they were opened
         time.sleep(0.02)

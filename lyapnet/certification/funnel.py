@@ -29,7 +29,7 @@ from lyapnet.certification.preconditions import (
     require_continuous,
     without,
 )
-from lyapnet.certification.proof import Progress, Proof, prove
+from lyapnet.certification.proof import Progress, Proof, prove, tell
 from lyapnet.certification.verdict import Verdict, time_spent, verdict_on
 from lyapnet.constraints import names_of
 from lyapnet.contracts import copied
@@ -154,7 +154,7 @@ def sound_claim(
     )
     duration = problem.horizon.duration
     left_out, initial_states, wanted, D, domain, sides, levels, assumed = setting_of(
-        condition, problem, duration, states, budget
+        condition, problem, duration, states, budget, report
     )
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
@@ -213,7 +213,12 @@ class Setting(NamedTuple):
 
 
 def setting_of(
-    condition: DecreaseCondition, problem: Problem, duration: float, states: Box | None, budget: Budget
+    condition: DecreaseCondition,
+    problem: Problem,
+    duration: float,
+    states: Box | None,
+    budget: Budget,
+    report: Callable[[Progress], None] | None = None,
 ) -> Setting:
     """The setting of a claim about a condition, whose V and h are traced for it, once.
 
@@ -221,23 +226,28 @@ def setting_of(
         duration: T, or 0 for what holds at t = 0 alone.
         states: D; by default a box around where samples of W are low enough.
         budget: of the claim; a share of it is for levels.
+        report: is told what is done.
 
     Raises:
         UsageError: D does not fit; or the condition is none that bounds can speak of.
     """
+    tell(report, budget, "calling and tracing f, g, the cost, V and u")
     memory = freeze(condition, over_time(problem.initial_states, duration))
     constants, goal = condition.closed_loop.system.constants, problem.goal.double()
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
     X0 = without(problem.initial_states, left_out)
     require_continuous(condition.V, X0.lower, X0.upper)
     levels = for_levels(budget)
+    tell(report, budget, "the largest V on X₀")
     wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
+    tell(report, budget, "the set D, and whether the law and the condition are as they should be on it")
     states = without(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
     assumed = check_controls(condition.closed_loop, domain)
     memory.check()
+    tell(report, budget, "the least V on the boundary of D")
     axes = [1 + i for i in range(states.dimension) if i not in (*left_out, *constants)]
     return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, assumed)
 
@@ -260,11 +270,13 @@ def proof_within(
         options: of prove.
     """
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
+    tell(options.get("report"), budget, "tracing the condition, and seeking where it fails")
     with signals_taken(search.stop.ask):
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options.get("keep")
         raise Interrupted(KEPT.format(keep) if keep else NOT_KEPT, 130)
+    tell(options.get("report"), budget, "what follows from the proof")
     return proof
 
 

@@ -186,7 +186,7 @@ def lower_claim(
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, delta, problem)
     cost, duration = condition.closed_loop.cost, condition.duration
-    left_out, X0, wanted, D, domain, sides, *_ = setting_of(condition, problem, duration, states, budget)
+    left_out, X0, wanted, D, domain, sides, *_ = setting_of(condition, problem, duration, states, budget, report)
     _require_still(condition, domain)
     needed = just_above(wanted)
     excess = _excess(condition, D, needed, budget)

@@ -47,11 +47,18 @@ class Proof:
 
 
 class Progress(NamedTuple):
-    """How far a proof is."""
+    """How far a proof is; or what is done before its first box, and after its last one."""
 
     boxes: int  # bounded so far
     remaining: float  # share of the domain that is undecided
     seconds: float
+    stage: str = "bounding boxes"
+
+
+def tell(report: Callable[[Progress], None] | None, budget: Budget, stage: str) -> None:
+    """Tell a report what is done while no boxes of a proof are bounded."""
+    if report is not None:
+        report(Progress(0, 1.0, budget.elapsed, stage))
 
 
 CPU = torch.device("cpu")

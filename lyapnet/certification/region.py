@@ -247,7 +247,7 @@ def region_claim(
         states, w = states and plants.around(states), None if w is None else plants.pushed(w)
     condition = RecedingDecrease(loop, decay, w, names)
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
-    setting = setting_of(condition, problem, 0.0, states, budget)
+    setting = setting_of(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:

@@ -1,33 +1,21 @@
 """What certificates show in a terminal."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 
-@contextmanager
-def proof_progress(console: Console, kind: str) -> Iterator[Callable[[Any], None]]:
-    """A bar in a terminal: how much of [0, T] × D, of D or of X₀ a proof has decided. It is told of Progress."""
+def progress_told_to(stages: Callable[..., None], kind: str) -> Callable[[Any], None]:
+    """Tells stages of Progress: what is done, and how much of [0, T] × D, of D or of X₀ a proof has left undecided."""
     domain = {"region": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(kind, "[0, T] × D")
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[state]}", markup=False),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"certifying, {kind}", total=None, state="")
 
-        def report(progress: Any) -> None:
-            state = f"{progress.boxes} boxes, {progress.remaining:.2%} of {domain} undecided"
-            bar.update(task, total=1.0, completed=1 - progress.remaining, state=state)
+    def report(progress: Any) -> None:
+        undecided = f"{progress.boxes:,} boxes, {progress.remaining:.2%} of {domain} undecided"
+        stages(progress.stage, detail=undecided if progress.boxes else "")
 
-        yield report
+    return report
 
 
 def certificate_table(title: str, result: Mapping[str, Any], labels: Mapping[str, str]) -> Table:

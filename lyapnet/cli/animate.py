@@ -41,8 +41,8 @@ def animate(
             x0 = controller.initial_states.lower.new_tensor([[float(entry) for entry in start.split(",")]])
         except ValueError as error:
             raise UsageError(f"Expected --from as numbers, got {start!r}; as in --from 0.5,-0.2.") from error
-    notes = Console(highlight=False, markup=False)
-    with notes.status("animating …"):
-        film = Film(controller.rollout(x0), controller.problem, controller.value, rate, speed)
-        film.write(out)
-    notes.print(f"wrote {out}", soft_wrap=True)
+    given.report("animating")
+    film = Film(controller.rollout(x0), controller.problem, controller.value, rate, speed)
+    film.write(out)
+    given.report.rest()
+    Console(highlight=False, markup=False).print(f"wrote {out}", soft_wrap=True)

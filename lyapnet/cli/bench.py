@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from typer.core import TyperGroup
 
-from lyapnet.cli.options import Debug, Given, of_a_controller
+from lyapnet.cli.options import Debug, Given, of_a_controller, stages_of
 from lyapnet.errors import UsageError
 from lyapnet.files import plain
 from lyapnet.sizes import THREADS
@@ -89,17 +88,18 @@ def gradient(
     batches = [_count("--batch", text) for text in _items(batch) or ["12", "64", "512"]]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
-    say = partial(notes.print, soft_wrap=True)
+    console, report = Console(highlight=False, markup=False), stages_of("gradient")
+    say, rows = partial(report.console.print, soft_wrap=True), []
     if not has_compiler():
         say("No C++ compiler ($CXX, g++ or clang++): compiled rows are left out.")
-    rows = []
-    for case, names in chosen:
-        for size in batches:
-            with notes.status(escape(f"{case.name}, batch {size}: {', '.join(names)}")):
+    with report:
+        for case, names in chosen:
+            for size in batches:
+                report(f"{case.name}, batch {size}: {', '.join(names)}")
                 rows += benchmark.time_routes(case, size, names, repeats, say)
-        if not as_json:
-            console.print(bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
+            report.rest()
+            if not as_json:
+                console.print(bench_table(case, [row for row in rows if row.task == case.name], repeats, threads))
     if as_json:
         print(json.dumps([asdict(row) for row in rows]))
     if figures is not None:
@@ -146,16 +146,18 @@ def certify(
     lengths = [_count("--dimensions", text) for text in _items([dimensions])]
     if figures is not None:
         figures.mkdir(parents=True, exist_ok=True)
-    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
+    console, report = Console(highlight=False, markup=False), stages_of("certify")
+    notes, proofs = report.console, []
     case = condition_of_network() if checkpoint is None else condition_of_controller(load(checkpoint))
-    enclosures = enclosures_of(case.condition, (case.lower, case.upper), partial(notes.print, soft_wrap=True))
-    with notes.status(escape(f"{case.name}: {', '.join(enclosures)}")):
+    with report:
+        enclosures = enclosures_of(case.condition, (case.lower, case.upper), partial(notes.print, soft_wrap=True))
+        report(f"{case.name}: {', '.join(enclosures)}")
         bounds = tightness(case, enclosures, boxes, repeats)
-    proofs = []
-    with notes.status("chains of integrators") as status:
+        report("chains of integrators")
         for proof in growth(lengths, seconds):
             proofs.append(proof)
-            status.update(f"{proof.case}, {proof.method}: {proof.verdict} after {proof.seconds:.3g} s")
+            last = f"{proof.case}, {proof.method}: {proof.verdict} after {proof.seconds:.3g} s"
+            report("chains of integrators", detail=last)
     if as_json:
         print(
             json.dumps(
@@ -195,8 +197,9 @@ def law(
         from lyapnet.comparison.timing import alternatives
 
         others = alternatives(controller)
-    with Console(stderr=True).status("writing, compiling, timing …"):
-        rows = latencies(controller, seconds, others)
+    given.report("writing, compiling, timing")
+    rows = latencies(controller, seconds, others)
+    given.report.rest()
     if as_json:
         print(json.dumps([asdict(row) for row in rows]))
     else:

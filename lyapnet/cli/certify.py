@@ -65,7 +65,9 @@ def sampled(
     from lyapnet.certification.sampling_certificates import sampled_certificate
 
     require_writable(figure, report)
-    certificate = sampled_certificate(given.load(), samples, radius, seed)
+    controller = given.load()
+    given.report(f"closed loops from {samples:,} states of X₀")
+    certificate = sampled_certificate(controller, samples, radius, seed)
     _record(certificate, draws_of(given.checkpoint, given.at, **given.own, radius=radius))
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
@@ -100,6 +102,7 @@ def statistical(
     controller = given.load()
     draws = draws_of(given.checkpoint, given.at, **given.own, radius=radius)
     made = 1 + draws.others(seed, samples)
+    given.report(f"closed loops from {samples:,} states of X₀")
     certificate = statistical_certificate(controller, samples, confidence, share, radius, seed, draws=made)
     _record(certificate, draws)
     _show(certificate, given, as_json)
@@ -141,24 +144,23 @@ def sound(
         raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set, sound_certificate
-    from lyapnet.certification.tables import proof_progress
+    from lyapnet.certification.tables import progress_told_to
     from lyapnet.certification.two_sided_certificate import two_sided_certificate
 
     if states is not None:
         parse_set(states)
     require_writable(figure, report, keep)
-    notes = Console(stderr=True, highlight=False, markup=False)
+    progress = progress_told_to(given.report, "sound")
 
     def certified(path: Path, started: float | None = None) -> Any:
         started = started or time.monotonic()
         found = given.of(path)
         controller = found.load()
         made = two_sided_certificate if two_sided else partial(sound_certificate, disturbance=disturbance)
-        with proof_progress(notes, "sound") as progress:
-            certificate = made(
-                controller, alpha, delta, states, seconds, workers, device,
-                keep=keep, seed=seed, report=progress, ray=ray, started=started,
-            )  # fmt: skip
+        certificate = made(
+            controller, alpha, delta, states, seconds, workers, device,
+            keep=keep, seed=seed, report=progress, ray=ray, started=started,
+        )  # fmt: skip
         _show(certificate, found, as_json)
         return certificate
 
@@ -214,26 +216,24 @@ def region(
     from lyapnet.certification.region_certificate import region_certificate
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set
-    from lyapnet.certification.tables import proof_progress
+    from lyapnet.certification.tables import progress_told_to
 
     if states is not None:
         parse_set(states)
     require_writable(figure, report, keep)
     given = given.with_functions(value, law)
-    options, notes = (decay, states, seconds, workers, device), Console(stderr=True, highlight=False, markup=False)
+    options, progress = (decay, states, seconds, workers, device), progress_told_to(given.report, "region")
     if several:
         controller = given.load()
-        with proof_progress(notes, "region") as progress:
-            regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress, parameter)
+        regions = regions_under_pushes(controller, disturbance or (), *options, seed, progress, parameter)
         return _show_several(regions, given, as_json, figure)
 
     def certified(path: Path, started: float | None = None) -> Any:
         started, found = started or time.monotonic(), given.of(path)
         controller = found.load()
-        with proof_progress(notes, "region") as progress:
-            made = region_certificate(
-                controller, *options, disturbance, keep, seed, progress, parameter, ray=ray, started=started
-            )
+        made = region_certificate(
+            controller, *options, disturbance, keep, seed, progress, parameter, ray=ray, started=started
+        )
         _show(made, found, as_json)
         return made
 
@@ -268,7 +268,7 @@ def tube(
     begun = time.monotonic()
     from lyapnet.certification.report import require_writable
     from lyapnet.certification.sound_certificate import parse_set
-    from lyapnet.certification.tables import proof_progress
+    from lyapnet.certification.tables import progress_told_to
     from lyapnet.certification.tubes.certificate import tube_certificate
     from lyapnet.certification.tubes.two_sided import two_sided_tube
 
@@ -282,10 +282,8 @@ def tube(
     made = partial(tube_certificate, controller)
     if two_sided:
         made = partial(two_sided_tube, controller, 0.95 if beta is None else beta, delta, states)
-    with proof_progress(
-        Console(stderr=True, highlight=False, markup=False), "two-sided tube" if two_sided else "tube"
-    ) as progress:
-        certificate = made(radius, seconds, workers, seed, progress, started=begun)
+    progress = progress_told_to(given.report, "two-sided tube" if two_sided else "tube")
+    certificate = made(radius, seconds, workers, seed, progress, started=begun)
     _show(certificate, given, as_json)
     _write(certificate, given, as_json, figure, report)
 
@@ -304,12 +302,12 @@ def check(
     """Whether a kept proof proves its claim: its leaves are bounded anew, without a search."""
     from lyapnet.certification.checking import check as checked
     from lyapnet.certification.checking import labels_of
-    from lyapnet.certification.tables import certificate_table, proof_progress
+    from lyapnet.certification.tables import certificate_table, progress_told_to
 
     given = given.with_functions(value, law)
     controller = given.load()
-    with proof_progress(Console(stderr=True, highlight=False), "check") as progress:
-        result = checked(controller, proof, workers, progress)
+    result = checked(controller, proof, workers, progress_told_to(given.report, "check"))
+    given.report.rest()
     if as_json:
         print(json.dumps(result, allow_nan=False))
     else:
@@ -328,6 +326,9 @@ def _show(certificate: Any, given: Given, as_json: bool) -> None:
     """The certificate as a table, unless JSON is asked for."""
     from lyapnet.certification.tables import certificate_table
 
+    given.report("comparing with the optimum")
+    certificate.result  # noqa: B018  # computed now, where it is told
+    given.report.rest()
     if not as_json:
         table = certificate_table(given.title, certificate.result, certificate.labels)
         Console(highlight=False, markup=False).print(table)
@@ -338,6 +339,7 @@ def _show_several(regions: Any, given: Given, as_json: bool, figure: Path | None
     from lyapnet.certification.disturbances.tables import table
     from lyapnet.certification.report import write_figure
 
+    given.report.rest()
     if as_json:
         print(json.dumps(regions.result, allow_nan=False))
     else:
@@ -354,5 +356,8 @@ def _write(certificate: Any, given: Given, as_json: bool, figure: Path | None, r
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))
     command = certificate.command(str(given.checkpoint), given.at or [], **given.again)
+    if figure is not None or report is not None:
+        given.report("drawing and writing")
     for path in write_outputs(certificate, given.checkpoint, command, figure, report):
+        given.report.rest()
         Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)

@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, stages_of
 from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.sizes import THREADS
+from lyapnet.training.stages import Stages, silent
 
 
 def compare(
@@ -43,13 +44,15 @@ def compare(
     lyapnet compare --config conf/compare.yaml --tasks reacher --methods lyapnet,ppo_tuned --seeds 1
     """
     _require_extra()
-    from lyapnet.comparison.execution import require_same, run_job
-    from lyapnet.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
-
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/compare.yaml.")
-    comparison = load_comparison(config, overrides or [])
     console = Console(highlight=False, markup=False)
+    with stages_of("compare") as stages:
+        stages(f"importing torch and Lightning for {config}")
+        from lyapnet.comparison.execution import require_same, run_job
+        from lyapnet.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
+
+        comparison = load_comparison(config, overrides or [])
     if job is not None:
         run_job(job_named(comparison, job), console)
         return
@@ -59,8 +62,9 @@ def compare(
         require_same(one)
     missing = [] if report else [one for one in jobs if not one.finished]
     tell_of_missing_optima(missing, console)
-    failed = _run(missing, len(jobs), workers or os.cpu_count() or 1, ray, console)
-    _report(comparison, jobs, command, console)
+    with stages_of("compare") as stages:
+        failed = _run(missing, len(jobs), workers or os.cpu_count() or 1, ray, console, stages)
+        _report(comparison, jobs, command, console, stages)
     if failed:
         raise LyapnetError(f"Expected {len(jobs)} jobs, {failed} failed; the same command tries them again.")
 
@@ -84,22 +88,23 @@ def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
             console.print(f"{job.task}: cost without its optimum. {reason}", soft_wrap=True)
 
 
-def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console) -> int:
-    """Run the jobs, with a line for each that ends; how many failed."""
+def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console, stages: Stages) -> int:
+    """Run the jobs, with a line for each that ends, and in a log one for what runs; how many failed."""
     from lyapnet.comparison.progress import progress
     from lyapnet.comparison.workers import run_jobs
 
     if not jobs:
         return 0
     failed = 0
-    with progress(jobs, total, workers, console) as (begun, ended):
+    with progress(jobs, total, workers, console, silent if console.is_terminal else stages) as (begun, ended):
         for outcome in run_jobs(jobs, workers, ray, begun):
             failed += bool(outcome.failure)
             ended(outcome)
+    stages.rest()
     return failed
 
 
-def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console) -> None:
+def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console, stages: Stages) -> None:
     """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
     from lyapnet.comparison.execution import controllers_of
     from lyapnet.comparison.plan import begun_jobs, jobs_of
@@ -114,12 +119,14 @@ def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console:
     if not results:
         console.print("no job is finished: nothing to report", soft_wrap=True)
         return
+    stages("statistics, figures and tables")
     planned = [(job.task, job.method, job.seed) for job in jobs]
     wrote = write_report(
         results, config.folder / "report", command=shlex.join(["lyapnet", *command]), planned=planned,
         controllers=controllers_of(jobs),
     )  # fmt: skip
     comparison = compared(results)
+    stages.rest()
     if (learned := comparison.without(PLANNED)).groups:
         console.print(terminal(summary(learned)))
     if set(PLANNED).intersection(comparison.methods):

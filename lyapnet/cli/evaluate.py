@@ -1,6 +1,7 @@
 """lyapnet evaluate."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -52,21 +53,22 @@ def evaluate(
     count = min(samples, 64)
     if until is not None:
         check_multiple(controller, until, count)
-    notes = Console(stderr=True, highlight=False, markup=False)
-    with notes.status("measuring …") as status:
-        measured = evaluation(
-            controller, samples, seed, optimum, lambda done, total: status.update(f"optimum: {done} of {total} states")
-        )
-        result = measured.result()
-        if not as_json:
-            Console(highlight=False, markup=False).print(evaluation_table(given.title, result))
-        if disturbed:
-            rows = robustness(controller, count, seed, optimum, lambda name: status.update(f"disturbance: {name}"))
-            result["robustness"] = [row._asdict() for row in rows]
-        later = []
-        if until is not None:
-            later = afterwards(controller, measured.table.x0[:count], until)
-            result["afterwards"] = in_plain_data(later, controller, until)
+    report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
+    report(f"closed loops from {samples:,} states of X₀")
+    measured = evaluation(controller, samples, seed, optimum, partial(report, "optima of states"))
+    result = measured.result()
+    if not as_json:
+        report.rest()
+        Console(highlight=False, markup=False).print(evaluation_table(given.title, result))
+    if disturbed:
+        rows = robustness(controller, count, seed, optimum, lambda name: report(f"disturbance: {name}"))
+        result["robustness"] = [row._asdict() for row in rows]
+    later = []
+    if until is not None:
+        report(f"closed loops up to {until:g} T")
+        later = afterwards(controller, measured.table.x0[:count], until)
+        result["afterwards"] = in_plain_data(later, controller, until)
+    report.rest()
     if as_json:
         print(json.dumps(result))
     else:
@@ -75,7 +77,10 @@ def evaluate(
         measured.write(table)
         notes.print(f"wrote {table}", soft_wrap=True)
     if figures is not None:
-        notes.print(_write_figures(figures, controller, measured, later), soft_wrap=True)
+        report("drawing")
+        wrote = _write_figures(figures, controller, measured, later)
+        report.rest()
+        notes.print(wrote, soft_wrap=True)
 
 
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:

@@ -28,9 +28,10 @@ def export(
     from lyapnet.export import export as write
 
     controller = given.load() if beyond is None else given.load().continued(beyond)
+    given.report("writing and verifying")
+    paths, agreement = write(controller, out, to, given.checkpoint, name)
+    given.report.rest()
     notes = Console(highlight=False, markup=False)
-    with notes.status("writing and verifying …"):
-        paths, agreement = write(controller, out, to, given.checkpoint, name)
     if beyond is None:
         notes.print(f"law: {controller.after_horizon()}", soft_wrap=True)
     for path in paths:

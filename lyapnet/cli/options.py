@@ -8,19 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Console
+
+from lyapnet.training.stages import PATIENCE, Stages
+
+FIRST = 1.0  # seconds after which a command says what it is doing
 
 Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
 
 
-def _located(path: Path) -> Path:
-    from lyapnet.checkpoint import located  # torch takes seconds: only where a checkpoint is named
-
-    return located(path)
-
-
-Checkpoint = Annotated[
-    Path, typer.Argument(help="A checkpoint of a run, or zoo:NAME.", metavar="CKPT", callback=_located)
-]
+Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run, or zoo:NAME.", metavar="CKPT")]
 At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
@@ -45,6 +42,7 @@ class Given:
     checkpoint: Path
     own: dict[str, str | None]  # the user's own parts, as module:Class, each by its option's name
     at: list[str] | None
+    report: Stages  # is told what is being done
     functions: tuple[Path, Path] | None = None  # ONNX files of V and u made elsewhere; the checkpoint is a config then
 
     @property
@@ -96,6 +94,7 @@ class Given:
 
         from lyapnet.loading import load
 
+        self.report(f"loading {self.title}")
         if self.functions is None:
             controller = load(self.checkpoint, **vars(self.parts()))
         else:
@@ -106,6 +105,11 @@ class Given:
         return member_of(controller, self.at) if self.at else controller
 
 
+def stages_of(name: str) -> Stages:
+    """What tells on stderr what a command is doing, from before torch is imported; what is quickly done is not told."""
+    return Stages(Console(stderr=True, highlight=False, markup=False), name, PATIENCE, FIRST)
+
+
 def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
     """A command with a Given among its parameters, as one with CKPT in its place, --system and its like, and --at."""
     parameters = inspect.signature(command).parameters.values()
@@ -113,8 +117,12 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(**options: Any) -> None:
-        own = {name: options.pop(name) for name in OWN}
-        command(**{given: Given(options.pop("checkpoint"), own, options.pop("at"))}, **options)
+        own, checkpoint = {name: options.pop(name) for name in OWN}, options.pop("checkpoint")
+        with stages_of(command.__name__) as report:
+            report(f"importing torch for {checkpoint}")
+            from lyapnet.checkpoint import located  # takes seconds
+
+            command(**{given: Given(located(checkpoint), own, options.pop("at"), report)}, **options)
 
     def keyword(name: str, annotation: Any, **more: Any) -> inspect.Parameter:
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, **more)

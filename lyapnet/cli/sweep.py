@@ -6,9 +6,8 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, stages_of
 from lyapnet.errors import LyapnetError
 from lyapnet.sizes import THREADS
 
@@ -34,18 +33,20 @@ def sweep(
     lyapnet sweep --config conf/double_integrator.yaml --vary horizon.steps=100,200,300,400
     lyapnet sweep --config conf/reacher.yaml --config conf/cartpole_swingup.yaml seeds=5
     """
-    from lyapnet.comparison.sweep.points import points_of
-    from lyapnet.comparison.sweep.runs import sweep as run
-    from lyapnet.comparison.sweep.runs import sweep_csv
-    from lyapnet.comparison.sweep.tables import sweep_table
+    console = Console(highlight=False, markup=False)
+    with stages_of("sweep") as report:
+        report("importing torch and Lightning")
+        from lyapnet.comparison.sweep.points import points_of
+        from lyapnet.comparison.sweep.runs import sweep as run
+        from lyapnet.comparison.sweep.runs import sweep_csv
+        from lyapnet.comparison.sweep.tables import sweep_table
 
-    console, notes = Console(highlight=False, markup=False), Console(stderr=True, highlight=False, markup=False)
-    points = points_of(config or [], vary, overrides or [])
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-    where = f"{workers} at a time" if ray is None else f"on the Ray cluster {ray}"
-    with notes.status(escape(f"training {len(points)} runs, {where}")):
-        rows = run(points, workers, partial(notes.print, soft_wrap=True), ray)
+        points = points_of(config or [], vary, overrides or [])
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+        where = f"{workers} at a time" if ray is None else f"on the Ray cluster {ray}"
+        report(f"training {len(points)} runs, {where}")
+        rows = run(points, workers, partial(report.console.print, soft_wrap=True), ray)
     failed = len(points) - len({(row.config, row.value) for row in rows})
     for name in dict.fromkeys(row.config for row in rows):
         console.print(sweep_table(name, [row for row in rows if row.config == name]))

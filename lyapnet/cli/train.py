@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, stages_of
 from lyapnet.errors import UsageError
 
 
@@ -22,16 +22,21 @@ def train(
     debug: Debug = False,
 ) -> None:
     """Train one experiment; python train.py is the same command."""
-    from lyapnet.config import load_config
-    from lyapnet.training.experiment import fit  # Lightning takes seconds to import: only where it is needed
-    from lyapnet.training.plan import plan_run
-
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
+    from lyapnet.config import load_config, outline
+
+    outline(config, overrides or [])  # what is misspelt is refused before torch is imported
     console = Console(highlight=False, markup=False)
     program = ["python", "train.py"] if Path("train.py").is_file() else ["lyapnet", "train"]
     command = shlex.join([*program, "--config", str(config), *(overrides or [])])
-    plan = plan_run(load_config(config, overrides or []), resume, finetune)
+    with stages_of("train") as report:
+        report(f"importing torch and Lightning for {config}")
+        from lyapnet.training.experiment import fit  # takes seconds
+        from lyapnet.training.plan import plan_run
+
+        report("checking f, g, the cost and V")
+        plan = plan_run(load_config(config, overrides or []), resume, finetune)
     if plan.finished:
         console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
         return

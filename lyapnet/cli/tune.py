@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, stages_of
 from lyapnet.errors import Interrupted, LyapnetError, UsageError
 from lyapnet.sizes import THREADS
 
@@ -41,29 +41,35 @@ def tune(
     """
     if importlib.util.find_spec("optuna") is None:
         raise UsageError('Expected Optuna for a search, got none; pip install "lyapnet[tune]".')
-    from lyapnet.comparison.tuning.search import best_of, open_study, search, task_of, train_anew
-    from lyapnet.comparison.tuning.tables import final_line
-    from lyapnet.training.run_lock import RunLock
+    with stages_of("tune") as report:
+        report(f"importing torch and Lightning for {config}")
+        from lyapnet.comparison.tuning.search import best_of, open_study, search, task_of, train_anew
+        from lyapnet.comparison.tuning.tables import final_line
+        from lyapnet.training.run_lock import RunLock
 
-    notes = Console(stderr=True, highlight=False, markup=False)
-    say = partial(notes.print, soft_wrap=True)
-    task = task_of(config, overrides or [], vary or [], out, seed, say)
-    task.folder.mkdir(parents=True, exist_ok=True)
-    with RunLock(task.folder):
-        study = open_study(task, say)
-        try:
-            with notes.status(f"{trials} trials, {workers} at a time"):
+        say = partial(report.console.print, soft_wrap=True)
+        task = task_of(config, overrides or [], vary or [], out, seed, say)
+        task.folder.mkdir(parents=True, exist_ok=True)
+        with RunLock(task.folder):
+            study = open_study(task, say)
+            try:
+                report(f"{trials} trials, {workers} at a time")
                 search(task, study, trials, workers, say)
-        except Interrupted as stop:
+            except Interrupted as stop:
+                report.rest()
+                _show(task, study)
+                raise Interrupted(f"{stop} The same command goes on.", stop.exit_status) from None
+            report.rest()
             _show(task, study)
-            raise Interrupted(f"{stop} The same command goes on.", stop.exit_status) from None
-        _show(task, study)
-        if (best := best_of(study)) is None:
-            raise LyapnetError(f"Expected a trial that comes to its end, got {trials} that do not; see {task.folder}.")
-        if final:
-            with notes.status("final training"):
+            if (best := best_of(study)) is None:
+                raise LyapnetError(
+                    f"Expected a trial that comes to its end, got {trials} that do not; see {task.folder}."
+                )
+            if final:
+                report("final training")
                 training = train_anew(task, best, say)
-            Console(highlight=False, markup=False).print(final_line(task, training), soft_wrap=True)
+                report.rest()
+                Console(highlight=False, markup=False).print(final_line(task, training), soft_wrap=True)
 
 
 def _show(task: Any, study: Any) -> None:

@@ -26,8 +26,8 @@ def view(
     from lyapnet.view import write_page
 
     controller = given.load()
-    notes = Console(highlight=False, markup=False)
-    with notes.status("writing …"):
-        funnel = None if proof is None else kept_funnel(controller, proof)
-        write_page(controller, out, given.title, funnel)
-    notes.print(f"wrote {out}", soft_wrap=True)
+    given.report("writing the page")
+    funnel = None if proof is None else kept_funnel(controller, proof)
+    write_page(controller, out, given.title, funnel)
+    given.report.rest()
+    Console(highlight=False, markup=False).print(f"wrote {out}", soft_wrap=True)

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from lyapnet.cli.options import Debug
+from lyapnet.cli.options import Debug, stages_of
 
 LEAST_SHOWN = 1e-12  # of a distance to the goal
 STATES = 1000  # that a demonstration draws for its certificate
@@ -20,8 +20,10 @@ def zoo(
     debug: Debug = False,
 ) -> None:
     """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
-    from lyapnet.certification.tables import floored
-    from lyapnet.zoo import entries
+    with stages_of("zoo") as report:
+        report("importing torch")
+        from lyapnet.certification.tables import floored
+        from lyapnet.zoo import entries
 
     console = Console(highlight=False, markup=False)
     if exports:
@@ -52,21 +54,24 @@ def demo(
 ) -> None:
     """Show a controller that comes with lyapnet: against the optimum, certified, drawn and in motion; no training."""
     began = time.monotonic()
-    from lyapnet.certification.sampling_certificates import statistical_certificate
-    from lyapnet.evaluation.animation import Film
-    from lyapnet.evaluation.figures import trajectories
-    from lyapnet.zoo import entry
+    with stages_of("demo") as report:
+        report(f"importing torch for {name}")
+        from lyapnet.certification.sampling_certificates import statistical_certificate
+        from lyapnet.evaluation.animation import Film
+        from lyapnet.evaluation.figures import trajectories
+        from lyapnet.zoo import entry
 
-    one, folder = entry(name), out or Path("lyapnet_demo", name)
-    console = Console(highlight=False, markup=False)
-    with console.status("rolling out …"):
+        one, folder = entry(name), out or Path("lyapnet_demo", name)
+        report("closed loops, and a certificate of them")
         controller = one.load()
         trajectory, ratio, error = one.measured(controller)
         certificate = statistical_certificate(controller, STATES, 1 - 1e-3, 0.95)
+        report("drawing and animating")
         shown = controller.rollout(trajectory.x[0, :5])
         folder.mkdir(parents=True, exist_ok=True)
         trajectories(shown, controller.problem).savefig(folder / "trajectories.png", dpi=150)
         Film(shown, controller.problem, controller.value).write(folder / "closed_loops.gif")
+    console = Console(highlight=False, markup=False)
     console.print(_table(one.name, controller, trajectory, ratio, error, certificate))
     console.print(f"{'made by':<10}{one.record['command']}", soft_wrap=True)
     console.print(f"{'wrote':<10}{folder / 'trajectories.png'}, {folder / 'closed_loops.gif'}", soft_wrap=True)

@@ -12,13 +12,18 @@ from rich.text import Text
 
 from lyapnet.comparison.plan import Job
 from lyapnet.comparison.workers import Outcome
+from lyapnet.training.stages import Report, silent
 
 
 @contextmanager
 def progress(
-    jobs: Sequence[Job], total: int, workers: int, console: Console
+    jobs: Sequence[Job], total: int, workers: int, console: Console, report: Report = silent
 ) -> Iterator[tuple[Callable[[Job], None], Callable[[Outcome[Job]], None]]]:
-    """A line for each job that ends, and in a terminal a bar with what runs and the time left."""
+    """A line for each job that ends, and in a terminal a bar with what runs and the time left.
+
+    Args:
+        report: is told what runs.
+    """
     starts: dict[Job, float] = {}
     took: dict[Job, float] = {}
     finished = total - len(jobs)
@@ -33,9 +38,14 @@ def progress(
     bar = Progress(*columns, console=console, disable=not console.is_terminal)
     task = bar.add_task("starting", total=total, completed=finished)
 
+    def tell() -> None:
+        running = [one.name for one in list(starts) if one not in took]
+        report(", ".join(running) or "no job", finished + len(took), total)
+
     def begun(job: Job) -> None:
         starts[job] = time.monotonic()
         bar.update(task, description=job.name)
+        tell()
 
     def ended(outcome: Outcome[Job]) -> None:
         took[outcome.job] = outcome.seconds
@@ -43,6 +53,7 @@ def progress(
         count = finished + len(took)
         console.print(f"{count}/{total}  {outcome.job.name}  {said}; {left()}", soft_wrap=True, markup=False)
         bar.update(task, completed=count)
+        tell()
 
     console.print(f"{total} jobs, {finished} of them finished", soft_wrap=True)
     with bar:

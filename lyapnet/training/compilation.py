@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
-from rich.console import Console
 
 from lyapnet.config import Config
 from lyapnet.errors import CompilationError, UntraceableError
@@ -14,20 +13,21 @@ from lyapnet.graphs.compilation import cache_folder, has_compiler
 from lyapnet.horizon import TABLEAUX
 from lyapnet.policy import POLICIES
 from lyapnet.training.compiling_ahead import CompilingAhead
+from lyapnet.training.stages import Stages
 
 
 class Compilation(Callback):
     """Compiles the closed loop and its gradient before the first step, where that pays, and says so.
 
     Args:
-        console: where it is said.
+        stages: where it is said.
         batch_size: initial states in a training batch.
         wanted: whether to compile in any case; else only what is on disk already.
         record: takes down that the run is compiled, and in how many seconds.
     """
 
-    def __init__(self, console: Console, batch_size: int, wanted: bool, record: Callable[..., None]):
-        self.console, self.batch_size, self.wanted, self.record = console, batch_size, wanted, record
+    def __init__(self, stages: Stages, batch_size: int, wanted: bool, record: Callable[..., None]):
+        self.stages, self.batch_size, self.wanted, self.record = stages, batch_size, wanted, record
         self._ahead: CompilingAhead | None = None
 
     @contextmanager
@@ -52,9 +52,11 @@ class Compilation(Callback):
             self._say(trainer, f"{error}; running without compilation.")
 
     def _compile(self, trainer: Trainer, module: Any, on_disk: bool) -> None:
+        started = time.perf_counter()
         if not on_disk and has_compiler():
             self._say(trainer, "compiling the closed loop and its gradient, once for this task and machine …")
-        started = time.perf_counter()
+        if trainer.is_global_zero:
+            self.stages("compiling or loading machine code")
         if self._ahead is not None and not on_disk:
             self._ahead.wait()
         module.compile_for(self.batch_size)
@@ -66,7 +68,7 @@ class Compilation(Callback):
 
     def _say(self, trainer: Trainer, line: str) -> None:
         if trainer.is_global_zero:
-            self.console.print(line, soft_wrap=True)
+            self.stages.console.print(line, soft_wrap=True)
 
 
 def earns_compilation(config: Config) -> bool:

@@ -5,6 +5,7 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +30,9 @@ from lyapnet.training.plan import Plan, plan_run
 from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.stages import Stages, silent
+from lyapnet.training.stages import PATIENCE, Stages, silent
 from lyapnet.training.start import REMEDY, Start, choose_start, has_place_for_start
 from lyapnet.training.trainer import build_trainer
-from lyapnet.training.validation_optimum import optimum_progress
 
 
 def train(
@@ -191,12 +191,14 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     config, options = plan.config, plan.config.evaluation
     results = []
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
-    for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
-        controller = load(run.best, **vars(plan.parts))
-        note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
-        with optimum_progress(console) as progress:
-            results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
-        log_result(own, one, results[-1], trainer.global_step)
+    with Stages(console, "evaluation", PATIENCE) as report:
+        for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
+            report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
+            controller, optimum_of = load(run.best, **vars(plan.parts)), partial(report, f"optima for seed {one.seed}")
+            report(f"what follows T for seed {one.seed}")
+            note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
+            results.append(evaluate(controller, options.test_states, one.seed, options.optimum, optimum_of))
+            log_result(own, one, results[-1], trainer.global_step)
     result = results[0] if config.seeds == 1 else over_seeds(results)
     write_json(plan.run.folder / EVALUATION, result)
     return result

@@ -6,11 +6,11 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
 from lyapnet.training.curves import members_of
+from lyapnet.training.stages import Stages
 
 # the line of a validation: name, key of the summary, format
 VALIDATED = (
@@ -22,15 +22,25 @@ VALIDATED = (
 
 
 class TrainingProgress(ProgressBar):
-    """A line for each validation, and below them in a terminal: step, loss, cost, speed, time left."""
+    """A line for each validation; below them in a terminal, and in a log now and then: step, loss, cost, speed.
 
-    def __init__(self, console: Console):
+    A terminal also has the time left.
+
+    Args:
+        stages: tells what is done before the first step, and in a log which step it is.
+    """
+
+    def __init__(self, stages: Stages):
         super().__init__()
-        self._console, self._progress, self._task = console, None, None
+        self._stages, self._console, self._progress, self._task = stages, stages.console, None, None
         self._named = False  # whether it was said what validations are over
 
     def disable(self) -> None:
         self._enabled = False
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        if trainer.is_global_zero:
+            self._stages.__enter__()("preparing the first step")
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.is_global_zero:
@@ -44,7 +54,9 @@ class TrainingProgress(ProgressBar):
             disable=not self._console.is_terminal,
         )
         self._task = self._progress.add_task("…", total=trainer.max_epochs, completed=trainer.global_step)
+        self._stages.rest()
         self._progress.start()
+        self._log(f"step {trainer.global_step} of {trainer.max_epochs}")
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -58,10 +70,21 @@ class TrainingProgress(ProgressBar):
         speed = sum(member.steps_per_second for member in members)
         line = f"loss {loss:.4g}  cost {cost:.4g}  {speed:,.0f} rollout steps/s"
         self._progress.update(self._task, completed=trainer.global_step, description=line)
+        self._log(f"step {trainer.global_step} of {trainer.max_epochs}", line)
+
+    def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._log(f"validation at step {trainer.global_step}")
+
+    def _log(self, stage: str, detail: str = "") -> None:
+        """Tell a stage where there is no bar."""
+        if self._progress is not None and not self._console.is_terminal:
+            self._stages(stage, detail=detail)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._progress is None:
             return
+        if not self._console.is_terminal:
+            self._stages.rest()
         members = members_of(pl_module)
         tables = [member.validation for member in members]
         if not self._named:
@@ -84,6 +107,7 @@ class TrainingProgress(ProgressBar):
         if self._progress is not None:  # gives the cursor back to the terminal
             self._progress.stop()
             self._progress = None
+        self._stages.__exit__()
 
 
 def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:

@@ -1,4 +1,4 @@
-"""What is being done before the first training step, how much of it is done, and for how many seconds."""
+"""What a command is doing, how much of it is done, and for how many seconds."""
 
 import threading
 import time
@@ -8,6 +8,8 @@ from rich.console import Console
 from rich.text import Text
 
 QUIET = 8.0  # seconds after which a log without a terminal has another line
+PATIENCE = 4.0  # seconds after which a stage of a command has its first one
+TICK = 0.25  # seconds between two looks at the clock
 
 
 @runtime_checkable
@@ -30,29 +32,41 @@ class Stages:
     Args:
         console: where it is shown.
         subject: what the stages belong to.
+        patience: seconds after which a stage has its line.
+        first: seconds after which the very first line comes; `patience` if None.
     """
 
-    def __init__(self, console: Console, subject: str):
-        self.console, self.subject = console, subject
-        self.stage, self.done, self.total = "", 0, 0
+    def __init__(self, console: Console, subject: str, patience: float = 0.0, first: float | None = None):
+        self.console, self.subject, self.patience = console, subject, patience
+        self.first = patience if first is None else first
+        self.stage, self.done, self.total, self.detail = "", 0, 0, ""
         self._began = self._printed = time.monotonic()
+        self._said = ""  # the last stage that has its line
         self._ended, self._printing = threading.Event(), threading.Lock()
         self._status = console.status(self) if console.is_terminal else None  # renders itself anew each time
         self._clock = threading.Thread(target=self._print_now_and_then, daemon=True)
 
-    def __call__(self, stage: str, done: int = 0, total: int = 0) -> None:
+    def __call__(self, stage: str, done: int = 0, total: int = 0, detail: str = "") -> None:
         is_new = stage != self.stage
-        self.stage, self.done, self.total = stage, done, total
         if is_new:
             self._began = time.monotonic()
-            if self._status is None:
-                self._print()
+        self.stage, self.done, self.total, self.detail = stage, done, total, detail
+        if self._status is not None:
+            self._status.start()
+        elif is_new and not self.patience:
+            self._print()
+
+    def rest(self) -> None:
+        """Show nothing until the next stage: something else is printed."""
+        with self._printing:
+            self.stage, self._printed = "", time.monotonic()
+        if self._status is not None:
+            self._status.stop()
 
     def __enter__(self) -> "Stages":
+        self._printed = time.monotonic()
         if self._status is None:
             self._clock.start()
-        else:
-            self._status.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -65,17 +79,22 @@ class Stages:
 
     @property
     def now(self) -> str:
-        """As "optima from 96 states of X₀, 3 of 96, 12 s"."""
+        """As "optima from 96 states of X₀, 3 of 96, 12 s"; a detail stands before the seconds."""
         seconds = int(time.monotonic() - self._began)
         counted = f", {self.done} of {self.total}" if self.total else ""
-        return f"{self.stage}{counted}{f', {seconds} s' if seconds else ' …'}"
+        detail = f", {self.detail}" if self.detail else ""
+        return f"{self.stage}{counted}{detail}{f', {seconds} s' if seconds else ' …'}"
 
     def _print(self) -> None:
         with self._printing:
-            self._printed = time.monotonic()
-            self.console.print(f"{self.subject}: {self.now}", soft_wrap=True, markup=False, highlight=False)
+            self._printed, self._said = time.monotonic(), self.stage
+            if self.stage:
+                self.console.print(f"{self.subject}: {self.now}", soft_wrap=True, markup=False, highlight=False)
 
     def _print_now_and_then(self) -> None:
-        while not self._ended.wait(max(0.1, self._printed + QUIET - time.monotonic())):
-            if self.stage and time.monotonic() - self._printed >= QUIET:
+        while not self._ended.wait(TICK):
+            due = self._printed + (QUIET if self._said or not self.first else self.first)
+            if self.patience and self._said not in ("", self.stage):
+                due = min(due, self._began + self.patience)
+            if self.stage and time.monotonic() >= due:
                 self._print()

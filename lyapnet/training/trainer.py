@@ -18,6 +18,7 @@ from lyapnet.training.lost_states import LostStates
 from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
 from lyapnet.training.recovery import RisingCost
+from lyapnet.training.stages import PATIENCE, Stages
 from lyapnet.training.trainer_options import trainer_options
 from lyapnet.training.validation_optimum import ValidationOptimum
 
@@ -48,15 +49,16 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
     options, every, members = config.evaluation, config.training.validate_every, plan.module.members
     best = {member.label: one.best for member, one in zip(members, run.members(config), strict=True)}
     certified = CertifiedShare(every * options.certify_every, options.certified_states, options.confidence)
+    stages = Stages(console, "training", PATIENCE)
     return [
-        *_compilation(plan, console),
-        ValidationOptimum(console, options.optimum),
+        *_compilation(plan, stages),
+        ValidationOptimum(stages, options.optimum),
         Dashboard(configs_of_seeds(config)),
         stopwatch,
         ScalarLogger(stopwatch),
         FigureLogger(every * options.figures_every, options.animate),
         *([certified] if options.certify_every else []),
-        TrainingProgress(console),
+        TrainingProgress(stages),
         RisingCost(),
         *([LostStates()] if config.training.lost_share else []),
         *plan.callbacks,
@@ -64,11 +66,11 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
     ]
 
 
-def _compilation(plan: Plan, console: Console) -> list[Compilation]:
+def _compilation(plan: Plan, stages: Stages) -> list[Compilation]:
     """What compiles the run, if anything may; a resumed run goes on as it was."""
     options = plan.config.rollout
     goes_on = plan.resume_from is not None
     if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
         return []
     wanted = goes_on or options.compile == "on" or earns_compilation(plan.config)
-    return [Compilation(console, plan.config.training.batch_size, wanted, plan.run.note)]
+    return [Compilation(stages, plan.config.training.batch_size, wanted, plan.run.note)]

@@ -1,20 +1,19 @@
 """The optimum of the validation states, found before the first step."""
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from rich.console import Console
 from torch import Tensor
 from torch.nn.functional import pad
 
 from lyapnet.errors import OracleError
-from lyapnet.evaluation.oracles import Report, oracle_of
+from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner
+from lyapnet.training.stages import Stages
 
 COMPARED = 64  # of each member's validation states, the first: with these is the optimum sought
 
@@ -25,12 +24,12 @@ class ValidationOptimum(Callback):
     A checkpoint keeps it, so that a run is compared with the same numbers to its end, whatever the cache has by then.
 
     Args:
-        console: where it is said.
+        stages: where it is said.
         wanted: whether an optimum that is not known yet is sought.
     """
 
-    def __init__(self, console: Console, wanted: bool = True):
-        self.console, self.wanted = console, wanted
+    def __init__(self, stages: Stages, wanted: bool = True):
+        self.stages, self.wanted = stages, wanted
         self.cost: Tensor | None = None  # (members, b)
 
     def state_dict(self) -> dict[str, Any]:
@@ -48,30 +47,24 @@ class ValidationOptimum(Callback):
         if self.cost is not None:
             for member, cost in zip(members, self.cost.to(pl_module.device), strict=True):
                 member.validation_optimum = cost
+        if trainer.is_global_zero:
+            self.stages("curves and figures of the start")
 
     def _solve(self, member: Learner, states: Tensor) -> Tensor | None:
         """J* (members, b) of states (members, b, n), or (1, b) of (b, n), NaN after the first; None without oracle."""
         started = time.perf_counter()
         try:
-            with optimum_progress(self.console) as progress:
-                oracle = oracle_of(member.problem, member.rollout.method)
-                compared = states[..., :COMPARED, :]
-                optima = oracle.solve(compared.flatten(0, -2), progress=progress)
+            oracle = oracle_of(member.problem, member.rollout.method)
+            compared = states[..., :COMPARED, :]
+            optima = oracle.solve(compared.flatten(0, -2), progress=partial(self.stages, "optima of validation states"))
         except OracleError as error:
-            self.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
+            self.stages.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
             return None
         seconds, missing = time.perf_counter() - started, ""
         if optima.failures:
             missing = f"; unknown for {optima.failures}, which are left out"
         if missing or seconds > 0.2:  # else nobody waits for it
             found = f"optimum of {len(optima.cost)} validation states, in {seconds:.0f} s"
-            self.console.print(f"{found}{missing}", soft_wrap=True)
+            self.stages.console.print(f"{found}{missing}", soft_wrap=True)
         cost = optima.cost.cpu().reshape(-1, compared.shape[-2])
         return pad(cost, (0, states.shape[-2] - cost.shape[-1]), value=torch.nan)
-
-
-@contextmanager
-def optimum_progress(console: Console) -> Iterator[Report]:
-    """A line in a terminal that says how far an oracle is."""
-    with console.status("optimum …") as status:
-        yield lambda done, total: status.update(f"optimum: {done} of {total} initial states")

@@ -12,7 +12,7 @@ from lyapnet.certification.boxes import Boxes, roots
 from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.ignorable_states import ignorable_states
 from lyapnet.certification.preconditions import over_time, without
-from lyapnet.certification.proof import Progress
+from lyapnet.certification.proof import Progress, tell
 from lyapnet.certification.tubes.enclosure import BINS, Cells, Enclosed, Enclosing
 from lyapnet.certification.tubes.field import DEGREE, Field
 from lyapnet.certification.tubes.nominal import places
@@ -152,9 +152,11 @@ def tube_claim(
 
     Args:
         radius: within which of the goal closed loops are asked to end.
+        report: is told what is done, and how far it is.
     """
     budget = budget or Budget()
     problem, loop = controller.problem, copied(controller.closed_loop)
+    tell(report, budget, "calling and tracing f, g, the cost and u")
     left_out = ignorable_states(loop, problem.constraints)
     seen = [i for i in range(problem.system.n) if i not in left_out]
     X0 = without(problem.initial_states, left_out)

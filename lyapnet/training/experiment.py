@@ -98,6 +98,8 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     if trainer.is_global_zero:
         _prepare_folder(plan)
         console.print(Text(config.experiment, "bold").append(f"  {run.folder}", "not bold"), soft_wrap=True)
+        if plan.anew:
+            console.print("stopped before its first checkpoint: training starts anew from step 0", soft_wrap=True)
         if plan.resume_from is not None:
             console.print(
                 f"resuming from step {plan.step} of {config.training.iterations} ({plan.resume_from})", soft_wrap=True

@@ -41,6 +41,7 @@ class Plan:
     run: Run
     resume_from: Path | None = None  # a checkpoint
     step: int = 0  # at which that was written
+    anew: bool = False  # whether a run goes on that was stopped before its first checkpoint
     lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
 
     def __post_init__(self) -> None:
@@ -94,11 +95,11 @@ def plan_run(
         lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
         if resume == LAST and not run.begun:
             _start_as(run, config, module)
-            plan = Plan(config, parts, module, callbacks, run, lock=lock)
+            plan = Plan(config, parts, module, callbacks, run, anew=True, lock=lock)
         else:
             content = _read(checkpoint, run)
             _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
-            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock)
+            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock=lock)
         if not plan.finished:
             stack.pop_all()
         return plan

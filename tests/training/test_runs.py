@@ -412,6 +412,17 @@ def test_resuming_another_config_is_refused_before_the_first_checkpoint_too(desk
     assert not desk.last.exists()
 
 
+def test_resuming_before_the_first_checkpoint_says_that_it_starts_anew(desk):
+    said = "stopped before its first checkpoint: training starts anew from step 0\n"
+    survives(desk, [(dies_at, MODULE, "training_step", 2)])
+    _, output, _ = desk.train("--resume", "last", prepare=without_figures)
+    assert said in output
+    assert "resuming from" not in output
+    _, output, _ = desk.train("--resume", "last", "training.iterations=18", prepare=without_figures)  # the twin
+    assert said not in output
+    assert f"resuming from step {STEPS} of 18" in output
+
+
 def test_resuming_a_finished_run_says_so(reference, ask):
     files = [path for path in reference.run.rglob("*") if path.name != ".lock"]
     before = {path: path.stat().st_mtime_ns for path in files}

@@ -16,7 +16,7 @@ from lyapnet.certification.proof import Progress, tell
 from lyapnet.certification.tubes.enclosure import BINS, Cells, Enclosed, Enclosing
 from lyapnet.certification.tubes.field import DEGREE, Field
 from lyapnet.certification.tubes.nominal import places
-from lyapnet.certification.verdict import Verdict
+from lyapnet.certification.verdict import Verdict, time_spent
 from lyapnet.certification.workers import answering
 from lyapnet.constraints import names_of
 from lyapnet.contracts import copied
@@ -63,6 +63,7 @@ class TubeClaim:
     radius: float | None = None  # within which x(T) is asked to be of the goal …
     reach: float = float("nan")  # … and is, at most
     missing: list[float] | None = None  # the middle of a cell whose closed loops end outside
+    set_up: float = 0.0  # seconds of the budget before the first cell
 
     @property
     def verdict(self) -> Verdict:
@@ -77,7 +78,9 @@ class TubeClaim:
         """Why the verdict is unknown, and what may help."""
         if self.verdict != "unknown":
             return None
-        return "seconds spent: allow more" if self.volume_share < 1 else "no bound of ‖x(T) − goal‖ is within --radius"
+        if self.volume_share < 1:
+            return f"{time_spent(self.set_up)}: allow more"
+        return "no bound of ‖x(T) − goal‖ is within --radius"
 
     @property
     def mean_cost(self) -> tuple[float, float]:
@@ -165,7 +168,7 @@ def tube_claim(
     about = _about(controller, loop, seen)
     found, waiting = _Found(len(seen)), _cut_up(roots(lower[None], upper[None], 0.0), axes, CELLS)
     with torch.no_grad(), signals_taken(budget.stop.ask), answering(about, budget.workers) as answers:
-        budget.stop.searching = True
+        budget.stop.searching, set_up = True, budget.elapsed
         while len(waiting.key) and not budget.spent(found.boxes) and found.violating is None:
             some, waiting = _next(waiting, waiting.volumes(lower, upper), AT_ONCE * budget.workers)
             chunks = [Cells(chunk.lower, chunk.upper) for chunk in some.split(AT_ONCE)]
@@ -180,7 +183,7 @@ def tube_claim(
                 report(Progress(found.boxes, max(0.0, 1 - found.share), budget.elapsed))
     if budget.stop.asked:
         raise Interrupted(NOTHING_KEPT, 130)
-    return _claim(controller, about, X0, seen, axes, found, budget, radius)
+    return _claim(controller, about, X0, seen, axes, found, budget, radius, set_up)
 
 
 def _about(controller: Controller, loop: Any, seen: list[int]) -> Enclosing:
@@ -229,7 +232,7 @@ def _axis(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: 
 
 def _claim(
     controller: Controller, about: Enclosing, X0: Box, seen: list[int], axes: list[int], found: _Found,
-    budget: Budget, radius: float | None,
+    budget: Budget, radius: float | None, set_up: float,
 ) -> TubeClaim:  # fmt: skip
     n, terms = len(seen), len(places(len(axes), DEGREE))
     empty = [torch.zeros(0, *shape, dtype=torch.float64) for shape in ((n,), (n,), (terms,), (2,), (n, 2))]
@@ -244,6 +247,7 @@ def _claim(
         min(1.0, found.share) if found.share < 1 - 1e-12 else 1.0, found.violating, found.boxes, found.steps,
         time.monotonic() - budget.started, about.field.defect.fingerprint, names_of(controller.problem.constraints),
         radius, float(far.max()) if len(far) else float("nan"), missing,
+        set_up,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -106,8 +107,11 @@ class Given:
 
 
 def stages_of(name: str) -> Stages:
-    """What tells on stderr what a command is doing, from before torch is imported; what is quickly done is not told."""
-    return Stages(Console(stderr=True, highlight=False, markup=False), name, PATIENCE, FIRST)
+    """What tells on stderr what a command is doing, from before torch is imported; what is quickly done is not told.
+
+    It keeps to the stderr of the command, which an oracle hides from others while it searches.
+    """
+    return Stages(Console(file=sys.stderr, highlight=False, markup=False), name, PATIENCE, FIRST)
 
 
 def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:

@@ -54,7 +54,8 @@ class TrainingProgress(ProgressBar):
             disable=not self._console.is_terminal,
         )
         self._task = self._progress.add_task("…", total=trainer.max_epochs, completed=trainer.global_step)
-        self._stages.rest()
+        if self._console.is_terminal:  # the bar takes its place
+            self._stages.rest()
         self._progress.start()
         self._log(f"step {trainer.global_step} of {trainer.max_epochs}")
 

@@ -1,5 +1,7 @@
 """What commands say on stderr while one waits, which leaves their results as they are."""
 
+import contextlib
+import io
 import json
 import os
 import pty
@@ -12,6 +14,7 @@ import pytest
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.certification.tables import progress_told_to
 from lyapnet.cli import main
+from lyapnet.cli.options import stages_of
 from lyapnet.loading import load
 from lyapnet.training.plan import plan_run
 from tests.runs import tiny_checkpoint
@@ -48,6 +51,14 @@ def test_a_command_that_loads_slowly_says_so_and_its_result_stays(checkpoint, mo
     quick = capsys.readouterr()
     assert not quick.err
     assert json.loads(quick.out) == json.loads(slow.out)
+
+
+def test_it_is_said_while_an_oracle_hides_what_others_say(capsys, telling):
+    with stages_of("evaluate") as report, contextlib.redirect_stderr(io.StringIO()) as hidden:
+        report("optima of states", 3, 64)
+        time.sleep(1.0)
+    assert capsys.readouterr().err.startswith("evaluate: optima of states, 3 of 64")
+    assert not hidden.getvalue()
 
 
 def test_training_says_what_it_waits_for(tmp_path, monkeypatch, capsys, telling):

@@ -195,10 +195,10 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
     with Stages(console, "evaluation", PATIENCE) as report:
         for one, run, own in zip(configs_of_seeds(config), runs, loggers, strict=True):
-            report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
+            report(f"what follows T, for seed {one.seed}")
             controller, optimum_of = load(run.best, **vars(plan.parts)), partial(report, f"optima for seed {one.seed}")
-            report(f"what follows T for seed {one.seed}")
             note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
+            report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
             results.append(evaluate(controller, options.test_states, one.seed, options.optimum, optimum_of))
             log_result(own, one, results[-1], trainer.global_step)
     result = results[0] if config.seeds == 1 else over_seeds(results)

@@ -12,7 +12,7 @@ import jaxtyping
 import pytest
 import torch
 
-CHECKED_CALLS = 50  # of each function in each file; with all of them the tests take three times as long
+CHECKED_CALLS = 10  # of each function in each file; with all of them the tests take three times as long
 _calls: dict[int, list[int]] = {}  # [number] of each piece of code
 
 

@@ -82,8 +82,8 @@ def test_stopped_on_either_side_it_goes_on(whole, kept, monkeypatch):
 def test_ctrl_c_in_the_middle_of_the_second_side_keeps_both(whole, tmp_path):
     path = tmp_path / "stopped.proof"
 
-    def stop(_):
-        if path.exists():  # the first side ended
+    def stop(progress):
+        if path.exists() and progress.boxes:  # the first side ended, and the second is searched
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(Interrupted, match=r"the proof so far is kept in .*stopped\.proof"):

@@ -20,6 +20,7 @@ from lyapnet.sets import Box, ControlSet, Unbounded
 from lyapnet.systems import ControlAffineSystem
 
 CONF = Path(__file__).parents[1] / "conf"
+AMPLE = 300.0  # wall seconds that no proof of a test takes, on a busy machine too: what bounds it is its boxes
 KINDS = ("double_integrator", "cartpole", "reacher", "satellite")  # systems, one of each kind of f, g and R
 
 

@@ -17,7 +17,7 @@ from lyapnet.policy import HJBPolicy
 from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem, Linear
-from tests.problems import problem_of
+from tests.problems import AMPLE, problem_of
 
 TABLE = torch.tensor([0.0, 0.0, 0.0, 40.0])
 CORNER = 0.9
@@ -108,7 +108,7 @@ def claim(system, cost, V):
     problem = problem_of(system, cost, steps=20, initial_states=Box([-0.5, -0.5], [0.5, 0.5]))
     closed_loop = ClosedLoop(problem, HJBPolicy(problem, V)).double()
     domain = Box(torch.tensor([-1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double())
-    return sound_claim(closed_loop, problem, 0.5, 0.02, domain, Budget(20, boxes=5000))
+    return sound_claim(closed_loop, problem, 0.5, 0.02, domain, Budget(AMPLE, boxes=5000))
 
 
 def test_what_nothing_is_added_to_is_certified():
@@ -133,7 +133,6 @@ def test_what_reads_more_than_its_state_is_refused(place, way):
     assert any(reason in message for reason in ("reads", "each state", "random numbers", "each time")), message
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("place", "way"), list(itertools.product(PLACES, WAYS)))
 def test_it_is_refused_wherever_it_stands(place, way):
     refused(place, way)

@@ -22,6 +22,7 @@ from lyapnet.certification.boxes import CutTree, single
 from lyapnet.errors import UsageError
 from lyapnet.graphs import bound_rules, bounds, simplification, taylor, tracing
 from tests.certification.planted import Planted, domain, loop, riccati
+from tests.problems import AMPLE
 
 
 @pytest.fixture
@@ -53,12 +54,13 @@ def violated(P):
 
 def go_on(condition, path, boxes=100_000, wanted=2.0, box=None, **options):
     return prove(
-        condition, box or domain(), wanted, Budget(60, boxes=boxes, chunk=64, workers=options.pop("workers", 1)), False,
+        condition, box or domain(), wanted,
+        Budget(AMPLE, boxes=boxes, chunk=64, workers=options.pop("workers", 1)), False,
         torch.Generator().manual_seed(0), keep=path, **options,
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), pytest.param(violated, 6.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("condition", "wanted"), [(dipped, 2.0), (violated, 6.0)])
 def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, tmp_path):
     condition, path = condition(P), tmp_path / "proof.pt"
     whole = go_on(condition, None, wanted=wanted)
@@ -182,7 +184,7 @@ def rewritten(path, change):
 
 
 def checked(condition, path, wanted=2.0):
-    return prove(condition, domain(), wanted, Budget(60, chunk=64), keep=path, replay=True)
+    return prove(condition, domain(), wanted, Budget(AMPLE, chunk=64), keep=path, replay=True)
 
 
 @pytest.fixture
@@ -259,7 +261,6 @@ def test_resuming_refuses_what_does_not_fit_together(change, P, kept):
         go_on(dipped(P), kept)
 
 
-@pytest.mark.slow
 def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
     path, condition = tmp_path / "proof.pt", violated(P)
     whole = go_on(condition, path, wanted=6.0)
@@ -335,7 +336,6 @@ def test_leaves_cover_their_box_exactly():
 # Threads
 
 
-@pytest.mark.slow
 def test_threads_come_to_the_same_verdict_and_level(P):
     true = dipped(P)
     one, two = (go_on(true, None, workers=workers) for workers in (1, 2))

@@ -21,6 +21,7 @@ from lyapnet.sets import Box
 from tests.certification import planted
 from tests.certification.planted import riccati, stationary
 from tests.certification.test_region import LIMITED, D, loop_of, problem
+from tests.problems import AMPLE
 
 ABOUT = problem(controls=LIMITED)
 
@@ -31,7 +32,7 @@ def V_of(factor=1.0):
 
 def claimed(path, boxes=4000, V=None, decay=None, states=D):
     V = V_of() if V is None else V
-    return region_claim(loop_of(V, ABOUT), ABOUT, decay, states, Budget(100, boxes, chunk=256), keep=path)
+    return region_claim(loop_of(V, ABOUT), ABOUT, decay, states, Budget(AMPLE, boxes, chunk=256), keep=path)
 
 
 def checked(path, V=None):
@@ -221,7 +222,6 @@ def test_an_edited_file_is_refused(name, kept):
     assert "\n" not in result["reason"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CHANGES if not name.startswith(("λ", "D ", "a V"))])
 def test_nothing_more_is_proved_from_an_edited_file(name, whole, kept):
     """A search that goes on from it refuses it, or comes to what is true."""

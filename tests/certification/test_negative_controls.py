@@ -13,7 +13,7 @@ from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.systems import Linear
 from tests.certification.planted import Planted
-from tests.problems import problem_of
+from tests.problems import AMPLE, problem_of
 
 DURATION = 2.0
 LOWER, UPPER = torch.tensor([0.0, -1.0, -1.0]).double(), torch.tensor([DURATION, 1.0, 1.0]).double()
@@ -70,7 +70,7 @@ def planted_at_random(seed):
 
 
 def proof_of(condition, seed, boxes=200):
-    budget = Budget(20, boxes=boxes, chunk=100)
+    budget = Budget(AMPLE, boxes=boxes, chunk=100)
     generator = torch.Generator().manual_seed(seed)
     return prove(condition, (LOWER, UPPER), budget=budget, stop_at_counterexample=False, generator=generator)
 
@@ -106,11 +106,6 @@ def test_what_nothing_is_planted_in_is_certified():
     assert proof_of(DecreaseCondition(loop(Bowl()), 0.5, 0.02), 0).verdict == "certified"
 
 
-def test_planted_violations_are_never_certified():
-    assert "certified" not in controls(range(3))
-
-
-@pytest.mark.slow
 def test_a_hundred_planted_violations_are_never_certified():
     assert "certified" not in controls(range(100))
 
@@ -120,7 +115,7 @@ def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
     """Their states grow whatever V says, and at the counterexample V grows by plain arithmetic along a short step."""
     torch.manual_seed(seed)
     closed_loop = loop(Bowl(0.2), A=(torch.tensor(UNSTABLE) + 0.1 * torch.randn(2, 2)).tolist(), gain=0.1)
-    found = claim(closed_loop, 0.5, 0.01, Box(LOWER[1:], UPPER[1:]), Budget(20, boxes=2000))
+    found = claim(closed_loop, 0.5, 0.01, Box(LOWER[1:], UPPER[1:]), Budget(AMPLE, boxes=2000))
     assert found.verdict == "falsified"
     t, x = torch.tensor(found.counterexample.t), torch.tensor(found.counterexample.x)
     u = closed_loop.policy(t, x).detach()
@@ -134,7 +129,7 @@ def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
 @pytest.mark.parametrize("V", [Bowl(-2.0), Bowl(0.05)], ids=["wrong sign", "too small"])
 def test_a_wrong_value_function_is_falsified(V, monkeypatch):
     monkeypatch.setattr(funnel, "LEVELS", 0.5)
-    found = claim(loop(V), 0.5, 0.02, Box(LOWER[1:], UPPER[1:]), Budget(20, boxes=2000))
+    found = claim(loop(V), 0.5, 0.02, Box(LOWER[1:], UPPER[1:]), Budget(AMPLE, boxes=2000))
     assert found.verdict == "falsified"
 
 

@@ -115,7 +115,7 @@ def calling(operator, shape, extra, turns, constant):
     return call
 
 
-def examined(operator, tries=8):
+def examined(operator, tries=3):
     """(calls that torch takes, those that were bounded, values outside)."""
     taken, bounded, wrong = 0, 0, 0
     for function in calls(operator, tries):
@@ -126,14 +126,6 @@ def examined(operator, tries=8):
         count = outside(function)
         taken, bounded, wrong = taken + 1, bounded + (count is not None), wrong + (count or 0)
     return taken, bounded, wrong
-
-
-def test_a_part_of_all_operators_is_refused_or_bounded():
-    counts = [examined(operator, 4) for operator in list(operators())[::24]]
-    taken, bounded, wrong = (sum(column) for column in zip(*counts, strict=True))
-    assert wrong == 0
-    assert bounded > 5
-    assert taken > 2 * bounded
 
 
 def test_whether_torch_finds_a_matrix_singular_is_not_known():
@@ -169,7 +161,6 @@ def test_a_process_that_ends_is_noticed():
     assert in_a_child(os.abort) is None
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # deprecations in torch's own operators
 def test_each_operator_is_refused_or_bounded():
     every = list(operators())

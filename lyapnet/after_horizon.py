@@ -52,7 +52,7 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
         return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))
     held, reasons = dict[str, int](), []
-    for law in LAWS:
+    for law in ("hold",) if problem.horizon.stationary else LAWS:  # of a task without end there is one law
         try:
             stays = is_held(problem, closed_loops(law, x0, MULTIPLE * problem.horizon.steps))
         except DivergenceError:

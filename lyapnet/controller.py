@@ -160,7 +160,9 @@ class Controller:
         return self._continued
 
     def after_horizon(self) -> AfterHorizon:
-        """The law after T, and how many closed loops it holds at the goal up to 5 T; sought once, where none is known.
+        """The law after T that holds the goal, and how many of 64 closed loops up to 5 T; whatever `beyond` says.
+
+        Of a checkpoint, what training found; else sought once.
 
         Raises:
             DivergenceError: ẋ or ℓ is not finite on states of X₀.

@@ -8,6 +8,7 @@ from scipy.linalg import solve_continuous_are
 from torch.testing import assert_close
 
 from lyapnet import load, train
+from lyapnet.after_horizon import AfterHorizon
 from lyapnet.build import Parts, build_problem, build_value_function
 from lyapnet.calculus import gradients
 from lyapnet.config import config_from_plain
@@ -272,6 +273,8 @@ def test_a_checkpoint_is_loaded_with_its_tail(tmp_path):
     run = train(config_from_plain(own, ["training.iterations=1", "training.warmup=0", "rollout.compile=off"]))
     controller = load(run.best)
     assert controller.horizon.stationary
+    assert controller.after_horizon() == AfterHorizon("hold", 64, 64), "one law for ever"
+    assert run.evaluation["after_T"] == "hold"
     assert_close(P_of(controller.problem), P_of(problem(CHAIN)))
     assert dataclasses.replace(controller.horizon, stationary=False) != controller.horizon
     ends = config_from_plain(own, ["horizon.stationary=false", "cost.Q_T=1", "program.name=value"])

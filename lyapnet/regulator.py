@@ -1,6 +1,8 @@
 """The linear-quadratic regulator of a problem's goal, for an infinite horizon; of a family, one for each member."""
 
 import itertools
+import operator
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -137,7 +139,7 @@ class _ChebyshevBasis(nn.Module):
         box, constants = exact.initial_states, list(exact.system.constants)
         half = box.widths[constants] / 2
         self.constants = constants
-        self.degrees = [NODES if float(h) > 0 else 1 for h in half]
+        self.counts = [NODES if float(h) > 0 else 1 for h in half]
         like = exact.goal
         self.register_buffer("center", box.center[constants].to(like), persistent=False)
         self.register_buffer("half_widths", torch.where(half > 0, half, 1.0).to(like), persistent=False)
@@ -146,17 +148,17 @@ class _ChebyshevBasis(nn.Module):
         """Each of the products at the parameters of states (*batch, n + k)."""
         center, half = self.center.to(x), self.half_widths.to(x)
         axes = []
-        for k, (i, count) in enumerate(zip(self.constants, self.degrees, strict=True)):
+        for k, (i, count) in enumerate(zip(self.constants, self.counts, strict=True)):
             s = ((x[..., i] - center[k]) / half[k]).clamp(-1.0, 1.0)
             terms = [torch.ones_like(s), s]
             while len(terms) < count:
                 terms.append(2 * s * terms[-1] - terms[-2])
             axes.append(terms[:count])
-        return [_product(factors) for factors in itertools.product(*axes)]
+        return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
 
     def nodes(self) -> Float[Tensor, "nodes k"]:
         """The parameters at which the products are fitted, as many as there are products."""
-        angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.degrees]
+        angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.counts]
         scaled = torch.cartesian_prod(*(a.cos() for a in angles)).reshape(-1, len(angles))
         return self.center + self.half_widths * scaled
 
@@ -201,14 +203,4 @@ def _goal_of(exact: Problem, p: Float[Tensor, " k"]) -> State:
 
 
 def _sum(terms: list[Tensor]) -> Tensor:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total
-
-
-def _product(factors: tuple[Tensor, ...]) -> Tensor:
-    result = factors[0]
-    for factor in factors[1:]:
-        result = result * factor
-    return result
+    return reduce(operator.add, terms)

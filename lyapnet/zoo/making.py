@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from lyapnet.after_horizon import LOOPS, distance_to_goal
+from lyapnet.after_horizon import LOOPS, MULTIPLE, distance_to_goal, is_held
 from lyapnet.certification.sampling_certificates import statistical_certificate
 from lyapnet.checkpoint import AFTER_HORIZON, KEY, ZOO, note_in_checkpoint, read_checkpoint, write_checkpoint
 from lyapnet.controller import Controller
@@ -93,14 +93,18 @@ def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
 
 
 def choose_law_after(checkpoint: Path) -> dict[str, Any]:
-    """Find what follows T, and note it in the checkpoint; with the mean distance to the goal at some multiples of T."""
+    """Find what follows T, and note it in the checkpoint; how many other closed loops it holds up to 5 T, and their
+    mean distance to the goal at some multiples of T.
+    """
+    note_in_checkpoint(checkpoint, **{AFTER_HORIZON: None})  # what was found before is not taken
     controller = load(checkpoint)
     found, problem = controller.after_horizon(), controller.problem
     note_in_checkpoint(checkpoint, **{AFTER_HORIZON: found._asdict()})
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(1))
     N, other = problem.horizon.steps, controller.continued(found.beyond)
-    distance = distance_to_goal(problem, other.rollout(x0, max(MULTIPLES) * N).x).mean(1)
-    return {**found._asdict(), "distance": {str(k): float(distance[k * N]) for k in MULTIPLES}}
+    x = other.rollout(x0, max(MULTIPLES) * N).x
+    held, distance = int(is_held(problem, x[: MULTIPLE * N + 1]).sum()), distance_to_goal(problem, x).mean(1)
+    return {**found._replace(held=held)._asdict(), "distance": {str(k): float(distance[k * N]) for k in MULTIPLES}}
 
 
 def _agreements(checkpoint: Path, precision: str) -> dict[str, dict[str, float]]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.checkpoint import KEY, ZOO, located, read_checkpoint, write_checkpoint, zoo_names
+from lyapnet.checkpoint import KEY, ZOO, located, note_in_checkpoint, read_checkpoint, write_checkpoint, zoo_names
 from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import UsageError
@@ -96,6 +96,34 @@ def test_the_zoo_is_listed(capsys):
     assert main(["zoo", "--exports"]) == 0
     printed = capsys.readouterr().out
     assert printed.count("float64") == printed.count("float32") == len(NAMES)
+
+
+def test_what_follows_the_end_is_as_the_page_has_it(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main(["zoo", "--after"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    page = (ROOT / "docs" / "beyond.md").read_text().splitlines()
+    for name in NAMES:
+        (shown,), (told,) = ([row for row in rows if f" {mark} " in row] for rows, mark in (
+            (printed, name), (page, f"`zoo:{name}`")
+        ))  # fmt: skip
+        cells = [cell.strip() for cell in shown.split("│")[2:-1]]
+        assert cells == [cell.strip(" `") for cell in told.split("|")[2:-1]]
+        record, noted = entry(name).record["afterwards"], read_checkpoint(f"zoo:{name}")[KEY]["after_horizon"]
+        assert record["beyond"] == noted["beyond"]
+        assert record["held"] == noted["held"] == (0 if name == "bryson_denham" else 64)
+
+
+def test_what_follows_the_end_is_found_again(tmp_path, monkeypatch):
+    """Not taken from the checkpoint; and what is recorded is of other closed loops than those of the choice."""
+    path = tmp_path / "one.ckpt"
+    shutil.copy(located(f"zoo:{ONE}"), path)
+    note_in_checkpoint(path, after_horizon={"beyond": "receding", "held": 3, "loops": 64, "reason": ""})
+    monkeypatch.setattr(making, "is_held", lambda problem, x: torch.arange(x.shape[1]) < 5)
+    recorded, noted = making.choose_law_after(path), read_checkpoint(path)[KEY]["after_horizon"]
+    assert (recorded["beyond"], recorded["held"]) == ("riccati", 5)
+    assert (noted["beyond"], noted["held"]) == ("riccati", 64)
+    assert recorded["distance"] == pytest.approx(entry(ONE).record["afterwards"]["distance"])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -45,14 +45,16 @@ class AfterHorizon(NamedTuple):
 def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State]) -> AfterHorizon:
     """The first of LAWS that holds closed loops from X₀ at the goal up to MULTIPLE T; else the one that holds most.
 
+    A task without end has one law for all time, which is tried alone.
+
     Args:
         closed_loops: (a key of LAWS, x₀ (b, n), steps) ↦ the states (steps + 1, b, n) under that law after T.
     """
     if MULTIPLE * problem.horizon.steps > LONGEST:
         return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))
-    held, reasons = dict[str, int](), []
-    for law in ("hold",) if problem.horizon.stationary else LAWS:  # of a task without end there is one law
+    held, reasons = {"hold": 0}, []  # what V says at T is there whatever f, g and the cost do
+    for law in ("hold",) if problem.horizon.stationary else LAWS:
         try:
             stays = is_held(problem, closed_loops(law, x0, MULTIPLE * problem.horizon.steps))
         except DivergenceError:
@@ -65,7 +67,7 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
         if held[law] == LOOPS:
             return AfterHorizon(law, LOOPS, LOOPS)
         reasons.append(f"{law}: {held[law]} of {LOOPS}")
-    most = max(reversed(held), key=lambda law: held[law])
+    most = max(held, key=lambda law: held[law])  # hold, where others hold as many
     return AfterHorizon(most, held[most], LOOPS, "; ".join(reasons))
 
 
@@ -95,4 +97,6 @@ def from_plain(content: Any) -> AfterHorizon | None:
     types = {"beyond": str, "held": int, "loops": int, "reason": str}
     if not isinstance(content, dict) or {key: type(value) for key, value in content.items()} != types:
         return None
-    return AfterHorizon(**content) if content["beyond"] in LAWS else None
+    found = AfterHorizon(**content)
+    possible = found.beyond in LAWS and 0 <= found.held <= found.loops and found.reason.isprintable()
+    return found if possible else None

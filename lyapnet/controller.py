@@ -74,7 +74,7 @@ class Controller:
             program: what V was trained for, and so what a certificate asks of it; None: the value program.
             config: of the run that trained it, where there was one.
             beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load; None: the first of riccati,
-                receding and hold that holds closed loops at the goal, tried when it is first asked for.
+                receding and hold that holds closed loops, tried when it is first asked for.
             parts: the user's own parts that stood in the place of the config's.
             policy: the control law of V, where no rollout has one; None: the one that V is made for, and the HJB law
                 where nobody knows, with a note if that matters.
@@ -160,12 +160,9 @@ class Controller:
         return self._continued
 
     def after_horizon(self) -> AfterHorizon:
-        """The law after T that holds the goal, and how many of 64 closed loops up to 5 T; whatever `beyond` says.
+        """What training found of the law after T, and of how many closed loops it holds up to 5 T; else it is sought.
 
-        Of a checkpoint, what training found; else sought once.
-
-        Raises:
-            DivergenceError: ẋ or ℓ is not finite on states of X₀.
+        Where `beyond` was given, that law is followed all the same.
         """
         if self._after_horizon is None:
             self._after_horizon = choose_law(

@@ -1,6 +1,7 @@
 """After T: what was asked for, and never in silence."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,7 +70,9 @@ def test_unless_told_it_is_what_holds_the_goal_and_says_so_once(logged):
         assert_close(own.policy(t, X), chosen.policy(t, X))
     (note,) = logged()
     assert note.startswith("note: the control law is for 1 s; after T follows riccati (the linear-quadratic regulator")
-    assert "holds 64 of 64 closed loops at the goal up to 5 T" in note
+    assert (
+        "holds 64 of 64 closed loops at the goal up to 5 T" in note
+    )
     assert_close(own.value(7.0, X), chosen.value(7.0, X))
     assert_close(own.rollout(X, steps=20).x, chosen.rollout(X, steps=20).x)
 
@@ -269,6 +272,36 @@ def test_a_plant_without_derivatives_is_no_failure():
     assert "riccati: " in found.reason
 
 
+def test_a_plant_that_refuses_states_is_no_failure():
+    """As a table does that ends: a law that asks for states outside holds nothing, and nothing else is lost."""
+
+    class Ending(DoubleIntegrator):
+        def f(self, x):
+            if bool((x[..., 0].abs() > 1).any()):
+                raise ValueError("outside of the table")
+            return super().f(x)
+
+        def dynamics(self, x, u):
+            return self.f(x) + super().g(x)[..., 0] * u
+
+    own = Controller(problem_of(Ending()), Formula(weak), policy=HJBPolicy)
+    found = own.after_horizon()
+    assert (found.beyond, found.held, found.loops) == ("hold", 0, 64)
+    assert found.reason.count("outside of the table") == 3
+    assert share_at_goal(own, X) == 0.0
+
+
+def test_a_task_without_end_has_one_law():
+    """The regulator, which is asked first elsewhere, does not follow it."""
+    problem = problem_of(DoubleIntegrator())
+    endless = problem.replaced(horizon=replace(problem.horizon, stationary=True))
+    V = Quadratic(torch.tensor([[2.0, 1.0], [1.0, 2.0]]))
+    own = Controller(endless, V, policy=HJBPolicy)
+    assert own.after_horizon() == AfterHorizon("hold", 64, 64)
+    assert own.law.beyond == "hold"
+    assert Controller(problem, V, policy=HJBPolicy).after_horizon().beyond == "riccati"
+
+
 def test_limits_that_are_too_narrow_hold_nothing():
     """Gravity is stronger than what the limits leave."""
     pendulum = leaning()
@@ -349,6 +382,8 @@ def test_what_does_not_hold_is_said_at_load(tmp_path, logged):
         {"beyond": ["riccati"], "held": 1, "loops": 1, "reason": ""},
         {"beyond": "riccati", "held": True, "loops": 1, "reason": ""},
         {"beyond": "riccati", "held": 1, "loops": 1, "reason": "", "more": 1},
+        {"beyond": "receding", "held": 65, "loops": 64, "reason": ""},
+        {"beyond": "receding", "held": 1, "loops": 64, "reason": "\x1b[2J"},
     ],
 )  # fmt: skip
 def test_what_a_checkpoint_cannot_mean_is_found_anew(said, tmp_path):

@@ -53,18 +53,19 @@ def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterw
 
 
 def share_at_goal(controller: Controller, x0: State) -> float | None:
-    """The share of closed loops that the law after T holds at the goal up to MULTIPLE T; None where that is not asked.
+    """The share of closed loops that the law after T holds up to MULTIPLE T; None where that is not asked.
 
-    It is not asked of an error, and of a time of more than LONGEST steps.
+    It is not asked of an error, and of a time of more than LONGEST steps. Closed loops that cannot be followed, as one
+    of them diverges or f, g or the cost refuse a state, are not held.
     """
     steps = MULTIPLE * controller.horizon.steps
     if controller.law.beyond == "error" or steps > LONGEST:
         return None
     try:
         x = controller.continued(law_after(controller)).rollout(x0, steps).x
-    except DivergenceError:
+        return float(is_held(controller.problem, x).double().mean())
+    except Exception:  # of any kind: f, g and the cost may be the user's
         return 0.0
-    return float(is_held(controller.problem, x).double().mean())
 
 
 def law_after(controller: Controller) -> str:

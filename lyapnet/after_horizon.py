@@ -17,9 +17,10 @@ LAWS = {  # those that can follow T, the one that is preferred first
     "hold": "V(T, x) and its law",
 }
 LOOPS, MULTIPLE = 64, 5  # closed loops that are tried, and up to how many T
-NEAR = 0.01  # share of the largest distance at t = 0 that counts as being at the goal
+NEAR = 0.01  # share of the largest distance at t = 0 within which a closed loop is held, however near it was at T
+HELD = f"no farther from the goal at {MULTIPLE} T than at T"  # see is_held
 LONGEST = 20_000  # steps of a closed loop that is tried
-REMEDY = "load with beyond=hold, receding, riccati or error to choose"
+REMEDY = "to choose another, load with beyond=hold, receding, riccati or error"
 
 
 class AfterHorizon(NamedTuple):
@@ -32,18 +33,18 @@ class AfterHorizon(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether every closed loop that was tried stays at the goal."""
+        """Whether it holds every closed loop that was tried."""
         return 0 < self.loops == self.held
 
     def __str__(self) -> str:
         law = f"after T follows {self.beyond} ({LAWS[self.beyond]})"
         if self.holds:
-            return f"{law}, which holds {self.held} of {self.loops} closed loops at the goal up to {MULTIPLE} T"
-        return f"{law}; no law was found that holds closed loops at the goal up to {MULTIPLE} T ({self.reason})"
+            return f"{law}, under which {self.held} of {self.loops} closed loops are {HELD}"
+        return f"{law}; no law was found under which all closed loops are {HELD} ({self.reason})"
 
 
 def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State]) -> AfterHorizon:
-    """The first of LAWS that holds closed loops from X₀ at the goal up to MULTIPLE T; else the one that holds most.
+    """The first of LAWS that holds closed loops from X₀ up to MULTIPLE T; else the one that holds most.
 
     A task without end has one law for all time, which is tried alone.
 
@@ -72,7 +73,7 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
 
 
 def is_held(problem: Problem, x: State) -> Bool[Tensor, " batch"]:
-    """Whether closed loops x (nodes, batch, n) that go on after T are at the goal at their last node.
+    """Whether closed loops x (nodes, batch, n) that go on after T are held, judged by their last node.
 
     In the states that the cost weighs, ‖x − x*‖ is then no larger than at T, or than NEAR times the largest at t = 0;
     and no constraint was violated after T by more than before.

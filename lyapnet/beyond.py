@@ -57,7 +57,7 @@ class Sequel(nn.Module):
         if not self._noted:
             self._noted = True
             logging.getLogger(__name__).warning(
-                "note: the control law is for %g s; %s. To choose, %s.", self.duration, self._choose(), REMEDY
+                "note: the control law is for %g s; %s; %s.", self.duration, self._choose(), REMEDY
             )
 
     def _follow(self, beyond: str) -> None:

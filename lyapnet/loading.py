@@ -71,7 +71,7 @@ def load(
     problem, V = problem.to(device), V.to(device)
     own = build_program(config) if program is None else program
     if beyond is None and after_horizon is not None and not after_horizon.holds:
-        logging.getLogger(__name__).warning("note: %s; to choose, %s.", after_horizon, REMEDY)
+        logging.getLogger(__name__).warning("note: %s; %s.", after_horizon, REMEDY)
     rollout = build_rollout(config, problem, V)
     return Controller(problem, V, rollout, own, config, beyond, parts, after_horizon=after_horizon)
 

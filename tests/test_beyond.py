@@ -71,7 +71,7 @@ def test_unless_told_it_is_what_holds_the_goal_and_says_so_once(logged):
     (note,) = logged()
     assert note.startswith("note: the control law is for 1 s; after T follows riccati (the linear-quadratic regulator")
     assert (
-        "holds 64 of 64 closed loops at the goal up to 5 T" in note
+        "under which 64 of 64 closed loops are no farther from the goal at 5 T than at T; to choose another, " in note
     )
     assert_close(own.value(7.0, X), chosen.value(7.0, X))
     assert_close(own.rollout(X, steps=20).x, chosen.rollout(X, steps=20).x)
@@ -257,7 +257,7 @@ def test_no_choice_where_nothing_holds_says_why(logged):
         assert word in found.reason
     own.policy(9.0, X)
     (note,) = logged()
-    assert "no law was found that holds closed loops at the goal up to 5 T (riccati: Expected a goal" in note
+    assert "no law was found under which all closed loops are no farther from the goal at 5 T than at T (ricc" in note
 
 
 def test_a_plant_without_derivatives_is_no_failure():
@@ -372,7 +372,8 @@ def test_what_does_not_hold_is_said_at_load(tmp_path, logged):
         checkpoint_that_says(tmp_path, {"beyond": "hold", "held": 3, "loops": 64, "reason": "riccati: 2 of 64"})
     )
     (note,) = logged()
-    assert "no law was found that holds closed loops at the goal up to 5 T (riccati: 2 of 64)" in note
+    assert "no law was found under which all closed loops are no farther from the goal at 5 T" in note
+    assert note.endswith("(riccati: 2 of 64); to choose another, load with beyond=hold, receding, riccati or error.")
 
 
 @pytest.mark.parametrize(

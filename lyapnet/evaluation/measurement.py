@@ -49,7 +49,7 @@ class Evaluation(NamedTuple):
     corner: Corner
     held_cost: PerState  # of the table's states in continuous time, u held for Δt; infinite where it diverges
     lqr_cost: PerState | None  # of the table's states under LQR, likewise; None where there is no such law
-    at_goal: float | None  # share of closed loops at the goal at 5 T; None where it is not asked
+    at_goal: float | None  # share of closed loops that the law after T holds; None where it is not asked
     after: str  # the law after T
     optimum_of: str = ""  # of which steps, or of continuous time; empty where no optimum was sought
 

@@ -6,6 +6,7 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
+from lyapnet.after_horizon import HELD
 from lyapnet.tables import DIVERGED, ratio
 
 ROWS = {
@@ -22,7 +23,7 @@ ROWS = {
     "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
     "constraint_loss": "constraint loss, mean",
     "terminal_error": "terminal error, mean ‖x(T)‖",
-    "at_goal_fraction": "at the goal at 5 T, share of closed loops",
+    "at_goal_fraction": f"{HELD}, share of closed loops",
     "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
     "falling_fraction": "V falls by half of each step's cost, within 1e-6 of V(0, x₀)",
     "largest_rise": "largest rise of V in a step, relative to V(0, x₀)",

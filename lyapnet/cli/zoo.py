@@ -122,7 +122,7 @@ def _table(name: str, controller: Any, trajectory: Any, ratio: float, error: flo
     table.add_row("cost / optimum, ratio of the means", f"{ratio:.4f}")
     table.add_row("value error, mean |V(0, x₀) − J*| / mean J*", f"{error:.2%}")
     if (share := share_at_goal(controller, trajectory.x[0])) is not None:
-        table.add_row(f"after T, by {law_after(controller)}: {HELD}, share of closed loops", f"{share:.1%}")
+        table.add_row(f"after T, by {law_after(controller)}: {HELD}, share", f"{share:.1%}")
     *conditions, _ = certificate.in_formulas()
     share = f"share of X₀ with {', '.join(conditions)}, from {STATES} further states, confidence 0.999"
     table.add_row(share, f"≥ {floored(certificate.claim.probability_lower_bound)}")

@@ -23,7 +23,7 @@ ROWS = {
     "value_error": "value error, mean |V(0, x₀) − J*| / mean J*",
     "constraint_loss": "constraint loss, mean",
     "terminal_error": "terminal error, mean ‖x(T)‖",
-    "at_goal_fraction": f"{HELD}, share of closed loops",
+    "at_goal_fraction": f"{HELD}, share",
     "bounded_fraction": "cost J ≤ V(0, x₀), share of states",
     "falling_fraction": "V falls by half of each step's cost, within 1e-6 of V(0, x₀)",
     "largest_rise": "largest rise of V in a step, relative to V(0, x₀)",

@@ -30,6 +30,8 @@ class Sequel(nn.Module):
         ValueError: another `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
     """
 
+    problem: Problem
+    duration: float
     beyond: str | None
     regulator: Regulator | None
 
@@ -102,6 +104,7 @@ class ContinuedPolicy(ValuePolicy):
     policy: ValuePolicy
     sequel: Sequel
     duration: float
+    held: bool
 
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None, choose: Chooser, noted: bool = False):
         sequel = Sequel(problem, beyond, choose, noted)

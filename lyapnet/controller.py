@@ -49,6 +49,7 @@ class Controller:
     problem: Problem
     program: Program
     V: ValueFunction
+    _after_horizon: AfterHorizon | None
 
     def __init__(
         self,
@@ -213,7 +214,9 @@ class Controller:
         config, parts, p = member(self.config, self._parts, system, parameters)
         problem = build_problem(config, parts).to(self.initial_states.lower.device)
         V = AtParameters(self.V, self.initial_states.lower.new_tensor(p))
-        return Controller(problem, V, build_rollout(config, problem, V), self.program, config, self._beyond, parts)
+        rollout = build_rollout(config, problem, V)
+        known = self._after_horizon  # of the family, and so of its members
+        return Controller(problem, V, rollout, self.program, config, self._beyond, parts, after_horizon=known)
 
     def continued(self, beyond: str) -> "Controller":
         """The controller with another law after T: hold, receding, riccati or error, as in lyapnet.load.

@@ -47,6 +47,8 @@ class Regulator(nn.Module):
             members whose gains no such polynomial fits.
     """
 
+    problem: Problem
+    basis: "_ChebyshevBasis | None"  # of a family
     P: Matrix  # of a family (nodes, n + k, n + k), coefficients of Chebyshev polynomials
     K: Float[Tensor, "m n"]  # likewise
 
@@ -138,8 +140,8 @@ class _ChebyshevBasis(nn.Module):
         super().__init__()
         box, constants = exact.initial_states, list(exact.system.constants)
         half = box.widths[constants] / 2
-        self.constants = constants
-        self.counts = [NODES if float(h) > 0 else 1 for h in half]
+        self.constants: list[int] = constants
+        self.counts: list[int] = [NODES if float(h) > 0 else 1 for h in half]
         like = exact.goal
         self.register_buffer("center", box.center[constants].to(like), persistent=False)
         self.register_buffer("half_widths", torch.where(half > 0, half, 1.0).to(like), persistent=False)

@@ -67,7 +67,8 @@ def _imported(tmp_path_factory):
     lyapnet.load(ZOO)
     with chdir(tmp_path_factory.mktemp("first")):
         Path("task.yaml").write_text(TASK)
-        assert main([argument.replace("FILE", "absent") for argument in READERS["onnx"]]) != 0
+        Path("foreign").write_bytes(b"\x00nothing")
+        assert main([argument.replace("FILE", "foreign") for argument in READERS["onnx"]]) != 0
 
 
 @pytest.fixture

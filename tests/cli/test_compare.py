@@ -121,10 +121,12 @@ def test_the_same_command_again_trains_nothing(smoke, compare):
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
-@pytest.mark.parametrize("report", [[], ["--report"]])
 @pytest.mark.parametrize(
-    ("change", "named"),
-    [("tasks.double_integrator.hidden=[5]", "hidden = [5] instead of [16]"), ("evaluation_seed=7", "evaluation")],
+    ("change", "named", "report"),
+    [
+        ("tasks.double_integrator.hidden=[5]", "hidden = [5] instead of [16]", []),
+        ("evaluation_seed=7", "evaluation", ["--report"]),
+    ],
 )
 def test_another_config_is_not_taken_for_the_same(change, named, report, compare):
     status, _, err = compare(change, *report)

@@ -56,7 +56,9 @@ def demo(
     began = time.monotonic()
     with stages_of("demo") as report:
         report(f"importing torch for {name}")
+        from lyapnet.after_horizon import HELD
         from lyapnet.certification.sampling_certificates import statistical_certificate
+        from lyapnet.evaluation.afterwards import law_after, share_at_goal
         from lyapnet.evaluation.animation import Film
         from lyapnet.evaluation.figures import trajectories
         from lyapnet.zoo import entry
@@ -66,13 +68,20 @@ def demo(
         controller = one.load()
         trajectory, ratio, error = one.measured(controller)
         certificate = statistical_certificate(controller, STATES, 1 - 1e-3, 0.95)
+        report("closed loops after T")
+        measured = {
+            "cost / optimum, ratio of the means": f"{ratio:.4f}",
+            "value error, mean |V(0, x₀) − J*| / mean J*": f"{error:.2%}",
+        }
+        if (share := share_at_goal(controller, trajectory.x[0])) is not None:
+            measured[f"after T, by {law_after(controller)}: {HELD}, share"] = f"{share:.1%}"
         report("drawing and animating")
         shown = controller.rollout(trajectory.x[0, :5])
         folder.mkdir(parents=True, exist_ok=True)
         trajectories(shown, controller.problem).savefig(folder / "trajectories.png", dpi=150)
         Film(shown, controller.problem, controller.value).write(folder / "closed_loops.gif")
     console = Console(highlight=False, markup=False)
-    console.print(_table(one.name, controller, trajectory, ratio, error, certificate))
+    console.print(_table(one.name, trajectory.x.shape[1], measured, certificate))
     console.print(f"{'made by':<10}{one.record['command']}", soft_wrap=True)
     console.print(f"{'wrote':<10}{folder / 'trajectories.png'}, {folder / 'closed_loops.gif'}", soft_wrap=True)
     for what, command in (
@@ -112,17 +121,12 @@ def _after(found: list[Any]) -> Table:
     return table
 
 
-def _table(name: str, controller: Any, trajectory: Any, ratio: float, error: float, certificate: Any) -> Table:
-    from lyapnet.after_horizon import HELD
+def _table(name: str, states: int, measured: dict[str, str], certificate: Any) -> Table:
     from lyapnet.certification.tables import floored
-    from lyapnet.evaluation.afterwards import law_after, share_at_goal
 
-    states = trajectory.x.shape[1]
     table = Table("measure", "value", title=f"zoo:{name}, {states} states of X₀ that no training saw")
-    table.add_row("cost / optimum, ratio of the means", f"{ratio:.4f}")
-    table.add_row("value error, mean |V(0, x₀) − J*| / mean J*", f"{error:.2%}")
-    if (share := share_at_goal(controller, trajectory.x[0])) is not None:
-        table.add_row(f"after T, by {law_after(controller)}: {HELD}, share", f"{share:.1%}")
+    for what, value in measured.items():
+        table.add_row(what, value)
     *conditions, _ = certificate.in_formulas()
     share = f"share of X₀ with {', '.join(conditions)}, from {STATES} further states, confidence 0.999"
     table.add_row(share, f"≥ {floored(certificate.claim.probability_lower_bound)}")

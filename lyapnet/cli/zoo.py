@@ -56,6 +56,8 @@ def demo(
     began = time.monotonic()
     with stages_of("demo") as report:
         report(f"importing torch for {name}")
+        import torch
+
         from lyapnet.after_horizon import HELD
         from lyapnet.certification.sampling_certificates import statistical_certificate
         from lyapnet.evaluation.afterwards import law_after, share_at_goal
@@ -63,6 +65,7 @@ def demo(
         from lyapnet.evaluation.figures import trajectories
         from lyapnet.zoo import entry
 
+        torch.set_num_threads(1)  # of such small networks more threads wait for one another on a busy machine
         one, folder = entry(name), out or Path("lyapnet_demo", name)
         report("closed loops, and a certificate of them")
         controller = one.load()

@@ -58,13 +58,12 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
     for law in ("hold",) if problem.horizon.stationary else LAWS:
         try:
             stays = is_held(problem, closed_loops(law, x0, MULTIPLE * problem.horizon.steps))
+            held[law] = int(stays.sum())
         except DivergenceError:
             held[law] = 0
         except Exception as refusal:  # of any kind: f, g and the cost, whose derivatives are asked, may be the user's
             reasons.append(f"{law}: {one_line(refusal)}")
             continue
-        else:
-            held[law] = int(stays.sum())
         if held[law] == LOOPS:
             return AfterHorizon(law, LOOPS, LOOPS)
         reasons.append(f"{law}: {held[law]} of {LOOPS}")

@@ -177,8 +177,7 @@ def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
             f"Expected a family of three parameters at most for {solve.purpose}, got {len(basis.constants)}; take "
             f"one member, or {solve.instead}."
         )
-    between = basis.center + basis.half_widths * (2 * torch.rand(8, len(basis.constants), dtype=torch.float64,
-                                                          generator=torch.Generator().manual_seed(0)) - 1)  # fmt: skip
+    between = exact.initial_states.sample(8, torch.Generator().manual_seed(0))[:, basis.constants]
     at_nodes, at_others = ([solve(_goal_of(exact, p)) for p in some] for some in (nodes, between))
     matrix, others = (
         np.asarray(torch.stack(basis(torch.stack([_goal_of(exact, p) for p in some])), -1)) for some in (nodes, between)

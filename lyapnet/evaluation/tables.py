@@ -92,9 +92,8 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     if about := results[0].get("optimum_of"):
         notes = {f"optimum: of {about}": None, **notes}
     notes |= {f"after T: {result['after_T']}": None for result in results if "after_T" in result}
-    return (
-        Text("; ".join(note.rstrip(".") for note in notes)) if notes else None
-    )  # Text: a plain string's [oracle] would be read as markup
+    caption = "; ".join(note.rstrip(".") for note in notes)
+    return Text(caption) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 
 def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float]) -> Table:

@@ -31,28 +31,33 @@ class Sequel(nn.Module):
     """
 
     problem: Problem
-    duration: float
-    beyond: str | None
     regulator: Regulator | None
+    _beyond: str | None
 
     def __init__(self, problem: Problem, beyond: str | None, choose: Chooser, noted: bool):
         super().__init__()
         if beyond not in (None, *BEYOND):
             raise ValueError(f"Expected beyond as one of {', '.join(BEYOND)}, got {beyond!r}; choose one of them.")
-        self.problem, self.duration, self._choose = problem, problem.horizon.duration, choose
-        self.beyond, self.regulator = None, None
+        self.problem, self._choose = problem, choose
+        self._beyond, self.regulator = None, None
         if beyond is None and problem.horizon.stationary:  # then nothing changes at T
             beyond = "hold"
         if beyond is not None:
             self._follow(beyond)
         self._noted = noted or beyond is not None
 
-    def settle(self) -> str:
+    @property
+    def duration(self) -> float:
+        """T, in s."""
+        return self.problem.horizon.duration
+
+    @property
+    def beyond(self) -> str:
         """The law's name; where nobody chose one, it is chosen now."""
-        if self.beyond is None:
+        if self._beyond is None:
             self._follow(self._choose().beyond)
-        assert self.beyond is not None
-        return self.beyond
+        assert self._beyond is not None
+        return self._beyond
 
     def note_once(self) -> None:
         """Say in a log what follows T, where nobody chose it."""
@@ -63,7 +68,7 @@ class Sequel(nn.Module):
             )
 
     def _follow(self, beyond: str) -> None:
-        self.beyond, self.regulator = beyond, Regulator(self.problem, spread=True) if beyond == "riccati" else None
+        self._beyond, self.regulator = beyond, Regulator(self.problem, spread=True) if beyond == "riccati" else None
 
 
 class ContinuedValue(ValueFunction):
@@ -71,20 +76,19 @@ class ContinuedValue(ValueFunction):
 
     V: ValueFunction
     sequel: Sequel
-    duration: float
 
     def __init__(self, V: ValueFunction, sequel: Sequel):
         super().__init__()
-        self.V, self.sequel, self.duration = V, sequel, sequel.duration
+        self.V, self.sequel = V, sequel
 
     def forward(self, t: Time, x: State) -> PerState:
-        late = is_after(t, self.duration)
+        late = is_after(t, self.sequel.duration)
         return self.at_any_time(t, x) if late.any() else self.V(t, x)
 
     def at_any_time(self, t: Time, x: State) -> PerState:
         """The same by one course for all t, to be traced."""
-        beyond, late = self.sequel.settle(), is_after(t, self.duration)
-        value, regulator = self.V(_within(t, late, self.duration, beyond), x), self.sequel.regulator
+        beyond, late = self.sequel.beyond, is_after(t, self.sequel.duration)
+        value, regulator = self.V(_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
         return value if regulator is None else torch.where(late, regulator.cost(x), value)
 
 
@@ -103,32 +107,29 @@ class ContinuedPolicy(ValuePolicy):
     V: ContinuedValue
     policy: ValuePolicy
     sequel: Sequel
-    duration: float
     held: bool
 
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None, choose: Chooser, noted: bool = False):
         sequel = Sequel(problem, beyond, choose, noted)
         super().__init__(problem, ContinuedValue(policy.V, sequel))
-        self.policy, self.sequel, self.duration, self.held = policy, sequel, problem.horizon.duration, policy.held
+        self.policy, self.sequel, self.held = policy, sequel, policy.held
 
     @property
-    def beyond(self) -> str | None:
-        """The law after T; None as long as nobody has chosen one."""
+    def beyond(self) -> str:
+        """The name of the law after T; where nobody chose one, it is chosen now."""
         return self.sequel.beyond
 
     def forward(self, t: Time, x: State) -> Control:
-        late = is_at_end(t, self.duration)
-        if not late.any():
+        if not is_at_end(t, self.sequel.duration).any():
             return self.policy(t, x)
-        self.sequel.settle()
-        if bool(is_after(t, self.duration).any()):
+        if bool(is_after(t, self.sequel.duration).any()):
             self.sequel.note_once()
         return self.at_any_time(t, x)
 
     def at_any_time(self, t: Time, x: State) -> Control:
         """The same by one course for all t, to be traced; without a word on what follows T."""
-        beyond, late = self.sequel.settle(), is_at_end(t, self.duration)
-        u, regulator = self.policy(_within(t, late, self.duration, beyond), x), self.sequel.regulator
+        beyond, late = self.beyond, is_at_end(t, self.sequel.duration)
+        u, regulator = self.policy(_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
         return u if regulator is None else torch.where(late[..., None], regulator(x), u)
 
 

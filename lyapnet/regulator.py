@@ -58,8 +58,9 @@ class Regulator(nn.Module):
         super().__init__()
         self.problem, exact = problem, in_float64(problem)
         solve = _Solver(exact, purpose, instead, spread)
-        self.basis = _ChebyshevBasis(exact) if exact.system.constants else None
-        P, K = solve(exact.goal) if self.basis is None else _fit(self.basis, exact, solve)
+        basis = _ChebyshevBasis(exact) if exact.system.constants else None
+        P, K = solve(exact.goal) if basis is None else _fit(basis, exact, solve)
+        self.basis = None if basis is None else basis.to(problem.goal)
         self.register_buffer("P", torch.as_tensor(P).to(problem.goal), persistent=False)
         self.register_buffer("K", torch.as_tensor(K).to(problem.goal), persistent=False)
 
@@ -148,10 +149,9 @@ class _ChebyshevBasis(nn.Module):
 
     def forward(self, x: State) -> list[PerState]:
         """Each of the products at the parameters of states (*batch, n + k)."""
-        center, half = self.center.to(x), self.half_widths.to(x)
         axes = []
         for k, (i, count) in enumerate(zip(self.constants, self.counts, strict=True)):
-            s = ((x[..., i] - center[k]) / half[k]).clamp(-1.0, 1.0)
+            s = ((x[..., i] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
             terms = [torch.ones_like(s), s]
             while len(terms) < count:
                 terms.append(2 * s * terms[-1] - terms[-2])

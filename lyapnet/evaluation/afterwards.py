@@ -59,18 +59,13 @@ def share_at_goal(controller: Controller, x0: State) -> float | None:
     of them diverges or f, g or the cost refuse a state, are not held.
     """
     steps = MULTIPLE * controller.horizon.steps
-    if controller.law.beyond == "error" or steps > LONGEST:
+    if steps > LONGEST or controller.law.beyond == "error":
         return None
     try:
-        x = controller.continued(law_after(controller)).rollout(x0, steps).x
+        x = controller.continued(controller.law.beyond).rollout(x0, steps).x
         return float(is_held(controller.problem, x).double().mean())
     except Exception:  # of any kind: f, g and the cost may be the user's
         return 0.0
-
-
-def law_after(controller: Controller) -> str:
-    """The name of the law after T; where nobody chose one, it is found now."""
-    return controller.law.beyond or controller.after_horizon().beyond
 
 
 def check_multiple(controller: Controller, multiple: float, states: int) -> None:

@@ -11,7 +11,7 @@ from lyapnet.after_horizon import LOOPS
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
-from lyapnet.evaluation.afterwards import law_after, share_at_goal
+from lyapnet.evaluation.afterwards import share_at_goal
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
@@ -163,7 +163,7 @@ def evaluation(
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     corner, problem = dearest_corner(controller), controller.problem
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
-    later = share_at_goal(controller, first.x0[:LOOPS]), law_after(controller)
+    later = share_at_goal(controller, first.x0[:LOOPS]), controller.law.beyond
     further = (seed, problem, corner, held, costs_of_lqr(problem, first.x0), *later)
     if not optimum:
         return Evaluation(first, paper, ["not asked for"] * samples, *further)

@@ -25,7 +25,7 @@ class Law:
 
     def __init__(self, controller: Controller):
         self._continued = controller.law
-        if self._continued.sequel.settle() == "error":
+        if self._continued.beyond == "error":
             raise ExportError(
                 "Expected a law after T that another language can follow, got beyond=error; take hold, receding or "
                 "riccati."

@@ -143,7 +143,7 @@ def _about(controller: Controller, checkpoint: Path | None) -> dict[str, str]:
     system, T = controller.system, controller.horizon.duration
     constants = set(system.constants)
     states = [i for i in range(system.n) if i not in constants]
-    beyond = controller.law.sequel.settle()
+    beyond = controller.law.beyond
     about = {
         "lyapnet": __version__,
         "checkpoint": "none" if checkpoint is None else f"{checkpoint}, SHA-256 {digest_of_file(checkpoint)}",

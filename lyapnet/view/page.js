@@ -225,8 +225,10 @@ function drawCourses() {
     shapes.push({ type: "line", xref: names.xaxis, yref: `${names.yaxis} domain`, x0: chosen.t, x1: chosen.t, y0: 0, y1: 1,
                   line: { color: "#999", width: 1 } });
   });
+  const hint = { text: "a click in the plane<br>starts a closed loop", showarrow: false, font: { size: 12 },
+                 xref: "x domain", yref: "y domain", x: 0.5, y: 0.5 };
   Plotly.react("courses", traces, {
-    ...layout, shapes, height: Math.max(560, 125 * rows + 110), margin: { l: 65, r: 10, t: 30, b: 60 },
+    ...layout, shapes, annotations: chosen.loops.length ? [] : [hint], height: Math.max(560, 125 * rows + 110), margin: { l: 65, r: 10, t: 30, b: 60 },
     legend: { orientation: "h", x: 0, y: -70 / (125 * rows), yanchor: "top" },
   }, CONFIG);
 }
@@ -269,6 +271,19 @@ function start(x0) {
   drawPlane();
   drawCourses();
   tell();
+}
+// Everything anew, as the first time: a plot keeps the margins that its legend once asked for at another width.
+function drawAnew() {
+  Plotly.purge("plane");
+  Plotly.purge("courses");
+  drawPlane();
+  drawCourses();
+  element("plane").on("plotly_click", ({ points: [point], event }) => {
+    const box = document.querySelector("#plane .nsewdrag").getBoundingClientRect();
+    const { x } = at(point.xaxis.p2d(event.clientX - box.left), point.yaxis.p2d(event.clientY - box.top));
+    for (const k of chosen.axes) if (k !== TIME) x[k] = onThin(x[k], k);
+    start(x);
+  });
 }
 function moveTo(t) {
   chosen.t = t;
@@ -346,15 +361,8 @@ if (facts.funnel) {
 }
 offerAxes();
 offerOthers();
-drawPlane();
-drawCourses();
+drawAnew();
 moveTo(0);
-element("plane").on("plotly_click", ({ points: [point], event }) => {
-  const box = document.querySelector("#plane .nsewdrag").getBoundingClientRect();
-  const { x } = at(point.xaxis.p2d(event.clientX - box.left), point.yaxis.p2d(event.clientY - box.top));
-  for (const k of chosen.axes) if (k !== TIME) x[k] = onThin(x[k], k);
-  start(x);
-});
 let waiting = false; // a slider may tell more often than the plane can be drawn
 element("t").addEventListener("input", () => {
   if (!waiting) setTimeout(() => {
@@ -368,5 +376,5 @@ element("up").addEventListener("change", (event) => choose(1, Number(event.targe
 element("layer").addEventListener("change", (event) => { chosen.layer = event.target.value; drawPlane(); });
 const watched = new ResizeObserver((changes) => changes.forEach(({ target }) => Plotly.Plots.resize(target)));
 for (const id of ["plane", "courses"]) watched.observe(element(id));
-phone.addEventListener("change", () => { drawPlane(); drawCourses(); });
+phone.addEventListener("change", drawAnew);
 element("clear").addEventListener("click", () => { chosen.loops = []; drawPlane(); drawCourses(); tell(); });

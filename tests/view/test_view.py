@@ -14,6 +14,7 @@ from lyapnet.certification.checking import KeptSide
 from lyapnet.cli import main
 from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
+from lyapnet.loading import load
 from lyapnet.sets import Box
 from lyapnet.view import page_of
 from tests.problems import Formula, untrained
@@ -140,6 +141,23 @@ def test_a_page_fits_its_window(name, width, tmp_path):
     assert right <= width
     wide = page.replace("</style>", "#plane { width: 900px; }</style>")
     assert float(shown(wide, tmp_path, act, width)[0].split(",")[1]) > width
+
+
+def test_a_page_fits_a_window_that_is_narrowed(tmp_path):
+    """In a frame of 1300 px that becomes one of 420 px, after two closed loops: as a page that was opened there."""
+    page = page_of(load("zoo:cartpole_limited"), "cart-pole")
+    loops = "await click(-0.1, 0.1); await click(0.1, 0.1);"
+    measure = """const map = document.querySelector("#plane .nsewdrag").getBoundingClientRect();
+    told.push(Math.round(map.width), Math.round(map.height));"""
+    act = f"{loops} frameElement.style.width = '420px'; await pause(1000); await click(0, 0.2); {measure}"
+    act = ACT.replace("DO", act).replace("document.title =", "parent.document.title =")
+    inner = json.dumps(act.join(page.rsplit("</body>", 1))).replace("</", "<\\/").replace("<!--", "<\\!--")
+    outer = f"""<!DOCTYPE html><title></title><body><p id="check"></p>
+    <iframe id="frame" style="width: 1300px; height: 900px"></iframe>
+    <script>document.getElementById("frame").srcdoc = {inner};</script></body>"""
+    opened = shown(page, tmp_path, f"{loops} await click(0, 0.2); {measure}", 420)[0]
+    narrowed = shown(outer, tmp_path, "", 1400)[0]
+    assert [int(size) for size in narrowed.split()] == pytest.approx([int(size) for size in opened.split()], abs=40)
 
 
 def test_a_missing_plotly_is_named(monkeypatch):

@@ -99,6 +99,11 @@ class Controller:
         self._after_horizon = after_horizon
         self._continued = ContinuedPolicy(problem, law, beyond, self.after_horizon, noted=after_horizon is not None)
 
+    def __repr__(self) -> str:
+        horizon, V, law = self.horizon, type(self.V).__name__, type(self.closed_loop.policy).__name__
+        about = f"{type(self.system).__name__}, {V}, {law}, {horizon.steps} steps of {horizon.dt:g} s"
+        return f"{type(self).__name__}({about})"
+
     @property
     def config(self) -> Config:
         """The config of the run that trained it.

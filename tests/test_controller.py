@@ -69,6 +69,10 @@ def test_public_attributes(controller):
     assert {"SYSTEMS", "ControlAffineSystem", "QuadraticCost", "Box", "load"} <= set(lyapnet.__all__)
 
 
+def test_a_controller_is_printed_as_what_it_is(controller):
+    assert repr(controller) == f"Controller(DoubleIntegrator, AnchoredNetwork, HJBPolicy, {N} steps of 0.01 s)"
+
+
 def test_controller_knows_its_problem_its_run_and_what_it_was_trained_for(controller):
     problem = controller.problem
     for part in ("system", "cost", "controls", "initial_states", "horizon"):

@@ -120,7 +120,9 @@ def _after(found: list[Any]) -> Table:
         distances = (later["distance"][k] for k in multiples)
         shown = (f"{d:.2g}" if d > LEAST_SHOWN else f"< {LEAST_SHOWN:g}" for d in distances)
         table.add_row(one.name, later["beyond"], f"{later['held']} of {later['loops']}", *shown)
-    table.caption = f"Mean distance of 64 closed loops, in the states that the cost weighs; held: {HELD}."
+    lines = [f"Mean distance of 64 closed loops, in the states that the cost weighs; held: {HELD}."]
+    reasons = {one.name: one.record["afterwards"]["reason"] for one in found}
+    table.caption = "\n".join([*lines, *(f"{name}: {reason}" for name, reason in reasons.items() if reason)])
     return table
 
 

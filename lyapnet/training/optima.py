@@ -74,11 +74,11 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
 
 def _by_oracle(problem: Problem, optimum: Optimum, x0: State, report: Report) -> Optimum:
     """The first of some optima, exchanged for those of the oracle that cost less."""
+    oracle = optimal_cost(problem)
+    if oracle is None:  # none is installed, or none is for such a problem
+        return optimum
     progress = partial(report, "optima by the oracle")
     progress(0, len(x0))
-    oracle = optimal_cost(problem)
-    if oracle is None:
-        return optimum
     found = oracle.solve(x0, progress=progress)
     if found.u is None:
         return optimum

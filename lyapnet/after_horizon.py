@@ -51,6 +51,8 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
     Args:
         closed_loops: (a key of LAWS, x₀ (b, n), steps) ↦ the states (steps + 1, b, n) under that law after T.
     """
+    if not problem.has_goal:
+        return AfterHorizon("hold", 0, 0, "the task has no goal")
     if MULTIPLE * problem.horizon.steps > LONGEST:
         return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))

@@ -13,6 +13,7 @@ from lyapnet.types import InputMatrix, Matrix, State
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 TO_WRITE = "write √(v² + ε²) in the place of √(v²) and |v|, and √(p + ε) in the place of √p, with a small ε"
 
+NAME_A_GOAL = "name target: in the config, or cost.goal, where the task has a goal"
 NEARBY, NEAR = 8, 1e-3  # states around the goal, and how far away they are, in units of X₀
 
 
@@ -50,6 +51,8 @@ def linearised(problem: Problem) -> Linearisation:
 def riccati_or_reason(problem: Problem) -> Expansion | Missing:
     """The Riccati solution at the goal, or why there is none."""
     problem = in_float64(problem)
+    if not problem.has_goal:
+        return Missing(problem.no_goal, NAME_A_GOAL)
     dynamics = linearised(problem)
     if missing := dynamics.missing or _missing_cost(problem):
         return missing
@@ -84,7 +87,7 @@ def _missing_values(problem: Problem, f: State, g: InputMatrix) -> Missing | Non
         bad = torch.nonzero(~value.isfinite())
         if len(bad):
             row, column = bad[0].tolist()
-            remedy = "name target: in the config, or cost.goal, where the task has a goal"
+            remedy = NAME_A_GOAL
             if problem.cost.goal is not None:
                 remedy = "choose a target at which it is"
             rate = f"the rate of {problem.system.state_names[row]} has {float(value[row, column])} there"

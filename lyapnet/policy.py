@@ -124,7 +124,7 @@ class SampledPolicy(ValuePolicy):
     B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is the optimal
     law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
     exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the
-    goal. About a target, u is counted from u*, and f is f + gu*.
+    goal, zero where there is no goal. About a target, u is counted from u*, and f is f + gu*.
     """
 
     held: bool = True
@@ -134,7 +134,9 @@ class SampledPolicy(ValuePolicy):
         self.problem = problem
         self.riccati: Curve | None = None
         if V.curvature(torch.zeros(()).to(problem.goal)) is None:
-            self.riccati = Curve(problem.horizon.times(problem.goal), riccati(problem).hessian.to(problem.goal))
+            times, n = problem.horizon.times(problem.goal), problem.system.n
+            H = riccati(problem).hessian if problem.has_goal else torch.zeros(len(times), n, n)
+            self.riccati = Curve(times, H.to(problem.goal))
 
     def forward(self, t: Time, x: State) -> Control:
         after, free = self._after(t), self.problem.response(x)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from lyapnet.constraints import Constraints
 from lyapnet.contracts import called, check_function, check_memory, copied
-from lyapnet.cost import Cost, PenaltyCost
+from lyapnet.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.linear_algebra import apply, convex_or
@@ -52,6 +52,7 @@ class Problem(nn.Module):
     initial_states: Box
     horizon: Horizon
     constraints: Constraints | None
+    _no_goal: str | None
 
     def __init__(
         self,
@@ -70,18 +71,39 @@ class Problem(nn.Module):
             )
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
+        self._no_goal = None  # not known yet
 
     @property
     def goal(self) -> State:
-        """The state (n,) at which q and φ vanish."""
+        """The state (n,) at which q and φ vanish; where there is none, the centre of X₀, as a state that is typical."""
         like = self.initial_states.lower
+        if not self.has_goal:
+            return self.initial_states.center
         return torch.zeros_like(like) if self.cost.goal is None else self.cost.goal.to(like)
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether q and φ vanish at a state, the cost's goal or else the origin, and are nowhere negative."""
+        return not self.no_goal
+
+    @property
+    def no_goal(self) -> str:
+        """Why there is no goal; empty where there is one."""
+        if self._no_goal is None:
+            try:
+                cost, box = copied(self.cost), copied(self.initial_states)
+                cost = cost.cost if isinstance(cost, PenaltyCost) else cost
+                goal = torch.zeros_like(box.lower) if cost.goal is None else cost.goal
+                self._no_goal = reason_for_no_goal(cost, goal, box.sample(TRIED, torch.Generator().manual_seed(0)))
+            except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
+                return ""
+        return self._no_goal
 
     @property
     def rest(self) -> Control:
         """The control (m,) that costs nothing: u*, zero where there is no target."""
-        rest = self.cost.rest
-        return self.goal.new_zeros(self.system.m) if rest is None else rest.to(self.goal)
+        rest, like = self.cost.rest, self.initial_states.lower
+        return like.new_zeros(self.system.m) if rest is None else rest.to(like)
 
     def rates(self, x: State, u: Control) -> tuple[State, PerState]:
         """The means of ẋ and of ℓ over one step from x with u held, by the method of the horizon."""
@@ -136,7 +158,10 @@ class Problem(nn.Module):
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts exchanged."""
         names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
-        return Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+        other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+        if parts.keys().isdisjoint(("cost", "initial_states")):
+            other._no_goal = self._no_goal
+        return other
 
     def in_steps(self, **changes: Any) -> "Problem":
         """The problem in other steps: its horizon with some of steps, dt and method exchanged."""

@@ -16,12 +16,12 @@ from lyapnet.types import Control, ControlMatrix, Matrix, PerState, State
 class Cost(nn.Module, ABC):
     """ℓ(x, u) = q(x) + uᵀR(x)u in cost per second along the way, and φ(x) at the end.
 
-    q and φ are smooth and nonnegative, R(x) is symmetric positive definite. A subclass writes `state`, `R` and
-    `terminal` with torch operations on tensors of any leading shape. About a target, u is counted from what holds it
-    there (TargetCost).
+    q and φ are smooth, R(x) is symmetric positive definite. A subclass writes `state`, `R` and `terminal` with torch
+    operations on tensors of any leading shape. About a target, u is counted from what holds it there (TargetCost).
+    Where q and φ vanish at a goal and are nowhere negative, V is a distance to it; a profit or a harvest has none.
     """
 
-    goal: Float[Tensor, " n"] | None  # where q and φ vanish; None: the origin
+    goal: Float[Tensor, " n"] | None  # where q and φ vanish, if they do; None: the origin
     rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing; None: zero
     R_constant: Matrix | None  # R and R⁻¹, where they are the same at every state
     R_inverse: Matrix | None
@@ -95,11 +95,10 @@ class Cost(nn.Module, ABC):
             UsageError: naming the first state at which q, φ or R(x) is not what it has to be.
         """
         for name, value in (("q(x)", self.state(x)), ("φ(x)", self.terminal(x))):
-            rounding = 100 * torch.finfo(value.dtype).eps * float(torch.nan_to_num(value).abs().max())
-            bad = torch.nonzero(~(value >= -rounding)).flatten()
+            bad = torch.nonzero(~value.isfinite()).flatten()
             if len(bad):
-                i = int(bad[0])
-                raise UsageError(f"Expected {name} ≥ 0, got {float(value[i]):.6g} at x = {x[i].tolist()}; correct it.")
+                at = x[bad[0]].tolist()
+                raise UsageError(f"Expected finite {name}, got {float(value[bad[0]]):.6g} at x = {at}; correct it.")
         R = self.R(x)
         asymmetry = (R - R.mT).abs().amax((-2, -1))
         smallest = torch.linalg.eigvalsh(torch.nan_to_num(R, nan=-1.0, posinf=-1.0, neginf=-1.0))[..., 0]

@@ -55,11 +55,11 @@ def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterw
 def share_at_goal(controller: Controller, x0: State) -> float | None:
     """The share of closed loops that the law after T holds up to MULTIPLE T; None where that is not asked.
 
-    It is not asked of an error, and of a time of more than LONGEST steps. Closed loops that cannot be followed, as one
-    of them diverges or f, g or the cost refuse a state, are not held.
+    It is not asked of a task without a goal, of an error, and of a time of more than LONGEST steps. Closed loops that
+    cannot be followed, as one of them diverges or f, g or the cost refuse a state, are not held.
     """
     steps = MULTIPLE * controller.horizon.steps
-    if steps > LONGEST or controller.law.beyond == "error":
+    if steps > LONGEST or not controller.problem.has_goal or controller.law.beyond == "error":
         return None
     try:
         x = controller.continued(controller.law.beyond).rollout(x0, steps).x

@@ -12,7 +12,7 @@ from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.afterwards import share_at_goal
-from lyapnet.evaluation.optimality import ratio_of_means
+from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
@@ -59,9 +59,7 @@ class Evaluation(NamedTuple):
         Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
-        system, errors = self.problem.system, self.problem.cost.from_goal(self.table.terminal_state).abs().mean(0)
-        labels = dict(enumerate(system.state_labels))
-        terminal = {labels[i]: float(errors[i]) for i in labels if i not in system.constants}
+        system = self.problem.system
         counts = {"satisfied_states": len(self.paper.cost), "samples": len(self.table.cost), "seed": self.seed}
         limits = self.table.use_of_limits(system.control_names)
         used: dict[str, Any] = {"at_limits": limits} if limits else {}
@@ -72,7 +70,7 @@ class Evaluation(NamedTuple):
             **self.table.summary(),
             **paper,
             **self._references(),
-            "terminal_errors": terminal,
+            **({"terminal_errors": self._terminal_errors()} if self.problem.has_goal else {}),
             **used,
             **counts,
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
@@ -80,6 +78,11 @@ class Evaluation(NamedTuple):
             **self._note(),
             "worst_corner": self.corner._asdict(),
         }
+
+    def _terminal_errors(self) -> dict[str, float]:
+        """Of each state, the mean distance from its goal at T."""
+        system, errors = self.problem.system, self.problem.cost.from_goal(self.table.terminal_state).abs().mean(0)
+        return {name: float(errors[i]) for i, name in enumerate(system.state_labels) if i not in system.constants}
 
     def write(self, path: Path) -> None:
         """The table as comma-separated values with a line of names and units.
@@ -108,13 +111,14 @@ class Evaluation(NamedTuple):
         """Mean costs of the plant in continuous time and of LQR, and their ratios to the optimum; None: not finite."""
         optimal = torch.full_like(self.table.cost, torch.nan)
         optimal = optimal if self.table.optimal_cost is None else self.table.optimal_cost
-        costs = {"held": self.held_cost, "lqr": self.lqr_cost}
-        measures = {
-            f"{name}_{key}": value
-            for name, cost in costs.items()
-            if cost is not None
-            for key, value in (("cost_mean", float(cost.mean())), ("cost_ratio", ratio_of_means(cost, optimal)))
-        }
+        measures = dict[str, float | None]()
+        for name, cost in (("held", self.held_cost), ("lqr", self.lqr_cost)):
+            if cost is not None:
+                measures[f"{name}_cost_mean"] = float(cost.mean())
+                if self.problem.has_goal:
+                    measures[f"{name}_cost_ratio"] = ratio_of_means(cost, optimal)
+                else:
+                    measures[f"{name}_regret"] = in_spreads(cost - optimal, optimal)
         return plain(measures)
 
     def _note(self) -> dict[str, str]:

@@ -45,9 +45,10 @@ def costs_of_plant(problem: Problem, policy: nn.Module, x0: State) -> PerState:
 def costs_of_lqr(problem: Problem, x0: State) -> PerState | None:
     """What LQR costs: u = ū_n + K_n(x − x*) of the problem linearised at its goal, for its N steps, kept to U.
 
-    None where there is no such law: the linearisation is not finite, or U is a set without limits that are known.
+    None where there is no such law: there is no goal, or no finite linearisation there, or U is a set without limits
+    that are known.
     """
-    law = None if problem.controls.limits is None else _lqr(problem)
+    law = _lqr(problem) if problem.has_goal and problem.controls.limits is not None else None
     if law is None:
         return None
     return path_under(in_float64(problem), law, x0.double().cpu()).cost.to(x0)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
+from lyapnet.evaluation.optimality import in_spreads, mean_optimum, ratio_of_means
 from lyapnet.problem import Problem
 from lyapnet.programs import Program
 from lyapnet.programs.terms import falls, hinge, largest_rise, satisfied
@@ -34,11 +34,12 @@ class StateTable:
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
     worst: Tensor | None = None  # (b, k): max_n h(x_n), where there are constraints
     worst_time: Tensor | None = None  # (b, k): when
+    has_goal: bool = True  # of the task; without one only costs, V and constraints say something
 
     def rows(self, chosen: slice) -> "StateTable":
         """The table of some of the states."""
         columns: dict[str, Any] = {
-            key: None if column is None else column[chosen] for key, column in vars(self).items()
+            key: column[chosen] if isinstance(column, Tensor) else column for key, column in vars(self).items()
         }
         return StateTable(**columns)
 
@@ -48,13 +49,19 @@ class StateTable:
 
     def summary(self) -> dict[str, float | None]:
         """The means and shares over the rows, under the names of `lyapnet evaluate --json`."""
-        return {
+        summary = {
             "cost_mean": float(self.cost.mean()),
             "cost_max": float(self.cost.max()),
             **self.against_optimum(),
             "value_mean": float(self.value.mean()),
-            "value_to_cost": float(self.value.mean() / self.cost.mean()),
             "constraint_loss": float(self.constraint_loss.mean()),
+        }
+        return {**summary, **self._about_goal()} if self.has_goal else summary
+
+    def _about_goal(self) -> dict[str, float | None]:
+        """What is said of V as a distance to the goal, in units of its size."""
+        return {
+            "value_to_cost": float(self.value.mean() / self.cost.mean()),
             "terminal_error": float(self.terminal_error.mean()),
             "bounded_fraction": _share(self.cost <= self.value),
             "falling_fraction": _share(self.falling),
@@ -89,12 +96,18 @@ class StateTable:
         return None if self.worst is None else ~(self.worst <= 0).all(-1)
 
     def against_optimum(self) -> dict[str, float | None]:
-        """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known."""
+        """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known.
+
+        Without a goal both are in units of the spread of J*, and the first is the regret, of J − J*.
+        """
         optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
+        error = (self.value - optimal).abs()
+        regret = {} if self.has_goal else {"regret": in_spreads(self.cost - optimal, optimal)}
         return {
             "optimal_cost_mean": mean_optimum(optimal),
-            "cost_ratio": ratio_of_means(self.cost, optimal),
-            "value_error": ratio_of_means((self.value - optimal).abs(), optimal),
+            "cost_ratio": ratio_of_means(self.cost, optimal) if self.has_goal else None,
+            **regret,
+            "value_error": ratio_of_means(error, optimal) if self.has_goal else in_spreads(error, optimal),
             "optimum_failures": None if self.optimal_cost is None else int((~optimal.isfinite()).sum()),
         }
 
@@ -124,6 +137,7 @@ def measure(
         at_limits=_at_limits(problem.controls, trajectory.u),
         worst=worst,
         worst_time=worst_time,
+        has_goal=problem.has_goal,
     )
 
 

@@ -9,13 +9,16 @@ from rich.text import Text
 from lyapnet.after_horizon import HELD
 from lyapnet.tables import DIVERGED, ratio
 
+REGRET = "regret, mean (cost − optimum) / spread of the optimum"
 ROWS = {
     "cost_mean": "cost J, mean",
     "cost_max": "cost J, worst",
     "optimal_cost_mean": "optimal cost, mean",
     "cost_ratio": "cost / optimum",
+    "regret": REGRET,
     "held_cost_mean": "in continuous time, u held for Δt: cost, mean",
     "held_cost_ratio": "in continuous time, u held for Δt: cost / optimum",
+    "held_regret": f"in continuous time, u held for Δt: {REGRET}",
     "lqr_cost_mean": "LQR, without training: cost, mean",
     "lqr_cost_ratio": "LQR, without training: cost / optimum",
     "value_mean": "V(0, x₀), mean",
@@ -39,7 +42,7 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
         table.add_row(label, _entry(key, result[key]))
-    for name, error in result["terminal_errors"].items():
+    for name, error in result.get("terminal_errors", {}).items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
     for name, share in result.get("at_limits", {}).items():
         table.add_row(
@@ -73,8 +76,11 @@ def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
 
 def _rows(result: dict[str, Any]) -> dict[str, str]:
     """The labels of what a result has; of a reference the ratio to the optimum, else its mean cost."""
-    unknown = "ratio" if result["cost_ratio"] is None else "mean"
-    left_out = {f"{name}_cost_{unknown}" for name in REFERENCES}
+    known = result.get("regret", result["cost_ratio"]) is not None
+    unknown = ("cost_mean",) if known else ("cost_ratio", "regret")
+    left_out = {f"{name}_{key}" for name in REFERENCES for key in unknown}
+    if "regret" in result:
+        left_out.add("cost_ratio")
     return {key: label for key, label in {**ROWS, **VIOLATED}.items() if key in result and key not in left_out}
 
 
@@ -132,4 +138,6 @@ def measured(key: str, value: float) -> str:
     """A measure of an evaluation as text: ratios with four decimals, shares in percent."""
     if key.endswith("cost_ratio"):
         return ratio(value)
+    if key.endswith("regret"):
+        return f"{value:.2%}"
     return f"{value:.1%}" if key.split("_1e")[0].endswith("fraction") else f"{value:.4g}"

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.errors import DivergenceError
+from lyapnet.programs.terms import spread
 from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
@@ -34,7 +35,7 @@ class Program(ABC):
 
     With `normalise`, the weights are numbers without units: every term is measured against its `unit`, the batch's mean
     cost J̄ (detached; C as the mean over time) unless told otherwise, but J, which enters as log J̄, whose gradient is
-    ∇J̄/J̄.
+    ∇J̄/J̄. Where costs may be of any sign, as of a task without a goal, they are measured against their spread.
     """
 
     degree: ClassVar[int]  # all terms but J are of this degree in units of cost
@@ -60,12 +61,16 @@ class Program(ABC):
         return {name: getattr(self, name) for name in self.weighted}
 
     def __call__(
-        self, trajectory: Trajectory, mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value
+        self,
+        trajectory: Trajectory,
+        mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value,
+        has_goal: bool = True,
     ) -> ProgramOutput:
         """The program on one batch of trajectories under the control law of a V.
 
         Args:
             trajectory: the batch.
+            has_goal: of the task; without one the batch's spread of costs stands for its mean cost.
             mean_over_processes: takes a number of this process to its mean over all that share the batch, so that
                 they normalise alike and the mean of their gradients is the gradient on the joint batch.
 
@@ -80,17 +85,23 @@ class Program(ABC):
             _require_finite(name, term, trajectory)
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
-            mean_cost, cost = mean_over_processes(J.detach()), trajectory.cost.detach()
-            terms = {name: (term / self.unit(name, cost, mean_cost)).mean() for name, term in per_state.items()}
+            cost = trajectory.cost.detach()
+            size = mean_over_processes(cost.mean() if has_goal else spread(cost))
+            each = cost if has_goal else size.expand_as(cost)
+            terms = {name: (term / self.unit(name, each, size)).mean() for name, term in per_state.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
-            # log J̄ and its gradient, where J̄ is the joint mean and this batch a part of it
-            terms["trajectory_cost"] = torch.log(mean_cost) + (J - J.detach()) / mean_cost
+            # log J̄, or J̄ in units of the spread, and its gradient; J̄ is the joint mean, and this batch a part of it
+            mean = torch.log(size) if has_goal else mean_over_processes(J.detach()) / size
+            terms["trajectory_cost"] = mean + (J - J.detach()) / size
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
-        """What a term of trajectories of some cost J is measured against: J̄ to the power of its degree."""
+        """What a term of trajectories of some cost J is measured against: J̄ to the power of its degree.
+
+        Without a goal both are the spread of costs.
+        """
         return mean_cost**self.degree
 
     def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
@@ -106,6 +117,17 @@ class Program(ABC):
     @abstractmethod
     def penalty(self, excess: Tensor) -> Tensor:
         """What an excess costs: zero where the condition holds."""
+
+    def without_goal(self, reason: str) -> "Program":
+        """The program for a task that has no goal.
+
+        Args:
+            reason: why it has none.
+
+        Raises:
+            UsageError: the program is about a goal.
+        """
+        return self
 
     def check_terminal(self, exact: bool) -> None:  # noqa: B027  (most programs have nothing to refuse)
         """Refuse weights that do not suit how V ends.

@@ -52,6 +52,12 @@ class LyapunovProgram(Program):
         """And that V decreases along the closed loop, within 1 % of V(0, x₀)."""
         return Tolerances(radius, 1e-2, cost)
 
+    def without_goal(self, reason: str) -> "LyapunovProgram":
+        raise UsageError(
+            f"Expected a task with a goal, to which V falls, got none: {reason}; take program.name=value, or name "
+            "target: in the config."
+        )
+
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
         return rate + (1 + self.margin) * running
 

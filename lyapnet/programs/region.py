@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.errors import UsageError
 from lyapnet.networks import kept_states
 from lyapnet.programs.base import Program
 from lyapnet.programs.pointwise import PointwiseCondition
@@ -49,6 +50,12 @@ class RegionProgram(Program):
             raise ValueError(f"Expected share in (0, 1], got {self.share}; V cannot pay for more than the cost.")
         if not self.growth >= 0:
             raise ValueError(f"Expected growth ≥ 0, got {self.growth}; the region is to grow.")
+
+    def without_goal(self, reason: str) -> "RegionProgram":
+        raise UsageError(
+            f"Expected a task with a goal, to which V falls, got none: {reason}; take program.name=value, or name "
+            "target: in the config."
+        )
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
         return rate + self.share * running

@@ -1,7 +1,7 @@
 """The value program: V is the cost-to-go of its own greedy policy."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -49,6 +49,9 @@ class ValueProgram(Program):
         if self.relative and name == "cost_to_go":
             return cost.maximum(LEAST * mean_cost) ** 2
         return super().unit(name, cost, mean_cost)
+
+    def without_goal(self, reason: str) -> "ValueProgram":
+        return replace(self, relative=False)  # J of a trajectory may be anything
 
     def penalty(self, excess: Tensor) -> Tensor:
         return excess**2

@@ -12,7 +12,7 @@ from lyapnet.training.curves import loggers_of_each
 PANELS = {
     "constraint loss": ("constraint_loss/train", "constraint_loss/val"),
     "trajectory cost": ("trajectory_cost/train", "trajectory_cost/val"),
-    "optimality": ("optimality_gap/val", "value_error/val"),
+    "optimality": ("optimality_gap/val", "regret/val", "value_error/val"),
     "condition": ("satisfied_fraction/val", "falling_fraction/val"),
 }
 LAYOUT = {panel: {curve: ["Multiline", [curve]] for curve in curves} for panel, curves in PANELS.items()}

@@ -12,10 +12,10 @@ from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64
 from lyapnet.horizon import TABLEAUX
 from lyapnet.linearisation import (
+    NAME_A_GOAL,
     LinAlgError,
     Linearisation,
     Missing,
-    goal_in_words,
     linearised,
     riccati_or_reason,
     singular,
@@ -31,8 +31,6 @@ from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, Start, choo
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
 ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
-VANISHING = 1e-3  # of what q and φ are on X₀, below which they vanish at the goal
-TRIED = 256  # states of X₀ for that
 
 
 def facts_of(
@@ -55,8 +53,10 @@ def facts_of(
         exact = in_float64(problem)
         tell(_task(exact))
         around = linearised(exact)
-        if (missing := around.missing_values or _goal_missing(exact)) is not None:
-            tell(Fact("goal", f"none: {missing.reason}", missing.remedy))
+        if not exact.has_goal:
+            tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
+        elif around.missing_values is not None:
+            tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
             tell(_goal(exact, around), *_modes(exact, around))
             stiff = stiffness(exact, learner.rollout)
@@ -117,8 +117,6 @@ def _task(problem: Problem) -> Fact:
 
 def _goal(problem: Problem, around: Linearisation) -> Fact:
     """Whether the goal is an equilibrium, or which control makes it one."""
-    if around.missing_values is not None:
-        return Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy)
     goal, system = problem.goal, problem.system
     f, rest = around.f, system.dynamics(goal, problem.rest)
     where = f"{_listed(goal)}, " if goal.any() else ""
@@ -136,28 +134,6 @@ def _goal(problem: Problem, around: Linearisation) -> Fact:
     return Fact(
         "goal", f"{where}no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there"
     )
-
-
-def _goal_missing(problem: Problem) -> Missing | None:
-    """Why the origin is no goal where nobody named one: q or φ, or a slope of them, does not vanish there."""
-    if problem.cost.goal is not None:
-        return None
-    cost = problem.cost.cost if isinstance(problem.cost, PenaltyCost) else problem.cost
-    x = problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0)).to(problem.goal)
-    extent = problem.initial_states.reach_from(problem.goal)
-    for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
-        with torch.enable_grad():
-            goal = problem.goal.clone().requires_grad_()
-            value = function(goal)
-            slope = torch.autograd.grad(value, goal, materialize_grads=True)[0] if value.requires_grad else None
-        slope = torch.zeros_like(problem.goal) if slope is None else slope
-        value, typical = float(value.detach()), VANISHING * float(function(x).abs().mean())
-        if abs(value) > typical or float((slope * extent).abs().max()) > typical:
-            return Missing(
-                f"{symbol} is {value:.3g}, of slope {_listed(slope)}, at {goal_in_words(problem)}",
-                "name target: in the config, or cost.goal, where the task has a goal",
-            )
-    return None
 
 
 def _modes(problem: Problem, around: Linearisation) -> list[Fact]:

@@ -1,7 +1,7 @@
 """What one seed trains: V in the closed loop of its own policy, and what was last measured of it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from lyapnet.errors import UsageError
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
+from lyapnet.programs.terms import spread
 from lyapnet.random_streams import POINTS, VALIDATION, stream
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.types import PerState
@@ -62,7 +63,8 @@ class Learner(nn.Module):
             )
         self.problem, self.V, self.rollout = problem, V, rollout
         V.made_for = type(rollout.closed_loop.policy)
-        self.program, self.pointwise, self.seed, self.label = program, pointwise, seed, label
+        self.program: Program = program if problem.has_goal else program.without_goal(problem.no_goal)
+        self.pointwise, self.seed, self.label = pointwise, seed, label
         self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
         # of the last training step and the last validation, for whoever shows them
         self.gradient_norm = self.steps_per_second = math.nan
@@ -78,7 +80,7 @@ class Learner(nn.Module):
         Args:
             draw: names the stream of the points off the closed loops.
         """
-        output = self._with_pointwise(self.program(trajectory, mean_over_processes), trajectory, draw)
+        output = self._evaluated(trajectory, draw, mean_over_processes)
         terms = {name: term.detach() for name, term in output.terms.items()}
         self.output = ProgramOutput(
             output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
@@ -96,16 +98,23 @@ class Learner(nn.Module):
             self.region_share = self.pointwise.sampled_share(stream(self.seed, VALIDATION, POINTS))
             loss = 1 - self.region_share
         else:
-            loss = self._with_pointwise(self.program(trajectory), trajectory, (VALIDATION, POINTS)).loss
+            loss = self._evaluated(trajectory, (VALIDATION, POINTS)).loss
         self.validation_loss = float(loss)
         return loss
 
-    def _with_pointwise(self, output: ProgramOutput, trajectory: Trajectory, draw: Sequence[int]) -> ProgramOutput:
-        """The program with its condition off the closed loops, where that has a weight."""
+    def _evaluated(
+        self,
+        trajectory: Trajectory,
+        draw: Sequence[int],
+        over_processes: Callable[[Tensor], Tensor] = lambda value: value,
+    ) -> ProgramOutput:
+        """The program, with its condition off the closed loops where that has a weight."""
+        output = self.program(trajectory, over_processes, self.problem.has_goal)
         if self.pointwise is None:
             return output
-        values, mean_cost = trajectory.require_value(), mean_over_processes(output.trajectory_cost.detach())
-        term = self.pointwise(stream(self.seed, *draw), mean_cost, values[0].max())
+        values, cost = trajectory.require_value(), trajectory.cost.detach()
+        size = mean_over_processes(output.trajectory_cost.detach() if self.problem.has_goal else spread(cost))
+        term = self.pointwise(stream(self.seed, *draw), size, values[0].max())
         loss = output.loss + self.pointwise.weight * term
         return output._replace(loss=loss, terms={**output.terms, "pointwise": term})
 
@@ -133,10 +142,10 @@ class Learner(nn.Module):
             "region_share/val": None if self.region_share is None else float(self.region_share),
             "violated_fraction/val": None if violated is None else float(violated.double().mean()),
             **{
-                f"{name}/val": summary[name]
+                f"{name}/val": summary.get(name)
                 for name in (
-                    "value_error", "value_to_cost", "satisfied_fraction", "bounded_fraction", "falling_fraction",
-                    "decreasing_fraction", "largest_rise", "terminal_error",
+                    "regret", "value_error", "value_to_cost", "satisfied_fraction", "bounded_fraction",
+                    "falling_fraction", "decreasing_fraction", "largest_rise", "terminal_error",
                 )
             },
         }  # fmt: skip

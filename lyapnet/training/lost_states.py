@@ -6,7 +6,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.errors import DivergenceError
-from lyapnet.programs.terms import promised
+from lyapnet.programs.terms import promised, spread
 from lyapnet.rollout import Trajectory
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
@@ -43,10 +43,13 @@ class LostStates(Callback):
             log_scalars(trainer, loggers, {"lost_fraction/val": lost.double().mean()})
 
 
-def excess(cost: PerState, value: PerState) -> PerState:
-    """(J_N − V(0, x₀)) / V(0, x₀): above zero where V promises what its law does not keep."""
-    return (cost - value) / promised(value, cost)
+def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
+    """(J_N − V(0, x₀)) / V(0, x₀): above zero where V promises what its law does not keep.
+
+    Without a goal it is in units of the spread of costs.
+    """
+    return (cost - value) / (promised(value, cost) if has_goal else spread(cost))
 
 
-def _excess_of(_: Learner, trajectory: Trajectory) -> PerState:
-    return excess(trajectory.cost, trajectory.require_value()[0])
+def _excess_of(learner: Learner, trajectory: Trajectory) -> PerState:
+    return excess(trajectory.cost, trajectory.require_value()[0], learner.problem.has_goal)

@@ -16,6 +16,7 @@ from lyapnet.training.stages import Stages
 VALIDATED = (
     ("cost", "cost_mean", ".4g"),
     ("cost/optimum", "cost_ratio", ".4f"),
+    ("regret", "regret", ".2%"),
     ("constraint loss", "constraint_loss", ".3g"),
     ("satisfied", "satisfied_fraction", ".0%"),
 )
@@ -113,7 +114,7 @@ class TrainingProgress(ProgressBar):
 
 def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
     """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
-    values = [summary[key] for summary in summaries]
+    values = [summary.get(key) for summary in summaries]
     if None in values:
         return ""
     mean, low, high = (format(value, form) for value in (fmean(values), min(values), max(values)))

@@ -15,6 +15,7 @@ from lyapnet.checkpoint import read_checkpoint
 from lyapnet.errors import DivergenceError
 from lyapnet.expansions import in_float64
 from lyapnet.policy import HJBPolicy
+from lyapnet.programs.terms import spread
 from lyapnet.training.curves import members_of
 from lyapnet.training.facts import stiffness
 from lyapnet.training.learner import Learner
@@ -29,7 +30,8 @@ MOST = 0.9  # of the validation states, the cheapest: a few are lost where V has
 
 
 class RisingCost(Callback):
-    """Ends a training whose cost on MOST of the validation states has risen to RISE times the least so far.
+    """Ends a training whose cost on MOST of the validation states has risen to RISE times the least so far; without a
+    goal, by the spread of V(0, x₀).
 
     Raises:
         DivergenceError: it has.
@@ -54,12 +56,13 @@ class RisingCost(Callback):
             costs = member.validation.cost.sort().values
             cost = float(costs[: math.ceil(MOST * len(costs))].mean()) if costs.isfinite().all() else math.inf
             least = self.least[member.label] = min(self.least.get(member.label, cost), cost)
-            if cost > RISE * least > 0:
+            size = least if member.problem.has_goal else float(spread(member.validation.value))
+            if cost - least > (RISE - 1) * size > 0:
                 module: Any = pl_module
                 raise DivergenceError(
                     f"{module.place(member.label)}: Expected a cost on the cheapest {MOST:.0%} of the validation "
-                    f"states of at most {RISE:g} times the least so far, {least:.4g}, got {cost:.4g}; lower "
-                    "training.learning_rate or set trainer.gradient_clip_val."
+                    f"states of at most {least + (RISE - 1) * size:.4g}, as {least:.4g} was reached before, got "
+                    f"{cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
                 )
 
 

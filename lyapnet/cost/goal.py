@@ -1,0 +1,43 @@
+"""Whether a cost has a goal: a state at which q and φ vanish, with their slopes, and below which neither goes."""
+
+import torch
+from torch import Tensor
+
+from lyapnet.cost.base import Cost
+from lyapnet.types import State
+
+VANISHING = 1e-3  # of what q and φ are in the mean, below which they vanish
+
+
+def reason_for_no_goal(cost: Cost, goal: State, x: State) -> str:
+    """Why a state is no goal of a cost; empty where it is one.
+
+    At a goal q and φ vanish with their slopes, and nowhere are they negative: V is then a distance to it, in units of
+    cost. A profit, a harvest, and what is left of a tumour have none.
+
+    Args:
+        cost: without the penalty that training adds for constraints.
+        goal: (n,), that of the cost, or the origin.
+        x: states (b, n) where the task begins.
+    """
+    where = f"the goal {_listed(goal)}"
+    if cost.goal is None:
+        where = "the origin, which stands in for a target: nobody named one"
+    reach = (x - goal).abs().amax(0)
+    for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
+        values = function(x).detach()
+        least = -VANISHING * float(values.abs().mean())
+        with torch.enable_grad():
+            leaf = goal.detach().clone().requires_grad_()
+            value = function(leaf)
+            slope = torch.autograd.grad(value, leaf, materialize_grads=True)[0] if value.requires_grad else 0 * goal
+        if abs(float(value.detach())) > -least or float((slope * reach).abs().max()) > -least:
+            return f"{symbol} is {float(value.detach()):.3g}, of slope {_listed(slope)}, at {where}"
+        lowest = int(values.argmin())
+        if float(values[lowest]) < least:
+            return f"{symbol} is negative, {float(values[lowest]):.3g}, at x = {_listed(x[lowest])}"
+    return ""
+
+
+def _listed(values: Tensor) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values.detach().tolist()) + ")"

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.contracts import copied
+from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem, Response
 from lyapnet.sets import Unbounded
@@ -236,7 +237,10 @@ def in_float64(problem: Problem) -> Problem:
 
 @torch.no_grad()
 def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
+    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it.
+
+    A path that jumps over a pole of f, g, q or φ, where it divides by zero, has no finite cost: no trajectory does.
+    """
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
@@ -244,7 +248,21 @@ def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State
         x.append(following)
         J = J + paid
     J = (J + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf)
-    return Path(torch.stack(x).nan_to_num(), torch.stack(u).nan_to_num(), J)
+    x, poles = torch.stack(x).nan_to_num(), _poles_of(problem)
+    if poles is not None:
+        J = J.masked_fill(poles.crossed(x.double().cpu()).to(J.device), torch.inf)
+    return Path(x, torch.stack(u).nan_to_num(), J)
+
+
+def _poles_of(problem: Problem) -> Poles | None:
+    """Where f, g, q and φ of a problem divide by zero, sought once."""
+    if "poles" not in problem.findings:
+        own = in_float64(problem)
+        system, cost = own.system, own.cost
+        problem.findings["poles"] = poles_of(
+            lambda x: (system.f(x), system.g(x), cost.state(x), cost.terminal(x)), own.initial_states.center
+        )
+    return problem.findings["poles"]
 
 
 def _line_search(problem: Problem, now: Path, backward: _Backward) -> Path:

@@ -22,6 +22,13 @@ LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign o
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
 
 
+class Findings(dict[str, Any]):
+    """What was found out about the functions of a problem, once for it and all its copies."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Findings":
+        return self
+
+
 class Response(NamedTuple):
     """One step with u held: F to first order in u, and ℓ to second."""
 
@@ -52,6 +59,7 @@ class Problem(nn.Module):
     initial_states: Box
     horizon: Horizon
     constraints: Constraints | None
+    findings: Findings
     _no_goal: str | None
 
     def __init__(
@@ -72,6 +80,7 @@ class Problem(nn.Module):
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
         self._no_goal = None  # not known yet
+        self.findings = Findings()
 
     @property
     def goal(self) -> State:
@@ -161,6 +170,8 @@ class Problem(nn.Module):
         other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
         if parts.keys().isdisjoint(("cost", "initial_states")):
             other._no_goal = self._no_goal
+        if parts.keys().isdisjoint(("cost", "system")):
+            other.findings = self.findings
         return other
 
     def in_steps(self, **changes: Any) -> "Problem":

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.contracts import copied
+from lyapnet.derivatives import Steps, steps_along, with_curvature
 from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem, Response
@@ -71,11 +72,12 @@ class Optimum(NamedTuple):
 
     path: Path
     expansion: Expansion
+    mended: PerState  # at how many of the nodes of each some derivative does not exist, and is taken beside them
 
     def member(self, rows: Tensor) -> "Optimum":
         """Those with some indices."""
         x, u, cost = self.path
-        return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows))
+        return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows), self.mended[rows])
 
 
 def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
@@ -118,6 +120,7 @@ class _Backward(NamedTuple):
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
     expansion: Expansion
+    mended: Tensor  # (N + 1, *batch) the nodes with a derivative that does not exist
 
 
 def riccati(problem: Problem) -> Expansion:
@@ -182,7 +185,8 @@ def optimal_trajectories(
         now = cheapest([now, under(euler.u)])
     now = _descended(problem, now, False, iterations, NEAR, rivals, settled(kinds - 2))
     now = _descended(problem, now, True, iterations, SETTLED, rivals, settled(kinds - 1))
-    return Optimum(now, _backward(problem, now.x, now.u).expansion)
+    backward = _backward(problem, now.x, now.u)
+    return Optimum(now, backward.expansion, backward.mended.sum(0))
 
 
 def _descended(
@@ -286,39 +290,29 @@ def _backward(
     With the second derivatives of F it runs twice. They enter as those of pᵀF, for p = V_x that the first pass finds
     without them: n + m derivatives of one sum, not of each component; where k = 0 both passes have the same p.
 
+    Derivatives that do not exist at a node are those beside it (`steps_along`).
+
     Args:
         damping: added to Q_uu, in units of the control cost.
         curved: with the second derivatives of F.
     """
-    steps = _derivatives(problem, x, u)
+    steps = steps_along(problem.step, problem.cost.terminal, x, u)
     backward = _recursion(problem, x, u, steps, damping)
-    if not curved:
-        return backward
-    with torch.enable_grad():
-        slopes = jacobian((backward.expansion.gradient[1:] * steps.F).sum(-1, keepdim=True), steps.z)[..., 0, :]
-        bent = steps.l_zz + jacobian(slopes, steps.z).detach()
-    return _recursion(problem, x, u, steps._replace(l_zz=bent), damping)
+    if curved:
+        backward = _recursion(
+            problem, x, u, with_curvature(problem.step, steps, backward.expansion.gradient[1:]), damping
+        )
+    return backward
 
 
-class _Steps(NamedTuple):
-    """F(z), l(z) and their derivatives at z = (x, u) of all steps at once; F with its graph."""
-
-    z: Tensor
-    F: StatePath
-    F_z: Tensor
-    paid: Tensor
-    l_z: Tensor
-    l_zz: Tensor  # what the second derivatives of Q have besides F_zᵀHF_z
-
-
-def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: _Steps, damping: Tensor | None) -> _Backward:
+def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None) -> _Backward:
     """V_n(δ) = ½ (1, δ)ᵀW_n(1, δ), W = [[2c, pᵀ], [p, H]], from W_N on: one matrix holds all that is known of V."""
     n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
     one = torch.eye(1, 1 + steps.z.shape[-1]).to(x).expand(*steps.paid.shape, 1, -1)
     M = torch.cat([one, torch.cat([(steps.F.detach() - x[1:])[..., None], steps.F_z], -1)], -2)
     L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
-    W = _quadratic(*_terminal(problem, x[-1]))
+    W = _quadratic(*steps.end)
     nodes, gains = [W], []
     for k in reversed(range(len(M))):
         Q = L[k] + M[k].mT @ W @ M[k]
@@ -330,7 +324,8 @@ def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: _Steps, da
         nodes.append(W)
         gains.append(gain)
     W, gain = torch.stack(nodes[::-1]), torch.stack(gains[::-1])
-    return _Backward(gain[..., 0], gain[..., 1:], Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:]))
+    expansion = Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:])
+    return _Backward(gain[..., 0], gain[..., 1:], expansion, steps.mended)
 
 
 def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:
@@ -364,28 +359,3 @@ def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:
     values = values.maximum(ROUNDING * values[..., -1:])
     values = values + (damping[..., None] if isinstance(damping, Tensor) else damping)
     return (vectors * values[..., None, :]) @ vectors.mT
-
-
-def _terminal(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
-    """φ, φ_x and φ_xx."""
-    with torch.enable_grad():
-        x = x.detach().requires_grad_()
-        phi = problem.cost.terminal(x)
-        phi_x = jacobian(phi[..., None], x)[..., 0, :]
-        return phi.detach(), phi_x.detach(), jacobian(phi_x, x).detach()
-
-
-def _derivatives(problem: Problem, x: StatePath, u: ControlPath) -> _Steps:
-    with torch.enable_grad():
-        z = torch.cat([x[:-1], u], -1).detach().requires_grad_()
-        F, paid = problem.step(z[..., : x.shape[-1]], z[..., x.shape[-1] :])
-        l_z = jacobian(paid[..., None], z)[..., 0, :]
-        return _Steps(z, F, jacobian(F, z).detach(), paid.detach(), l_z.detach(), jacobian(l_z, z).detach())
-
-
-def jacobian(y: Tensor, z: Tensor) -> Tensor:
-    """∂y/∂z, (*batch, outputs, inputs), each state's by itself; zero where y does not depend on z."""
-    if not y.requires_grad:
-        return y.new_zeros(*y.shape, z.shape[-1])
-    rows = [torch.autograd.grad(y_i.sum(), z, create_graph=True, materialize_grads=True)[0] for y_i in y.unbind(-1)]
-    return torch.stack(rows, -2)

@@ -5,8 +5,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lyapnet.derivatives import jacobian
 from lyapnet.errors import one_line
-from lyapnet.expansions import Expansion, in_float64, jacobian, riccati
+from lyapnet.expansions import Expansion, in_float64, riccati
 from lyapnet.problem import Problem
 from lyapnet.types import InputMatrix, Matrix, State
 

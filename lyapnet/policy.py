@@ -7,8 +7,9 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
 from lyapnet.cost import Cost
+from lyapnet.derivatives import jacobian
 from lyapnet.errors import UsageError
-from lyapnet.expansions import held_control, jacobian, riccati
+from lyapnet.expansions import held_control, riccati
 from lyapnet.interpolation import Curve
 from lyapnet.linear_algebra import apply, convex_or, multiply
 from lyapnet.problem import Problem, Response

@@ -24,7 +24,7 @@ LEVELS = (
     },
     {"sizes"},
     {"files"},
-    {"cluster", "constraints", "contracts", "cost", "devices", "horizon", "schema", "sets", "systems"},
+    {"cluster", "constraints", "contracts", "cost", "derivatives", "devices", "horizon", "schema", "sets", "systems"},
     {"calculus", "checkpoint", "graphs", "problem"},
     {"expansions", "family", "networks"},
     {"after_horizon", "linearisation", "policy", "regulator"},
@@ -41,7 +41,7 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "errors", "expansions", "family",
+    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "derivatives", "errors", "expansions", "family",
     "files", "graphs", "horizon", "interpolation", "linear_algebra", "linearisation", "networks", "policy", "problem",
     "programs", "random_streams", "regulator", "rollout", "sets", "shapes", "systems", "types",
 }  # fmt: skip

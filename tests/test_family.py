@@ -392,10 +392,10 @@ def test_optima_that_are_no_minimum_are_left_out():
     H[0, 1], H[1, 2], H[0, 4] = 1e5, math.nan, 50.0
     x, cost = torch.arange(b).double()[None, :, None].expand(N + 1, b, n), torch.ones(b)
     cost[5] = math.inf
-    optimum = Optimum(Path(x, torch.zeros(N, b, 1), cost), Expansion(x, torch.zeros(N + 1, b), x, H))
+    optimum = Optimum(Path(x, torch.zeros(N, b, 1), cost), Expansion(x, torch.zeros(N + 1, b), x, H), cost)
     problem = problem_of(SYSTEMS["double_integrator"]())
     kept = minima(problem, optimum)
     assert kept.path.x[0, :, 0].tolist() == [0, 3, 4]
     assert kept.expansion.hessian.shape == (N + 1, 3, n, n)
-    nothing = Optimum(optimum.path._replace(cost=torch.full((b,), math.inf)), optimum.expansion)
+    nothing = Optimum(optimum.path._replace(cost=torch.full((b,), math.inf)), optimum.expansion, cost)
     assert minima(problem, nothing).path.x.shape[1] == 0

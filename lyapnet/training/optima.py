@@ -125,14 +125,15 @@ def _joined(one: Optimum, other: Optimum) -> Optimum:
         torch.cat([one.path.cost, other.path.cost]),
     )
     parts = zip(one.expansion, other.expansion, strict=True)
-    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)))
+    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)), torch.cat([one.mended, other.mended]))
 
 
 def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
     """Some trajectories exchanged for others that cost less."""
     parts = zip(optimum.expansion, others.expansion, strict=True)
     expansion = Expansion(*(part.index_copy(1, rows, new) for part, new in parts))
-    return Optimum(exchanged(optimum.path, rows, others.path), expansion)
+    mended = optimum.mended.index_copy(0, rows, others.mended)
+    return Optimum(exchanged(optimum.path, rows, others.path), expansion, mended)
 
 
 def _affordable(problem: Problem) -> int:

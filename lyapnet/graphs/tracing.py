@@ -12,7 +12,7 @@ from torch._decomp import core_aten_decompositions, get_decompositions
 from torch.func import functionalize, vmap
 from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
-from torch.fx.node import map_aggregate
+from torch.fx.node import map_arg
 from torch.overrides import TorchFunctionMode
 from torch.testing import assert_close
 
@@ -313,21 +313,51 @@ def _results(graph: Graph) -> tuple[Node, ...]:
     return tuple(result) if isinstance(result, list | tuple) else (result,)  # pyright: ignore
 
 
-class _MinusZero(float):
-    """−0.0, which equals 0.0, told from it by its type."""
-
-
 def without_repetitions(graph: Graph) -> Graph:
-    """The graph with each expression computed once."""
-    from torch._functorch.compile_utils import fx_graph_cse  # loads sympy: a third of a second
+    """A copy of the graph with each expression computed once; results stay tensors of their own.
 
+    torch's own fx_graph_cse does the same, but imports its compiler for it, for about a second.
+    """
+    once, copies, found = Graph(), dict[Node, Node](), dict[Any, Node]()
+    memory = {_memory(node) for node in _results(graph) if isinstance(node, Node)}
     for node in graph.nodes:
-        node.args, node.kwargs = map_aggregate((node.args, node.kwargs), _telling_zeros_apart)  # pyright: ignore
-    return fx_graph_cse(graph)
+        if not _can_be_shared(node) or _memory(node) in memory:
+            copies[node] = once.node_copy(node, copies.__getitem__)
+            continue
+        arguments = map_arg((node.args, node.kwargs), copies.__getitem__)
+        key = node.target, _told_apart(arguments)
+        if key not in found:
+            found[key] = once.node_copy(node, copies.__getitem__)
+        copies[node] = found[key]
+    return once
 
 
-def _telling_zeros_apart(value: Any) -> Any:
-    return _MinusZero(value) if isinstance(value, float) and str(value) == "-0.0" else value
+def _can_be_shared(node: Node) -> bool:
+    """Whether a node computes the same wherever it stands, of the same arguments."""
+    random = torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ())
+    return (
+        node.op == "call_function" and name_of(node.target) not in UNINITIALISED and not random and not _mutates(node)
+    )
+
+
+def _memory(node: Node) -> Any:
+    """What tells the memory of a node's tensor from that of others; the node where it has none of its own."""
+    value = node.meta.get("val")
+    try:
+        return value.untyped_storage()._cdata if isinstance(value, Tensor) else node
+    except NotImplementedError:
+        return node
+
+
+def _told_apart(value: Any) -> Any:
+    """What two arguments have in common if they are the same: 1, 1.0 and True are not, nor are 0.0 and −0.0."""
+    if isinstance(value, tuple | list):
+        return type(value), *map(_told_apart, value)
+    if isinstance(value, dict):
+        return dict, *((name, _told_apart(each)) for name, each in value.items())
+    if isinstance(value, slice):
+        return slice, *map(_told_apart, (value.start, value.stop, value.step))
+    return type(value), repr(value) if isinstance(value, float | complex) else value
 
 
 def _tidied(root: GraphModule, graph: Graph) -> GraphModule:

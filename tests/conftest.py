@@ -34,10 +34,14 @@ def _checked_at_first(typechecker):
             once = count[0] <= CHECKED_CALLS and not _of_any_size(arguments)
             return (checked() if once else function)(*arguments, **options)
 
-        # Code of a library, as the one that it stands for: no part of what lyapnet's users wrote.
-        call.__code__ = call.__code__.replace(co_filename=jaxtyping.__file__)
         # Only when called: a function within a function is made anew each time, and most of these are not checked.
-        checked = functools.cache(lambda: _jaxtyped(function, typechecker=typechecker))
+        def wrapped():
+            return _jaxtyped(function, typechecker=typechecker)
+
+        checked = functools.cache(wrapped)
+        # Code of a library, as the one that they stand for: no part of what lyapnet's users wrote.
+        for each in (call, wrapped):
+            each.__code__ = each.__code__.replace(co_filename=jaxtyping.__file__)
         return call
 
     return decorate

@@ -12,6 +12,7 @@ from torch import nn
 
 from lyapnet.contracts.batch_sizes import check_batch_sizes
 from lyapnet.errors import UsageError
+from lyapnet.policy import HJBPolicy
 from tests.certification.test_false_attempts import Bowl, Paid, System, claim
 from tests.certification.test_memory import Law
 from tests.problems import problem_of
@@ -172,6 +173,16 @@ HONEST = {
 def test_shapes_are_used_honestly(way):
     """The twins."""
     assert check_batch_sizes("f(x)", lambda x: (HONEST[way](x),), [torch.zeros(4, 2)]) is None
+
+
+def test_what_comes_with_lyapnet_is_of_each_state_by_itself(system, cost, V):
+    """Which a problem takes for granted: it holds the user's own code alone against batches of every size."""
+    law = HJBPolicy(problem_of(system, cost), V)
+
+    def everything(t, x):
+        return system.f(x), system.g(x), cost.state(x), cost.R(x), cost.terminal(x), V(t, x), law(t, x)
+
+    assert check_batch_sizes("all of it", everything, [torch.zeros(4), torch.randn(4, system.n)]) is None
 
 
 def test_and_certified():

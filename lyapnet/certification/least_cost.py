@@ -14,7 +14,7 @@ from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.counterexamples import Counterexample
 from lyapnet.certification.funnel import for_levels, largest_seen, proof_within, setting_of
 from lyapnet.certification.ignorable_states import ignorable_states
-from lyapnet.certification.preconditions import at_time, domain_around, require_still, without
+from lyapnet.certification.preconditions import at_time, domain_around, require_goal, require_still, without
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.verdict import Verdict, verdict_on
 from lyapnet.contracts import copied
@@ -183,6 +183,7 @@ def lower_claim(
         UsageError: β, δ or D do not fit, ℓ is not quadratic in u, or V, f, g, q or R have an operator without a rule.
         Interrupted: Ctrl-C or SIGTERM.
     """
+    require_goal(problem, "two-sided")
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, delta, problem)
     cost, duration = condition.closed_loop.cost, condition.duration

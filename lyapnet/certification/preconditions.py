@@ -14,7 +14,7 @@ from lyapnet.errors import UsageError
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import JUMPS
 from lyapnet.linear_algebra import apply
-from lyapnet.problem import TRIED
+from lyapnet.problem import TRIED, Problem
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.types import Corner, Corners, State, Time, Value
@@ -122,6 +122,22 @@ def check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
         raise UsageError(
             f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there: "
             "correct the cost, or choose a smaller set."
+        )
+
+
+def require_goal(problem: Problem, claim: str) -> None:
+    """Refuse a claim that is about a goal, for a task that has none.
+
+    Args:
+        claim: the name of the certificate, for the message.
+
+    Raises:
+        UsageError: the task has no goal; says why.
+    """
+    if not problem.has_goal:
+        raise UsageError(
+            f"Expected a task with a goal, towards which V falls, for a {claim} certificate, got none: "
+            f"{problem.no_goal}; lyapnet certify tube bounds the cost of such a task."
         )
 
 

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from lyapnet.certification import figures
 from lyapnet.certification.certificates import Certificate
+from lyapnet.certification.preconditions import require_goal
 from lyapnet.certification.statistical import SampledClaim, StatisticalClaim, sampled_claim, statistical_claim
 from lyapnet.certification.tables import floored
 from lyapnet.constraints import names_of
@@ -162,6 +163,7 @@ def sampled_certificate(
     Args:
         radius: of success at T, in the norm of x; not asked for if None.
     """
+    require_goal(controller.problem, "sampled")
     tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
     claim = sampled_claim(controller.rollout, controller.problem, tolerances, samples, generator)
     return SampledCertificate(controller, claim, {"samples": samples, "radius": radius, "seed": seed})
@@ -184,6 +186,7 @@ def statistical_certificate(
         radius: of success at T, in the norm of x; not asked for if None.
         draws: of this controller that were made, this one included, with other seeds or numbers of states.
     """
+    require_goal(controller.problem, "statistical")
     tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
     claim = statistical_claim(
         controller.rollout, controller.problem, tolerances, samples, confidence, share, generator, draws=draws

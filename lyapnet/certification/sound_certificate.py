@@ -15,7 +15,7 @@ from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.certificates import FROZEN, NOT_PROVED, Certificate
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.funnel import SoundClaim, sound_claim
-from lyapnet.certification.preconditions import over_time
+from lyapnet.certification.preconditions import over_time, require_goal
 from lyapnet.certification.proof import Progress
 from lyapnet.certification.tables import floored
 from lyapnet.contracts import copied
@@ -210,6 +210,7 @@ def sound_certificate(
         ray: of Budget.
         started: time.monotonic() from which the seconds count; now if None.
     """
+    require_goal(controller.problem, "sound")
     begun = time.monotonic() if started is None else started
     budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
     claim = sound_claim(

@@ -109,7 +109,7 @@ def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation
     }
     if has_plane(problem):
         drawn["paths"] = paths(trajectory, problem)
-    if measured.result()["cost_ratio"] is not None:
+    if measured.result()["optimal_cost_mean"] is not None:
         drawn["optimality"] = figures.optimality(measured.table)
     if any(one.distance is not None for one in later):
         drawn["afterwards"] = distances(later, controller)

@@ -37,7 +37,7 @@ class Film:
 
     The left panel has the shapes that the system draws: the first closed loop's, in the background those of the others,
     and in red the goal's. Of a system without shapes it has the plane of X₀'s two widest states, with level sets of
-    V(t, ·) through the centre of X₀ in the others. On the right are the controls with their limits, and the cost to
+    V(t, ·) through the centre of X₀ in the others; of a single state its course over time. On the right are the controls with their limits, and the cost to
     go with V, of the first closed loop in full colour.
 
     Args:
@@ -68,7 +68,7 @@ class Film:
         self.nodes: list[int] = np.linspace(0, len(self.t) - 1, count).round().astype(int).tolist()
         self.figure = Figure(figsize=(8.6, 4.3), layout="constrained")
         drawn = [self._shapes(node, 0) for node in (0, len(self.u))]
-        self._scene = self._stage() if any(drawn) else self._plane()
+        self._scene = self._stage() if any(drawn) else self._plane() if problem.system.n > 1 else self._course()
         self._curves = self._panels()
         self._canvas = FigureCanvasAgg(self.figure)
         self.figure.set_dpi(110)
@@ -162,8 +162,6 @@ class Film:
     def _plane(self) -> Any:
         """The panel of two states with level sets of V; what puts those of a node into it."""
         panel, problem = self._left(), self.problem
-        if problem.system.n < 2:
-            raise UsageError(f"Expected {problem.system.title}.draw, got none, and one state has no plane; write it.")
         axes = plane_axes(problem)
         region = _grid(problem, axes, *set_plane(panel, problem, axes, self.x.reshape(-1, problem.system.n)))
         first = self._values(0, region)
@@ -177,6 +175,30 @@ class Film:
                 path = self.x[: node + 1, loop][:, axes]
                 yield from panel.plot(*path.T, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
                 yield from panel.plot(*path[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
+
+        return put
+
+    def _course(self) -> Any:
+        """The panel of a single state over time, with level sets of V; what puts it until a node into it."""
+        panel, problem = self._left(), self.problem
+        low, high = float(self.x.min()), float(self.x.max())
+        margin = 0.06 * max(high - low, 1e-9)
+        panel.set(xlim=(0, self.t[-1]), ylim=(low - margin, high + margin), xlabel="time (s)")
+        panel.set_ylabel(problem.system.state_labels[0], fontsize=8)
+        panel.tick_params(labelsize=7)
+        if problem.has_goal:
+            panel.axhline(float(problem.goal[0]), color=VERMILION, linestyle=":")
+        heights = torch.linspace(low - margin, high + margin, 41).to(problem.goal)[:, None]
+        with torch.no_grad():
+            times = [torch.as_tensor(self.t[node]).to(heights) for node in self.nodes]
+            values = np.stack([numpy_of(self.V(t, heights)) for t in times], 1)
+        panel.contour(self.t[self.nodes], numpy_of(heights[:, 0]), values, levels=9, colors=GREY, linewidths=0.7)
+
+        def put(node: int) -> Iterator[Artist]:
+            for loop in range(self.x.shape[1]):
+                t, x = self.t[: node + 1], self.x[: node + 1, loop, 0]
+                yield from panel.plot(t, x, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
+                yield from panel.plot(t[-1], x[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
 
         return put
 

@@ -102,7 +102,8 @@ def _draw_plane_region(
     paths = numpy_of(trajectory.x[:, corners])
     axes.plot(paths[..., i], paths[..., j], color=BLUE, linewidth=1)
     axes.plot(paths[0, :, i], paths[0, :, j], "o", color=BLUE, markersize=3)
-    axes.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10)
+    if problem.has_goal:
+        axes.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10)
     (left, bottom), (width, height) = (
         side[region.axes].tolist() for side in (initial_states.lower, initial_states.widths)
     )
@@ -155,6 +156,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     x0 = trajectory.x[0]
     goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # of each, in a family
     one = torch.where((goal - goal[0]).abs().amax(0) <= 1e-9 * (1 + goal[0].abs()), goal[0], torch.nan)
+    one = one if problem.has_goal else torch.full_like(one, torch.nan)
     at_rest = torch.cat([one, problem.rest]).tolist()
     curves = [(system.state_labels[i], numpy_of(trajectory.x[..., i]), BLUE) for i in drawn]
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
@@ -257,8 +259,12 @@ def optimality(table: StateTable) -> Figure:
         panel.legend(frameon=False, fontsize=8)
     left_out = f", {len(known) - len(optimal)} without optimum left out" if len(optimal) < len(known) else ""
     summary = table.against_optimum()
-    panels[0].set_title(f"cost / optimum, ratio of the means: {summary['cost_ratio']:.4f}", fontsize=9)
-    panels[1].set_title(f"mean |V(0, x₀) − J*| / mean J*: {summary['value_error']:.1%}", fontsize=9)
+    if table.has_goal:
+        titles = f"cost / optimum, ratio of the means: {summary['cost_ratio']:.4f}", "mean |V(0, x₀) − J*| / mean J*"
+    else:
+        titles = f"mean (J − J*) / spread of J*: {summary['regret']:.2%}", "mean |V(0, x₀) − J*| / spread of J*"
+    panels[0].set_title(titles[0], fontsize=9)
+    panels[1].set_title(f"{titles[1]}: {summary['value_error']:.1%}", fontsize=9)
     figure.suptitle(f"{len(optimal)} initial states{left_out}", fontsize=9)
     return figure
 

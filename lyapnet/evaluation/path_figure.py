@@ -34,7 +34,8 @@ def paths(trajectory: Trajectory, problem: Problem) -> Figure:
     for k, path in enumerate(x.swapaxes(0, 1)):
         panel.plot(path[:, i], path[:, j], color=BLUE, linewidth=0.9, label=None if k else "closed loop")
     panel.plot(x[0, :, i], x[0, :, j], "o", color=BLUE, markersize=3)
-    panel.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10, label="goal", linestyle="none")
+    if problem.has_goal:
+        panel.plot(*problem.goal[[i, j]].tolist(), "*", color=VERMILION, markersize=10, label="goal", linestyle="none")
     low, size = (side[[i, j]].tolist() for side in (problem.initial_states.lower, problem.initial_states.widths))
     panel.add_patch(Rectangle((low[0], low[1]), *size, fill=False, edgecolor="black", linewidth=0.8, label="X₀"))
     panel.set_xlabel(problem.system.state_labels[i])

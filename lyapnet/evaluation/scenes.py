@@ -80,15 +80,16 @@ class Picture:
         panel.set_xlabel("time (s)", fontsize=8)
         panel.set_ylabel(self.problem.system.state_labels[0], fontsize=8)
         panel.tick_params(labelsize=7)
-        panel.axhline(float(self.problem.goal[0]), color=VERMILION, linestyle=":")
+        if self.problem.has_goal:
+            panel.axhline(float(self.problem.goal[0]), color=VERMILION, linestyle=":")
         panel.update_datalim([(0, float(box.lower[0])), (0, float(box.upper[0]))])
         panel.plot(t, x, color=BLUE, linewidth=1.0)
         panel.plot(t[-1], x[-1], "o", color=BLUE, markersize=5)
 
 
 def set_stage(panel: Axes, problem: Problem, corners: np.ndarray) -> None:
-    """A panel in metres that shows these points (k, 2), and the goal's shapes in red."""
-    goal = shapes_of(problem, numpy_of(problem.goal), numpy_of(problem.rest))
+    """A panel in metres that shows these points (k, 2), and the shapes of a goal in red."""
+    goal = shapes_of(problem, numpy_of(problem.goal), numpy_of(problem.rest)) if problem.has_goal else []
     corners = np.concatenate([corners, *map(corners_of, goal)])
     low, high = corners.min(0), corners.max(0)
     side = 1.1 * max(float((high - low).max()), 1e-9) / 2
@@ -108,7 +109,7 @@ def plane_axes(problem: Problem) -> list[int]:
 
 
 def set_plane(panel: Axes, problem: Problem, axes: list[int], states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A panel of two states that shows these (k, n), and the goal as a star; its lower left and upper right."""
+    """A panel of two states that shows these (k, n), and a goal as a star; its lower left and upper right."""
     for axis, index in zip("xy", axes, strict=True):
         getattr(panel, f"set_{axis}label")(problem.system.state_labels[index], fontsize=8)
     low, high = states.min(0)[axes], states.max(0)[axes]
@@ -116,7 +117,8 @@ def set_plane(panel: Axes, problem: Problem, axes: list[int], states: np.ndarray
     low, high = low - margin, high + margin
     panel.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     panel.tick_params(labelsize=7)
-    panel.plot(*numpy_of(problem.goal)[axes], "*", color=VERMILION, markersize=10)
+    if problem.has_goal:
+        panel.plot(*numpy_of(problem.goal)[axes], "*", color=VERMILION, markersize=10)
     return low, high
 
 

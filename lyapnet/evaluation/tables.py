@@ -79,9 +79,11 @@ def _rows(result: dict[str, Any]) -> dict[str, str]:
     known = result.get("regret", result["cost_ratio"]) is not None
     unknown = ("cost_mean",) if known else ("cost_ratio", "regret")
     left_out = {f"{name}_{key}" for name in REFERENCES for key in unknown}
+    labels = {**ROWS, **VIOLATED}
     if "regret" in result:
         left_out.add("cost_ratio")
-    return {key: label for key, label in {**ROWS, **VIOLATED}.items() if key in result and key not in left_out}
+        labels["value_error"] = "value error, mean |V(0, x₀) − J*| / spread of J*"
+    return {key: label for key, label in labels.items() if key in result and key not in left_out}
 
 
 def _entry(key: str, value: float | None) -> str:

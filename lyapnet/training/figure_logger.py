@@ -59,11 +59,14 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
     with torch.no_grad():
         sample = learner.rollout(x0)
     drawn = {
-        "certified_region": figures.certified_region(learner.rollout, problem),
         "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),
     }
-    return {**drawn, "paths": paths(sample, problem)} if has_plane(problem) else drawn
+    if problem.has_goal:
+        drawn["certified_region"] = figures.certified_region(learner.rollout, problem)
+    if has_plane(problem):
+        drawn["paths"] = paths(sample, problem)
+    return drawn
 
 
 def film_of(learner: Learner) -> Film:

@@ -154,7 +154,7 @@ function marks() {
     x: [left, right, right, left, left], y: [bottom, bottom, top, top, bottom], mode: "lines", hoverinfo: "skip",
     name: through ? "X₀" : "X₀, projected", line: { color: "#000000", width: 2, dash: through ? "solid" : "dot" },
   });
-  found.push({
+  if (facts.hasGoal) found.push({
     x: i === TIME ? [0, T] : [goal[i]], y: Array(i === TIME ? 2 : 1).fill(goal[j]), name: "goal", hoverinfo: "skip",
     mode: i === TIME ? "lines" : "markers", line: { color: VERMILION, dash: "dot" },
     marker: { symbol: "star", size: 13, color: VERMILION, line: { color: "#fff", width: 1 } },
@@ -315,7 +315,7 @@ function offerOthers() {
     return [label];
   });
   const back = document.createElement("button");
-  back.textContent = "others at the goal";
+  back.textContent = `others at the ${facts.hasGoal ? "goal" : "centre of X₀"}`;
   back.addEventListener("click", () => {
     chosen.x = facts.start.slice();
     offerOthers();

@@ -96,7 +96,8 @@ def facts_of(controller: Controller, title: str, funnel: KeptSide | None = None)
             {"name": name, "label": label, "lower": lower, "upper": upper}
             for name, label, lower, upper in zip(system.control_names, system.control_labels, *sides, strict=True)
         ],
-        "start": (center - problem.cost.from_goal(center)).tolist(),  # of a family, its parameters at the centre
+        "start": _start(controller).tolist(),
+        "hasGoal": problem.has_goal,
         "axes": _axes(controller),
         "initialStates": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
         "steps": problem.horizon.steps,
@@ -119,14 +120,20 @@ def _axes(controller: Controller) -> list[int]:
     return sorted([*free, *(i for i in range(controller.system.n) if i not in free)][:2])
 
 
+def _start(controller: Controller) -> Tensor:
+    """The other states of the first slice: those of the goal, of a family with its parameters at the centre of X₀."""
+    problem, center = controller.problem, controller.initial_states.center
+    return center - problem.cost.from_goal(center) if problem.has_goal else center
+
+
 def _extent(controller: Controller, funnel: KeptSide | None) -> Box:
     """How far the axes go: around X₀, closed loops from there, the goal, limits of states and the set of a funnel."""
-    box, cost = controller.initial_states, controller.cost
+    box = controller.initial_states
     try:
         x = controller.rollout(box.sample(LOOPS, stream(0, FIGURES))).x.flatten(0, 1)
     except DivergenceError:
         x = box.center[None]
-    points = torch.cat([x, box.lower[None], box.upper[None], (box.center - cost.from_goal(box.center))[None]])
+    points = torch.cat([x, box.lower[None], box.upper[None], _start(controller)[None]])
     lower, upper = points.amin(0), points.amax(0)
     for part in parts_of(controller.problem.constraints):
         if isinstance(part, StateLimits):

@@ -29,12 +29,16 @@ class Compared:
         low, high = claim.bounds_of_cost(x0)
         inside = high.isfinite()
         self.x0, self.low, self.high = x0[inside], low[inside], high[inside]
-        self.optimum = optima_of(controller, self.x0, seconds)
+        self.optimum, self.has_goal = optima_of(controller, self.x0, seconds), controller.problem.has_goal
 
     @property
     def ratio(self) -> float | None:
-        """Mean guaranteed cost over the mean optimum."""
-        return None if self.optimum is None else ratio_of_means(self.high[: len(self.optimum)], self.optimum)
+        """Mean guaranteed cost over the mean optimum; None where costs may be of any sign."""
+        return (
+            None
+            if self.optimum is None or not self.has_goal
+            else ratio_of_means(self.high[: len(self.optimum)], self.optimum)
+        )
 
 
 class TubeCertificate(Certificate):

@@ -24,7 +24,7 @@ from lyapnet.sets import Box
 from lyapnet.types import PerState, State, Time
 
 BOXES, SAMPLES = 2000, 200  # that are bounded, and states that are tried, for one size of the box
-GROWTH, SIZES = 1.6, 20  # sizes of the box that are tried, as long as they do, up to half of D
+GROWTH, SIZES = 1.6, 20  # sizes of the box among which the largest is sought by bisection, up to half of D
 NEAR = 1e-6  # how far YZ may be from 1
 LEAST = 0.2  # of the linearised law's own rate, that is enough; no more than half of what Y has at the goal
 CORNERS = 6  # axes of P at whose corners laws are linearised
@@ -193,12 +193,12 @@ def contraction_around(
         box = proposed[0]
         fits = _is_around(box, goal, within, radii * GROWTH**-SIZES)
         return coordinates.on(box, budget.left) if fits and at_goal > 0 else None, slowest
-    for k in range(SIZES if at_goal > 0 else 0):
+    low, high = -1, SIZES if at_goal > 0 else 0  # seen to contract at low, and not at high
+    while high - low > 1:
+        k = (low + high) // 2
         size = radii * GROWTH ** (k + 1 - SIZES)
-        larger = coordinates.on(Box(goal - size, goal + size), budget.left)
-        if larger is None:
-            break
-        found = larger
+        one = coordinates.on(Box(goal - size, goal + size), budget.left / 2)  # the rest is for smaller boxes
+        low, high, found = (k, high, one) if one is not None else (low, k, found)
     return found, slowest
 
 

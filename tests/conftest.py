@@ -57,7 +57,7 @@ jaxtyping.jaxtyped = _checked_at_first
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
 jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
-from lyapnet.certification import funnel  # noqa: E402
+from lyapnet.certification import funnel, preconditions  # noqa: E402
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
 from lyapnet.rollout import discrete_adjoint  # noqa: E402
@@ -188,4 +188,18 @@ def few_seconds_for_levels():
     """What is sought beside a proof takes no longer than this; for tests where it decides no verdict."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(funnel, "LEVELS", 0.5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def batch_sizes_once():
+    """The parts of a closed loop are traced for batches of every size once in a file that is about one closed loop."""
+    asked, check = [], preconditions.check_batch_sizes
+
+    def once(*arguments):
+        asked.append(arguments)
+        return check(*arguments) if len(asked) == 1 else None
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(preconditions, "check_batch_sizes", once)
         yield

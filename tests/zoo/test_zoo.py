@@ -1,5 +1,6 @@
 """The controllers that come with lyapnet: each as good as its record says, named everywhere as zoo:NAME."""
 
+import functools
 import json
 import shutil
 import tomllib
@@ -19,6 +20,12 @@ from lyapnet.zoo import entry, making
 ROOT = Path(__file__).parents[2]
 NAMES = zoo_names()
 ONE = "cartpole_balancing"
+
+
+@functools.cache
+def config_of(name):
+    """That of the loaded controller, for what only reads it."""
+    return lyapnet.load(f"zoo:{name}").config
 
 
 def test_every_checkpoint_has_its_record_and_its_command():
@@ -47,7 +54,7 @@ def test_a_controller_is_of_its_command_and_names_no_folder(name):
     assert own["experiment"] == name
     assert own["logs"] == "logs"
     for part in ("system", "cost", "controls", "initial_states", "horizon", "program"):
-        assert vars(lyapnet.load(f"zoo:{name}").config)[part] == getattr(config, part)
+        assert vars(config_of(name))[part] == getattr(config, part)
     assert set(content) == {"state_dict", "global_step", KEY}
     assert located(f"zoo:{name}").stat().st_size < 400_000
 
@@ -132,7 +139,7 @@ def test_every_export_is_its_controller(name, precision, bound):
     agreements = entry(name).record["export"][precision]
     assert set(agreements) == set(making.EXPORTS)
     assert all(one["states"] == 10_000 for one in agreements.values())
-    if lyapnet.load(f"zoo:{name}").config.rollout.policy == "lookahead":  # where rounding decides between equal costs
+    if config_of(name).rollout.policy == "lookahead":  # where rounding decides between equal costs
         bound *= 1e4
     assert all(max(one["control"], one["value"]) < bound for one in agreements.values())
 

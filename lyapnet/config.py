@@ -265,7 +265,10 @@ class Config:
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
-    target: list[float] | None = option(None, "x*, the state that the cost is about; null: its own goal.")
+    target: Any = option(
+        None, "x*, what the cost is about: a list, or {state: value}, the others solved for; null: its own goal.",
+        mapping=True,
+    )  # fmt: skip
     target_control: list[float] | None = option(None, "u*, likewise; null: what holds x*, f(x*) + g(x*)u* = 0.")
     family: dict[str, list[float]] = option(
         {}, "Ranges of what V is told: parameters of the system, and target_STATE; each as [least, greatest]."

@@ -45,14 +45,16 @@ def option(
     choices: Sequence[str] = (),
     user_class: bool = False,
     folder: bool = False,
+    mapping: bool = False,
     above: float | None = None,
     at_least: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A field with its sentence and the values it admits; `user_class` also admits module:Class, and `folder` only what
-    does not leave the folder that it is in."""
+    """A field with its sentence and the values it admits; `user_class` also admits module:Class, `folder` only what
+    does not leave the folder that it is in, and `mapping` a mapping in the place of a list."""
     bounds = {">": above, "≥": at_least, "<": below}
     rule = {"doc": doc, "choices": choices, "user_class": user_class, "folder": folder, "bounds": bounds}
+    rule["mapping"] = mapping
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=rule)
     return field(default=default, metadata=rule)
@@ -96,15 +98,17 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
         if "=" not in override.lstrip("="):
             raise UsageError(f"Expected overrides as key.sub=value, got {override!r}; put an = between key and value.")
     try:
-        layers = []
+        layers = list[dict[str, Any]]()
         for layer in (OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))):
             given: Any = OmegaConf.to_container(layer, resolve=False)
             _refuse_unknown_keys(given, schema, "")
-            layers.append(OmegaConf.create(_with_numbers_as_lists(given, schema)))
+            layers.append(_with_numbers_as_lists(given, schema))
             for f in dataclasses.fields(schema):  # pyright: ignore
                 if f.metadata.get("folder") and re.search(r"\$\{[^}]*:", str(given.get(f.name, ""))):
                     raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
-        merged = OmegaConf.merge(OmegaConf.structured(schema), *layers)
+        written, given = layers
+        layers = [_without_other_kinds(written, given, schema), given]
+        merged = OmegaConf.merge(OmegaConf.structured(schema), *(OmegaConf.create(layer) for layer in layers))
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise UsageError(_explain(error, schema)) from error
@@ -176,6 +180,21 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
             for name, entry in value.items():
                 _refuse_scalar(f"{key}.{name}", entry, "a list", f.metadata.get("doc", ""))
+    return found
+
+
+def _without_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
+    """The content without what becomes a mapping later, and mappings that become lists, in fields that take both."""
+    found = dict(content)
+    for f in dataclasses.fields(schema):  # pyright: ignore
+        value, other = content.get(f.name), later.get(f.name)
+        if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
+            if isinstance(value, Mapping) and isinstance(other, Mapping):
+                found[f.name] = _without_other_kinds(value, other, f.type)
+        elif (
+            f.metadata.get("mapping") and isinstance(value, Mapping) != isinstance(other, Mapping) and other is not None
+        ):
+            found.pop(f.name, None)
     return found
 
 

@@ -5,7 +5,7 @@ from lyapnet.build.entries import entry_per_state
 from lyapnet.build.family import knows, member
 from lyapnet.build.learner import build_program, build_rollout, build_value_function
 from lyapnet.build.named_parts import parts_named, parts_of
-from lyapnet.build.problem import build_problem, build_system, with_parameters
+from lyapnet.build.problem import build_problem, build_system, operating_point, with_parameters
 
 __all__ = [
     "REGISTRIES",
@@ -18,6 +18,7 @@ __all__ = [
     "entry_per_state",
     "knows",
     "member",
+    "operating_point",
     "own_parts",
     "parts_named",
     "parts_of",

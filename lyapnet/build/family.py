@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from lyapnet.build.classes import Parts, section
-from lyapnet.build.entries import repeated
-from lyapnet.build.target import HELD, about_target, holding
+from lyapnet.build.target import about_written_target, holding, written_target
 from lyapnet.config import Config
 from lyapnet.cost import Cost, MadeOfAnother, innermost
 from lyapnet.errors import UsageError, did_you_mean
 from lyapnet.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
+from lyapnet.operating_points import HELD
 from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import ControlMatrix, State
@@ -49,7 +49,7 @@ def family_of(
             shift[targets[name], k] = 1
     if targets or config.target is not None:
         at_center = _config_of(config, dict(zip(ranges, center.tolist(), strict=True)), system)
-        cost = about_target(at_center, cost, family.member(center), controls)
+        cost = about_written_target(at_center, cost, family.member(center), controls)
         if config.target_control is None:
             _require_one_control(family, cost, shift, center, low, high)
     return family, FamilyCost(cost, shift, center, _weight_of_members(cost, family)), box
@@ -83,7 +83,7 @@ def _config_of(config: Config, parameters: Mapping[str, float], system: ControlA
     """The config of one member of a family."""
     given = {name: value for name, value in parameters.items() if not name.startswith(PREFIX)}
     own = dataclasses.replace(config.system, parameters={**config.system.parameters, **given})
-    target = None if config.target is None else [*repeated(config.target, system.n)]
+    target = None if config.target is None else written_target(config, system).tolist()
     for name, i in _targets(parameters, system).items():
         target = [0.0] * system.n if target is None else target
         target[i] = parameters[name]

@@ -14,8 +14,8 @@ from lyapnet.build.constraints import ball_of, build_constraints
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
 from lyapnet.build.stationary import without_end
-from lyapnet.build.target import about_target
-from lyapnet.config import Config, ControlsConfig, CostConfig, SystemConfig
+from lyapnet.build.target import Trim, about_target, trim
+from lyapnet.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
 from lyapnet.contracts import initialised
 from lyapnet.cost import (
     COSTS,
@@ -52,11 +52,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         system, cost, controls, constraints = (copy.deepcopy(initialised(part)) for part in given)
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
-        with section("initial_states"):
-            bounds = {side: repeated(getattr(config.initial_states, side), system.n) for side in ("lower", "upper")}
-            for side, bound in bounds.items():
-                require_length(f"initial_states.{side}", len(bound), system.state_names)
-            initial_states = Box(**bounds)
+        initial_states = build_initial_states(config.initial_states, system)
         with section("horizon"):
             method = config.rollout.method
             held = method if method in TABLEAUX else "rk4"  # of an adaptive method
@@ -70,7 +66,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if config.family:
             system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
         elif not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
-            cost = about_target(config, cost, system, controls)
+            cost = about_target(config, cost, system, controls, initial_states)
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
@@ -79,6 +75,23 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
             problem = without_end(problem)
         return problem.to(dtype)
+
+
+def operating_point(config: Config, parts: Parts | None = None) -> tuple[ControlAffineSystem, Trim]:
+    """The system of a config, and the operating point of its target, for which its cost and horizon are not asked.
+
+    Raises:
+        UsageError: as build_problem, for these.
+    """
+    parts = parts or Parts()
+    with float64_defaults():
+        system, controls = (copy.deepcopy(initialised(part)) for part in (parts.system, parts.controls))
+        system = build_system(config.system) if system is None else system.double()
+        system.check_coordinates()
+        initial_states = build_initial_states(config.initial_states, system)
+        with section("controls"):
+            controls = build_controls(config.controls, system) if controls is None else controls.double()
+        return system, trim(config, system, controls, initial_states)
 
 
 def _weights(config: Config) -> CostConfig:
@@ -101,6 +114,15 @@ def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], 
     """A system of the same class from other arguments, in the precision and on the device of a tensor."""
     with float64_defaults():
         return type(system)(**parameters).to(like)
+
+
+def build_initial_states(config: InitialStatesConfig, system: ControlAffineSystem) -> Box:
+    """X₀ of a config; a single number is the bound of every state."""
+    with section("initial_states"):
+        bounds = {side: repeated(getattr(config, side), system.n) for side in ("lower", "upper")}
+        for side, bound in bounds.items():
+            require_length(f"initial_states.{side}", len(bound), system.state_names)
+        return Box(**bounds)
 
 
 def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:

@@ -1,4 +1,4 @@
-"""The command line: lyapnet check | train | evaluate | animate | view | export | sweep | tune | certify | compare | …
+"""The command line: lyapnet check | trim | train | evaluate | animate | view | export | sweep | tune | certify | …
 
 A command imports what it needs when it runs: help and misspelt options are answered at once.
 """
@@ -20,6 +20,7 @@ from lyapnet.cli.export import export
 from lyapnet.cli.sweep import sweep
 from lyapnet.cli.systems import systems
 from lyapnet.cli.train import train
+from lyapnet.cli.trim import trim
 from lyapnet.cli.tune import tune
 from lyapnet.cli.view import view
 from lyapnet.cli.zoo import demo, zoo
@@ -41,7 +42,7 @@ def lyapnet(
         print(__version__)
 
 
-for command in (check, train, evaluate, animate, view, export, sweep, tune, compare, systems, zoo, demo):
+for command in (check, trim, train, evaluate, animate, view, export, sweep, tune, compare, systems, zoo, demo):
     app.command()(command)
 for group in (certify, bench):
     app.add_typer(group.app, name=group.__name__.rpartition(".")[2])

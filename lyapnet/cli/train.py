@@ -56,13 +56,14 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
     best, own = members[0].best, own_parts(plan.config)
     quoted = shlex.quote(str(best))
     options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
+    kind = "statistical" if plan.module.members[0].problem.has_goal else "tube"
     arguments = "".join(f", {part}=…" for part in own)
     for what, shown in (
         ("run", plan.run.folder),
         ("watch", shlex.join(["tensorboard", "--logdir", str(plan.config.logs)])),
         ("measure", f"lyapnet evaluate {quoted}{options}"),
         ("animate", f"lyapnet animate {quoted}{options} --out closed_loops.gif"),
-        ("certify", f"lyapnet certify statistical {quoted}{options}"),
+        ("certify", f"lyapnet certify {kind} {quoted}{options}"),
         ("export", f"lyapnet export {quoted}{options} --to c --out law"),
         ("fine-tune", f"{command} --finetune {quoted}"),
         ("use", f"lyapnet.load({json.dumps(str(best), ensure_ascii=False)}{arguments})"),

@@ -37,8 +37,8 @@ class Film:
 
     The left panel has the shapes that the system draws: the first closed loop's, in the background those of the others,
     and in red the goal's. Of a system without shapes it has the plane of X₀'s two widest states, with level sets of
-    V(t, ·) through the centre of X₀ in the others; of a single state its course over time. On the right are the controls with their limits, and the cost to
-    go with V, of the first closed loop in full colour.
+    V(t, ·) through the centre of X₀ in the others; of a single state its course over time. On the right are the
+    controls with their limits, and the cost to go with V, of the first closed loop in full colour.
 
     Args:
         trajectory: a batch (b,) of closed loops of a V.

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from lyapnet.build import Parts, parts_of
+from lyapnet.build.target import named_entries
 from lyapnet.checkpoint import KEY, read_checkpoint
 from lyapnet.config import Config, differing_keys, load_config
 from lyapnet.errors import LyapnetError, UsageError
@@ -105,13 +106,13 @@ def plan_run(
         return plan
 
 
-def _note_another_target(target: list[float] | None, problem: Problem, checkpoint: Path) -> None:
+def _note_another_target(target: Any, problem: Problem, checkpoint: Path) -> None:
     """Say that V was made for another goal, which it then begins about."""
     goal = problem.goal.tolist()
     if target is None and problem.cost.rest is None:
         return
-    before = [0.0] if target is None else target
-    if not np.allclose(before if len(before) == len(goal) else before[0], goal, rtol=1e-6):
+    before = named_entries([0.0] if target is None else target, problem.system)
+    if not np.allclose([*before.values()], [goal[i] for i in before], rtol=1e-6):
         logging.getLogger(__name__).warning(
             "note: %s was trained about x* = %s, and V begins there; this run is about %s. Unless they are close, "
             "start anew without --finetune.", checkpoint, target or "the origin", goal,

@@ -18,6 +18,7 @@ from lyapnet.evaluation.figures import widest_axes
 from lyapnet.files import plain, write_atomically
 from lyapnet.random_streams import FIGURES, stream
 from lyapnet.sets import Box
+from lyapnet.types import State
 from lyapnet.view.functions import functions_of
 
 LOOPS = 64  # closed loops from X₀ that say how far the axes go
@@ -120,7 +121,7 @@ def _axes(controller: Controller) -> list[int]:
     return sorted([*free, *(i for i in range(controller.system.n) if i not in free)][:2])
 
 
-def _start(controller: Controller) -> Tensor:
+def _start(controller: Controller) -> State:
     """The other states of the first slice: those of the goal, of a family with its parameters at the centre of X₀."""
     problem, center = controller.problem, controller.initial_states.center
     return center - problem.cost.from_goal(center) if problem.has_goal else center

@@ -127,11 +127,14 @@ def test_level_sets_of_V_where_a_system_draws_nothing():
     assert np.abs(end).max() == pytest.approx(np.abs(start).max() / 5**0.5, rel=0.02)  # of V = (1 + n) ‖x‖²
 
 
-def test_one_state_has_no_plane():
+def test_one_state_is_drawn_over_time():
     problem = problem_of(IntegratorChain(1), steps=2)
     controller = Controller(problem, Quadratic(torch.eye(1).double()))
-    with pytest.raises(UsageError, match=r"IntegratorChain\.draw, got none"):
-        Film(controller.rollout(problem.initial_states.sample(1)), problem, controller.value)
+    trajectory = controller.rollout(torch.tensor([[1.0], [-1.0]]).double())
+    shown = Film(trajectory, problem, controller.value, rate=2)
+    assert shown._panel.get_xlabel() == "time (s)"
+    lines = [line.get_xydata() for line in shown._scene(2)][::2]
+    assert np.allclose(lines, torch.stack([trajectory.t.expand(2, -1), trajectory.x[..., 0].T], -1))
 
 
 @pytest.mark.parametrize("seconds", [0.4, 5.0, 40.0])

@@ -1,6 +1,7 @@
 """Shared by all tests: shapes checked, float64, fixed seeds, every registered system and its task."""
 
 import functools
+import importlib
 import inspect
 import logging
 import os
@@ -51,6 +52,10 @@ def _of_any_size(arguments):
     """Whether one of them is a batch whose size has no value, which jaxtyping would ask for."""
     return any(isinstance(each, torch.Tensor) and torch.SymInt in map(type, each.shape) for each in arguments)
 
+
+# What lyapnet imports first within its own modules would be compiled, and kept on disk, once more for the hook below.
+for library in ("beartype.typing", "scipy.integrate", "scipy.linalg", "scipy.optimize", "torch._dynamo"):
+    importlib.import_module(library)
 
 _jaxtyped = jaxtyping.jaxtyped
 jaxtyping.jaxtyped = _checked_at_first

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati, oracle_of
-from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati
+from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati, sizes
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import ControlAffineSystem, Linear, Pendulum
 from tests.problems import problem_of
@@ -172,3 +172,11 @@ def test_of_guesses_at_one_optimum_the_hopeless_are_left_once_one_has_settled(mo
     assert_close(alone, settled.cost.expand(3), rtol=1e-6, atol=0)
     assert_close(rivals[:2], alone[:2], rtol=1e-6, atol=0)
     assert rivals[2] > 2 * alone[2]
+
+
+def test_differences_of_costs_are_held_against_their_size():
+    cost = torch.tensor([1.0, 3.0, torch.inf])
+    assert sizes(cost) is cost, "where none is negative, zero is the least"
+    shifted = sizes(cost - 2)
+    assert_close(shifted[:2], torch.tensor([2.0, 2.0]))  # |J| = 1, and they are spread by 1
+    assert float(sizes(torch.tensor([-1e-9, 1.0])).min()) > 0.4, "a cost that is nearly zero by chance is no unit"

@@ -25,8 +25,8 @@ from lyapnet.random_streams import TEST, stream
 from lyapnet.systems import SYSTEMS, Pendulum
 from lyapnet.systems.base import MechanicalSystem
 from lyapnet.training import pretraining, start
+from lyapnet.training.initial_networks import take
 from lyapnet.training.optima import minima
-from lyapnet.training.start import take
 from tests.configs import objects
 from tests.problems import CONF, problem_of
 

@@ -23,6 +23,7 @@ from lyapnet.files import write_atomically, write_json
 from lyapnet.loading import load
 from lyapnet.machine import peak_memory
 from lyapnet.training.build import build_data
+from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
@@ -31,7 +32,7 @@ from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
 from lyapnet.training.stages import PATIENCE, Stages, silent
-from lyapnet.training.start import REMEDY, Start, choose_start, has_place_for_start
+from lyapnet.training.start import REMEDY, choose_start, has_place_for_start
 from lyapnet.training.trainer import build_trainer
 
 

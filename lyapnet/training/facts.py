@@ -22,11 +22,12 @@ from lyapnet.linearisation import (
 )
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
+from lyapnet.training.candidates import CALM, Candidate, Start
 from lyapnet.training.fact import Fact, listed
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import CALM, REMEDY, SMALLER, Candidate, Start, choose_start
+from lyapnet.training.start import REMEDY, SMALLER, choose_start
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another

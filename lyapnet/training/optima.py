@@ -1,6 +1,7 @@
 """Optimal trajectories from many states of X₀, each sought where its neighbours were found."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import torch
@@ -18,12 +19,15 @@ from lyapnet.expansions import (
     in_float64,
     optimal_trajectories,
     path_under,
+    sizes,
 )
 from lyapnet.problem import Problem
+from lyapnet.random_streams import START, stream
 from lyapnet.training.stages import Report, silent
-from lyapnet.types import State
+from lyapnet.types import Control, State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
+WAVES = 6  # random controls from which optima are sought where there is no expansion
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
@@ -32,10 +36,10 @@ NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, an
 def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: Report = silent) -> Optimum:
     """Optimal trajectories from a batch of states.
 
-    The first few are sought: from the controls that expansions ask for, or none if cheaper, and some of them by the
-    oracle, where there is one, whose starts need not be trajectories. The others begin with the laws of the few that
-    are nearest. Which local minimum a start leads to is luck, but the least cost is continuous in x₀: at last, what was
-    found from one state is tried from the states around it.
+    The first few are sought: from the controls that expansions ask for, or none if cheaper, or random waves where there
+    is no expansion; and some of them by the oracle, where there is one, whose starts need not be trajectories. The
+    others begin with the laws of the few that are nearest. Which local minimum a start leads to is luck, but the least
+    cost is continuous in x₀: at last, what was found from one state is tried from the states around it.
 
     Args:
         report: is told what is being done.
@@ -44,6 +48,8 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
     x0 = x0.double().cpu()[: _affordable(problem)]
     few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
+    if not expansions:
+        laws += waves(exact, float(sizes(path_under(exact, laws[0], few).cost).median()), WAVES)
     progress = partial(report, f"optima from {len(few)} states of X₀")
     progress(0, len(few))
     u = cheapest([path_under(exact, law, few) for law in laws]).u
@@ -56,6 +62,21 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
         u = cheapest([_along(exact, optimum, column, others) for column in columns]).u
         optimum = _joined(optimum, optimal_trajectories(problem, others, u, progress=progress))
     return _followed(exact, optimum, report)
+
+
+def waves(problem: Problem, cost: float, count: int) -> list[Callable[[int, State], Control]]:
+    """Laws (n, x_n) ↦ u_n whose controls are random waves in time, of about some cost."""
+    N, m, own = problem.horizon.steps, problem.system.m, torch.arange(1, 5)
+    dearest = float(torch.linalg.eigvalsh(problem.cost.R(problem.initial_states.center))[..., -1])
+    amplitude = math.sqrt(abs(cost) / (dearest * problem.horizon.duration)) if math.isfinite(cost) else 1.0
+    phase = torch.arange(N).double()[:, None] / N * torch.pi * own
+    weights = torch.randn(count, m, 2, len(own), generator=stream(0, START, 1), dtype=torch.float64) / own
+    u = amplitude * torch.einsum("gmaw,awn->gnm", weights, torch.stack([phase.sin(), phase.cos()]).mT)
+
+    def along(controls: Tensor) -> Callable[[int, State], Control]:
+        return lambda n, x: problem.controls.project(controls[n].to(x).expand(*x.shape[:-1], -1))
+
+    return [along(controls) for controls in u]
 
 
 def minima(problem: Problem, optimum: Optimum) -> Optimum:
@@ -82,7 +103,9 @@ def _by_oracle(problem: Problem, optimum: Optimum, x0: State, report: Report) ->
     found = oracle.solve(x0, progress=progress)
     if found.u is None:
         return optimum
-    better = torch.nonzero(found.cost < BETTER * optimum.path.cost[: len(x0)]).flatten()
+    better = torch.nonzero(
+        found.cost < optimum.path.cost[: len(x0)] - (1 - BETTER) * sizes(optimum.path.cost)[: len(x0)]
+    ).flatten()
     if not len(better):
         return optimum
     return _with(optimum, better, optimal_trajectories(problem, x0[better], found.u[:, better]))
@@ -95,7 +118,7 @@ def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
         report("optima of neighbours", k, ROUNDS)
         paths = [_along(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
         best = cheapest(paths)
-        improved = torch.nonzero(best.cost < BETTER * optimum.path.cost).flatten()
+        improved = torch.nonzero(best.cost < optimum.path.cost - (1 - BETTER) * sizes(optimum.path.cost)).flatten()
         if not len(improved):
             break
         optimum = _with(optimum, improved, optimal_trajectories(exact, x0[improved], best.u[:, improved]))

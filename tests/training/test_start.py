@@ -8,15 +8,18 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet import load, train
+from lyapnet import ControlAffineSystem, load, train
+from lyapnet.build import Parts
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
+from lyapnet.expansions import optimal_trajectories
 from lyapnet.training.build import build_module
+from lyapnet.training.candidates import CALM
 from lyapnet.training.optimizer import OptimizerOptions
-from lyapnet.training.start import CALM, choose_start, expansions_of
+from lyapnet.training.start import choose_start, expansions_of
 
 LINEAR = {
     "experiment": "mine",
@@ -158,8 +161,8 @@ def test_states_that_V_ignores_are_left_out_of_the_expansion():
 
 @pytest.mark.parametrize("wrong", [False, True])
 def test_a_fit_does_not_begin_with_an_expansion_that_is_worse_than_nothing(wrong, monkeypatch):
-    def bent(problem, report):
-        for name, expansion in expansions_of(problem, report):
+    def bent(problem, *told):
+        for name, expansion in expansions_of(problem, *told):
             yield name, expansion._replace(hessian=30 * expansion.hessian) if wrong else expansion
 
     monkeypatch.setattr("lyapnet.training.start.expansions_of", bent)
@@ -211,3 +214,44 @@ def test_a_run_records_its_start_and_loads_with_it(tmp_path, capsys):
 def test_exact_terminal_values_are_not_for_it():
     with pytest.raises(UsageError, match="terminal"):
         build_module(config_from_plain(LINEAR, ["network.terminal=exact"]))
+
+
+class Rooted(ControlAffineSystem):
+    """A block with drag √(v²) v: f has no finite slope at rest, and so at the goal."""
+
+    state_names, state_units, control_names, control_units = ("p", "v"), ("m", "m/s"), ("u",), ("N",)
+
+    def f(self, x):
+        return torch.stack([x[..., 1], -0.3 * x[..., 1].square().sqrt() * x[..., 1]], -1)
+
+    def g(self, x):
+        return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
+
+
+@pytest.mark.parametrize("lower", [[1.0, 0.0], [-2.0, -1.0]])
+def test_optima_are_sought_where_there_is_no_expansion(lower):
+    """Between (1, 0) and (2, 0), where all begin at rest, and around the goal, where the centre says nothing."""
+    task = {**LINEAR, "system": {"name": "mine:Rooted"}, "initial_states": {"lower": lower, "upper": [2, -lower[1]]}}
+    module = build_module(config_from_plain(task), Parts(system=Rooted()))
+    start = choose_start(list(module.members))
+    names = [candidate.name for candidate in start.candidates if candidate.missing is None]
+    assert start.chosen.name == "12 optima from states of X₀"
+    assert ("the optimum from the centre of X₀" in names) == (lower[1] == 0)
+    assert "no Riccati solution at the goal: f + gu* has no finite slope" in str(start)
+    assert ("derivatives that do not exist at 12 of 612 nodes" in str(start)) == (lower[1] == 0)
+    x = module.members[0].problem.initial_states.sample(64)
+    smooth = drag_without_root(module.members[0].problem)
+    guess = torch.zeros(50, 64, 1)
+    optimum = optimal_trajectories(smooth, x, guess).path.cost
+    cost = module.members[0].rollout(x).cost.detach()
+    assert float((cost / optimum).median()) < 1.03
+    calm = next(candidate for candidate in start.candidates if candidate.name == CALM)
+    assert calm.cost > 3 * start.chosen.cost, "what it was before"
+
+
+def drag_without_root(problem):
+    class Smooth(Rooted):
+        def f(self, x):
+            return torch.stack([x[..., 1], -0.3 * x[..., 1].abs() * x[..., 1]], -1)
+
+    return problem.replaced(system=Smooth())

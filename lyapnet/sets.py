@@ -127,6 +127,10 @@ class ControlSet(nn.Module, ABC):
             b: (*batch, m).
         """
 
+    def minimise_now(self, R: ControlMatrix, b: Control) -> Control:
+        """`minimise` of numbers at hand, without gradients: it may look at them, as no traced function can."""
+        return self.minimise(R, b)
+
     @abstractmethod
     def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
         """Whether each control lies in U."""
@@ -227,6 +231,21 @@ class ControlBox(ControlSet):
         known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         return torch.where(known[..., None], u, torch.nan).to(given)  # what is no number stays none
 
+    @torch.no_grad()
+    def minimise_now(self, R: ControlMatrix, b: Control) -> Control:
+        """With three controls and more, rounds of which each holds those that the last one drives outwards; what is
+        not settled so, if anything, goes on with `minimise`."""
+        m = b.shape[-1]
+        if m <= 2 or type(self).minimise is not ControlBox.minimise or self.lower.numel() not in (1, m):
+            return self.minimise(R, b)
+        given, shape, (low, high) = b, b.shape, (side.double().expand(m) for side in self.limits)
+        R, b = R.double().expand(*shape, m).reshape(-1, m, m), b.double().reshape(-1, m)
+        u, settled = _by_rounds(R, b, low, high)
+        if not bool(settled.all()):
+            u[~settled] = self.minimise(R[~settled], b[~settled])
+        known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
+        return torch.where(known[:, None], u.clamp(low, high), torch.nan).reshape(shape).to(given)
+
     @staticmethod
     def _of_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
         """u₂ where the slope in it of min over u₁ vanishes, which is the middle one of three lines; then u₁."""
@@ -278,6 +297,45 @@ def _minimum_beside(R: Tensor, b: Control, held: Control, side: Control) -> Cont
     return solve(A, (free * (-b / 2 - apply(R, held)))[..., None])[..., 0]
 
 
+def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Control, Tensor]:
+    """The minimum of each of a batch (k, m), and which are settled: those whose controls at limits are those of the
+    last round, where the slope vanishes for the others and points outwards for these.
+
+    All controls change sides at once; after SETTLING rounds, as few batches may go round in circles so, only the first
+    of those that would, which comes to an end.
+
+    Source: Bergounioux, Ito, Kunisch, "Primal-dual strategy for constrained optimal control problems", SIAM Journal on
+    Control and Optimization 1999; Murty, "Note on a Bard-type scheme for solving the complementarity problem", Opsearch
+    1974 (the least index).
+    """
+    m, each = b.shape[-1], torch.arange(b.shape[-1])
+    diagonal = 2 * R.diagonal(dim1=-2, dim2=-1)
+    u, before = (-b / diagonal).clamp(low, high), torch.full_like(b, 2.0)
+    rows, minimum = torch.arange(len(b)), u.clone()
+    for k in range(SETTLING * (1 + m)):
+        towards = u - (2 * (R @ u[..., None])[..., 0] + b) / diagonal
+        side = (towards >= high).to(b) - (towards <= low).to(b)
+        changes = side != before
+        going = changes.any(-1)
+        if not bool(going.all()):
+            minimum[rows[~going]] = u[~going]
+            parts = (rows, R, b, diagonal, side, before, changes)
+            rows, R, b, diagonal, side, before, changes = (part[going] for part in parts)
+            if not len(rows):
+                break
+        if k >= SETTLING:
+            first = changes.to(torch.uint8).argmax(-1, keepdim=True)
+            side = torch.where(each == first, torch.where(before == 0, side, 0.0), before)
+        free = (side == 0).to(b)
+        held = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))
+        A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
+        rest = free * (-b / 2 - (R @ held[..., None])[..., 0]) + held
+        u, before = torch.linalg.solve_ex(A, rest[..., None])[0][..., 0], side
+    settled = torch.ones(len(minimum), dtype=torch.bool)
+    settled[rows] = False
+    return minimum, settled
+
+
 def _active_set(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
     """Which controls are at a limit at the minimum: −1 at the lower, 1 at the upper, 0 at none.
 
@@ -304,6 +362,7 @@ def _active_set(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
 
 FEW = 4  # controls of which all ways are tried: 3⁴ = 81 systems, less code to compile than that many rounds
 ROUNDS = 4
+SETTLING = 8  # rounds in which all controls may change sides at once; as many for each control follow
 HUGE = 1e150  # in the place of a limit that is none, where it is multiplied
 
 CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}  # limits are controls.lower and upper

@@ -247,7 +247,7 @@ def expansions_of(
     centre = problem.initial_states.center.double().cpu()
     if problem.horizon.stationary:
         return
-    if has_rest and torch.equal(centre, problem.goal.double().cpu()):
+    if has_rest and problem.has_goal and torch.equal(centre, problem.goal.double().cpu()):
         return
     progress = partial(report, "the optimum from the centre of X₀")
     progress(0, 0)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from lyapnet.errors import LyapnetError
     from lyapnet.horizon import Horizon
     from lyapnet.interpolation import Table
+    from lyapnet.linear_algebra import norm
     from lyapnet.loading import load
     from lyapnet.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
     from lyapnet.problem import Problem
@@ -36,6 +37,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
+    "linear_algebra": ["norm"],
     "loading": ["load"],
     "policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
     "horizon": ["Horizon"],
@@ -88,6 +90,7 @@ __all__ = [
     "ValueProgram",
     "__version__",
     "load",
+    "norm",
     "train",
 ]
 

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.contracts import copied
+from lyapnet.cost import spread
 from lyapnet.derivatives import Steps, steps_along, with_curvature
 from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
@@ -230,12 +231,12 @@ def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
     )
 
 
-def sizes(cost: PerState) -> PerState:
-    """What differences of costs are held against: each cost, where none is negative, else |J| and their spread."""
+def sizes(problem: Problem, cost: PerState) -> PerState:
+    """What differences of the costs of some trajectories are held against: each cost; without a goal their spread."""
     finite = cost[cost.isfinite()]
-    if not bool((finite < 0).any()):
+    if problem.has_goal or not len(finite):
         return cost
-    return cost.abs() + (finite.std(correction=0) if len(finite) else 0)
+    return spread(finite).expand_as(cost)
 
 
 def cheapest(paths: Sequence[Path]) -> Path:

@@ -14,6 +14,22 @@ CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed ze
 UNROLLED = 6  # unknowns of a linear system, up to which it is solved in whole batches
 
 
+def norm(v: Tensor, dim: int = -1) -> Tensor:
+    """‖v‖ = √(Σ v²) along an axis, exactly, with slope 0 at v = 0 and all further derivatives finite there.
+
+    The root's own slope is infinite at 0, and autograd makes not a number of it: at rest, v‖v‖ has no derivative with
+    torch.sqrt, and no second one with torch.linalg.vector_norm.
+
+    Args:
+        v: (…, k, …), in any unit.
+        dim: the axis that is summed over, the last one unless said otherwise.
+    """
+    squared = (v * v).sum(dim)
+    away = squared > 0
+    # the root of 1 in the place of that of 0, so that its infinite slope is not even computed
+    return torch.where(away, torch.sqrt(torch.where(away, squared, 1.0)), 0.0)
+
+
 def multiply(A: Tensor, B: Tensor) -> Tensor:
     """AB for A of shape (*batch, k, d) and B of shape (*batch, d, l)."""
     if A.shape[-2] * A.shape[-1] * B.shape[-1] > SMALL:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lyapnet.contracts import TO_WRITE
 from lyapnet.derivatives import jacobian
 from lyapnet.errors import one_line
 from lyapnet.expansions import Expansion, in_float64, riccati
@@ -12,8 +13,6 @@ from lyapnet.problem import Problem
 from lyapnet.types import InputMatrix, Matrix, State
 
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
-TO_WRITE = "write √(v² + ε²) in the place of √(v²) and |v|, and √(p + ε) in the place of √p, with a small ε"
-
 NAME_A_GOAL = "name target: in the config, or cost.goal, where the task has a goal"
 NEARBY, NEAR = 8, 1e-3  # states around the goal, and how far away they are, in units of X₀
 

@@ -175,8 +175,8 @@ def test_of_guesses_at_one_optimum_the_hopeless_are_left_once_one_has_settled(mo
 
 
 def test_differences_of_costs_are_held_against_their_size():
-    cost = torch.tensor([1.0, 3.0, torch.inf])
-    assert sizes(cost) is cost, "where none is negative, zero is the least"
-    shifted = sizes(cost - 2)
-    assert_close(shifted[:2], torch.tensor([2.0, 2.0]))  # |J| = 1, and they are spread by 1
-    assert float(sizes(torch.tensor([-1e-9, 1.0])).min()) > 0.4, "a cost that is nearly zero by chance is no unit"
+    cost, problem = torch.tensor([1.0, 3.0, torch.inf]), hanging()
+    assert sizes(problem, cost) is cost, "with a goal zero is the least"
+    problem._no_goal = "nobody named one"
+    assert_close(sizes(problem, cost - 7), torch.tensor([1.0, 1.0, 1.0]))  # by how much the finite ones are spread
+    assert_close(sizes(problem, torch.tensor([-1e-9, 1.0])), torch.tensor([0.5, 0.5]))

@@ -1,9 +1,10 @@
 """The gates for what others wrote: functions of each state alone, in batches of every size, that remember nothing."""
 
+from lyapnet.contracts.derivatives import TO_WRITE, without_slope
 from lyapnet.contracts.functions import called, check_function, copied, initialised, remedy
 from lyapnet.contracts.memory import Memory, check_memory, differences, reaches_own_code, state_of
 
 __all__ = [
-    "Memory", "called", "check_function", "check_memory", "copied", "differences",
-    "initialised", "reaches_own_code", "remedy", "state_of",
+    "TO_WRITE", "Memory", "called", "check_function", "check_memory", "copied", "differences",
+    "initialised", "reaches_own_code", "remedy", "state_of", "without_slope",
 ]  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lyapnet.contracts.derivatives import at_state, check_derivative
 from lyapnet.contracts.memory import reaches_own_code
 from lyapnet.errors import UsageError, raised
 
@@ -20,8 +21,6 @@ REMEDIES = {  # what an error of torch's says ↦ what to do
     "converted to Python scalars": "stay in torch: no float(x) and no x.item()",
     "numpy": "stay in torch: torch.sin for np.sin, and lyapnet.Table for np.interp",
 }
-STEP = 1e-6  # of central differences, relative to the spread of an argument
-DIRECTIONS = 4  # along which derivatives are compared at each state
 
 
 def _advice(got: tuple[int, ...] | str, batch: int, expected: tuple[int, ...]) -> str:
@@ -77,8 +76,8 @@ def check_function(
     bad = torch.nonzero(~value.isfinite().reshape(batch, -1).all(-1)).flatten()
     if len(bad):
         raise UsageError(
-            f"Expected finite {name}, got {_first_bad(value[bad[0]])} at {_at(arguments, int(bad[0]))}; correct it, or "
-            "choose an X₀ that avoids this state."
+            f"Expected finite {name}, got {_first_bad(value[bad[0]])} at {at_state(arguments, int(bad[0]))}; correct "
+            "it, or choose an X₀ that avoids this state."
         )
     if any_size and reaches_own_code(function):
         from lyapnet.contracts.batch_sizes import check_batch_sizes  # loads sympy: a second
@@ -86,7 +85,7 @@ def check_function(
         check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
     _check_each_for_itself(name, function, arguments, value)
     if differentiable:
-        _check_derivative(name, function, arguments, value)
+        check_derivative(name, lambda *batches: called(name, function, batches), arguments)
 
 
 def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
@@ -153,48 +152,5 @@ def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: S
             )
 
 
-def _check_derivative(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
-    """Hold autograd against central differences, wherever these agree with those of half the step: at no kink."""
-    generator = torch.Generator().manual_seed(0)
-    weight = torch.randn(value.shape, generator=generator, dtype=value.dtype)
-    leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
-    with torch.enable_grad():
-        total = (weight * called(name, function, leaves)).sum()
-        slopes = (
-            torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-            if total.requires_grad
-            else [torch.zeros_like(leaf) for leaf in leaves]
-        )
-
-    def along(directions: Sequence[Tensor], step: float) -> Tensor:
-        sides = [[a + s * step * d for a, d in zip(arguments, directions, strict=True)] for s in (1, -1)]
-        with torch.no_grad():
-            ahead, behind = (weight * function(*side) for side in sides)
-        return (ahead - behind).reshape(len(value), -1).sum(1) / (2 * step)
-
-    rounding = 1e-13 / STEP * float((weight * value).abs().max())
-    for _ in range(DIRECTIONS):
-        directions = [
-            torch.randn(a.shape, generator=generator, dtype=a.dtype) * a.std(0).clamp_min(1e-3) for a in arguments
-        ]
-        parts = [(s * d).reshape(len(value), -1).sum(1) for s, d in zip(slopes, directions, strict=True)]
-        slope = torch.stack(parts).sum(0)
-        wide, narrow = along(directions, STEP), along(directions, STEP / 2)
-        tolerance = 1e-4 * torch.maximum(wide.abs(), slope.abs()) + rounding
-        wrong = torch.nonzero(((wide - narrow).abs() <= tolerance) & ~((slope - wide).abs() <= 3 * tolerance)).flatten()
-        if len(wrong):
-            i = int(wrong[0])
-            raise UsageError(
-                f"Expected {name} with autograd's derivative as its own, got a slope of {float(slope[i]):.4g} where "
-                f"differences have {float(wide[i]):.4g}, at {_at(arguments, i)}; stay in torch: no NumPy, detach or "
-                "float(x), and lyapnet.Table for a table."
-            )
-
-
 def _first_bad(result: Tensor) -> float:
     return float(result[~result.isfinite()][0])
-
-
-def _at(arguments: Sequence[Tensor], i: int) -> str:
-    shown = ["(" + ", ".join(f"{v:.6g}" for v in a[i].detach().flatten().tolist()) + ")" for a in arguments]
-    return f"x = {shown[-1]}" if len(shown) == 1 else f"(t, x) = ({', '.join(shown)})"

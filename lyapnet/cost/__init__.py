@@ -1,7 +1,7 @@
 """What a problem charges: a running cost and a terminal cost."""
 
 from lyapnet.cost.base import Cost
-from lyapnet.cost.goal import reason_for_no_goal
+from lyapnet.cost.goal import reason_for_no_goal, spread
 from lyapnet.cost.made_of_another import (
     MadeOfAnother,
     ObstacleCost,
@@ -32,4 +32,5 @@ __all__ = [
     "is_quadratic",
     "is_quadratic_about_target",
     "reason_for_no_goal",
+    "spread",
 ]

@@ -1,11 +1,13 @@
 """Whether a cost has a goal: a state at which q and φ vanish, with their slopes, and below which neither goes."""
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.cost.base import Cost
-from lyapnet.types import State
+from lyapnet.types import PerState, State
 
+THIN = 1e-3  # of the mean size of costs, which their spread counts for at the least: X₀ may be a point
 VANISHING = 1e-3  # of what q and φ are in the mean, below which they vanish
 
 
@@ -37,6 +39,15 @@ def reason_for_no_goal(cost: Cost, goal: State, x: State) -> str:
         if float(values[lowest]) < least:
             return f"{symbol} is negative, {float(values[lowest]):.3g}, at x = {_listed(x[lowest])}"
     return ""
+
+
+def spread(cost: PerState) -> Float[Tensor, ""]:
+    """The standard deviation of some costs, THIN of their mean size at the least.
+
+    Without a goal costs may be of any sign, and small as a whole where their differences are not: this is what
+    differences are held against.
+    """
+    return cost.std(correction=0).maximum(THIN * cost.abs().mean())
 
 
 def _listed(values: Tensor) -> str:

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lyapnet.programs.terms import spread
+from lyapnet.cost import spread
 
 
 def mean_optimum(optima: Tensor) -> float | None:

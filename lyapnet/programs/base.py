@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from lyapnet.cost import spread
 from lyapnet.errors import DivergenceError
-from lyapnet.programs.terms import spread
 from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath

@@ -4,13 +4,12 @@
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from lyapnet.types import PerState, StepPath, ValuePath
 
 FALL, ROUGHLY = 0.5, 1e-6  # what V has to fall by, of a step's cost, and what a step may miss of that, of V(0, x₀)
-THIN = 1e-3  # of the mean size of costs, which their spread counts for at the least: X₀ may be a point
 LEAST = 0.05  # of a typical cost, against which an error counts where the cost itself is less
 
 
@@ -55,13 +54,6 @@ def terminal_hinge(values: ValuePath, terminal_cost: PerState) -> PerState:
 def promised(value: PerState, cost: PerState) -> PerState:
     """V(0, x₀), LEAST of the median cost at the least: what the cost of a closed loop is held against."""
     return value.maximum(LEAST * cost.median())
-
-
-def spread(cost: PerState) -> Float[Tensor, ""]:
-    """The standard deviation of some costs, THIN of their mean size at the least: where a task has no goal, and costs
-    may be of any sign, this is what they are held against.
-    """
-    return cost.std(correction=0).maximum(THIN * cost.abs().mean())
 
 
 def satisfied(summed_hinge: PerState, value: PerState, tolerance: float) -> Bool[Tensor, "*batch"]:

@@ -65,7 +65,7 @@ def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, 
     spread = SPREAD * ((expansion.x - centre) ** 2).mean((0, 1)).sqrt()
     size = expansion.hessian.abs().amax((0, -2, -1))
     curvature = _curvature(network, expansion.hessian[:, size <= size.median()].mean(1))
-    cost, like = typical(sizes(optimum.path.cost)) or 1.0, network.scale
+    cost, like = typical(sizes(problem, optimum.path.cost)) or 1.0, network.scale
     t = problem.horizon.times(expansion.x)
     network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
 

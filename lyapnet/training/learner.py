@@ -8,12 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.cost import PenaltyCost
+from lyapnet.cost import PenaltyCost, spread
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
-from lyapnet.programs.terms import spread
 from lyapnet.random_streams import POINTS, VALIDATION, stream
 from lyapnet.rollout import Rollout, Trajectory
 from lyapnet.types import PerState

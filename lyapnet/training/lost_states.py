@@ -5,8 +5,9 @@ from typing import Any, cast
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
+from lyapnet.cost import spread
 from lyapnet.errors import DivergenceError
-from lyapnet.programs.terms import promised, spread
+from lyapnet.programs.terms import promised
 from lyapnet.rollout import Trajectory
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner

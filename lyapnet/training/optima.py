@@ -49,7 +49,7 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
     few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
     if not expansions:
-        laws += waves(exact, float(sizes(path_under(exact, laws[0], few).cost).median()), WAVES)
+        laws += waves(exact, float(sizes(exact, path_under(exact, laws[0], few).cost).median()), WAVES)
     progress = partial(report, f"optima from {len(few)} states of X₀")
     progress(0, len(few))
     u = cheapest([path_under(exact, law, few) for law in laws]).u
@@ -104,7 +104,7 @@ def _by_oracle(problem: Problem, optimum: Optimum, x0: State, report: Report) ->
     if found.u is None:
         return optimum
     better = torch.nonzero(
-        found.cost < optimum.path.cost[: len(x0)] - (1 - BETTER) * sizes(optimum.path.cost)[: len(x0)]
+        found.cost < optimum.path.cost[: len(x0)] - (1 - BETTER) * sizes(problem, optimum.path.cost)[: len(x0)]
     ).flatten()
     if not len(better):
         return optimum
@@ -118,7 +118,9 @@ def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
         report("optima of neighbours", k, ROUNDS)
         paths = [_along(exact, optimum, column, x0) for column in nearest(x0, x0, itself=False).unbind(1)]
         best = cheapest(paths)
-        improved = torch.nonzero(best.cost < optimum.path.cost - (1 - BETTER) * sizes(optimum.path.cost)).flatten()
+        improved = torch.nonzero(
+            best.cost < optimum.path.cost - (1 - BETTER) * sizes(exact, optimum.path.cost)
+        ).flatten()
         if not len(improved):
             break
         optimum = _with(optimum, improved, optimal_trajectories(exact, x0[improved], best.u[:, improved]))

@@ -103,7 +103,7 @@ def _costs_of(problem: Problem, optimum: Optimum) -> Tensor:
     It is the cost of the trajectory, or the median of all if that is more. A stationary V is to be right in relation to
     what it is at that state, near the goal too, but for LEAST of the same.
     """
-    size = sizes(optimum.path.cost)
+    size = sizes(problem, optimum.path.cost)
     costs = size.clamp_min(typical(size)).expand(len(optimum.path.u), -1)
     return optimum.expansion.value[:-1].maximum(LEAST * costs) if problem.horizon.stationary else costs
 
@@ -186,7 +186,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
-    enough = float((optimum.path.cost + (GOOD - 1) * sizes(optimum.path.cost)).mean())
+    enough = float((optimum.path.cost + (GOOD - 1) * sizes(learner.problem, optimum.path.cost)).mean())
     for k in range(ROUNDS + 1):
         again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again}")

@@ -114,8 +114,8 @@ class TrainingProgress(ProgressBar):
 
 def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
     """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
-    values = [summary.get(key) for summary in summaries]
-    if None in values:
+    values = [summary[key] for summary in summaries if summary.get(key) is not None]
+    if len(values) < len(summaries):
         return ""
     mean, low, high = (format(value, form) for value in (fmean(values), min(values), max(values)))
     return mean if len(values) == 1 else f"{mean} ({low} – {high})"

@@ -8,14 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from rich.console import Console
 
 from lyapnet.checkpoint import read_checkpoint
+from lyapnet.contracts import TO_WRITE, without_slope
+from lyapnet.cost import spread
 from lyapnet.errors import DivergenceError
 from lyapnet.expansions import in_float64
 from lyapnet.policy import HJBPolicy
-from lyapnet.programs.terms import spread
 from lyapnet.training.curves import members_of
 from lyapnet.training.facts import stiffness
 from lyapnet.training.learner import Learner
@@ -26,6 +28,7 @@ from lyapnet.training.start import Start
 RETURNS = 4  # at the most
 SLOWER = 3.0  # by which each divides the learning rate
 RISE = 2.0  # times the least cost so far of most validation states, from which on a run is taken for lost
+TRIED = 32  # states of X₀ whose closed loops are searched for slopes that are not finite
 MOST = 0.9  # of the validation states, the cheapest: a few are lost where V has a kink, with no need to turn back
 
 
@@ -88,11 +91,13 @@ class Returns:
         """The plan from the last checkpoint on, more slowly.
 
         Raises:
-            DivergenceError: there were too many returns.
+            DivergenceError: there were too many returns, or no step was taken, so that the rate is no matter.
         """
         if self.count == RETURNS or trainer.world_size > 1:
             raise DivergenceError(f"{error}{self._diagnosis()}") from error
         plan, module = self.plan, self.plan.module
+        if not self.count and trainer.global_step == 0:
+            raise DivergenceError(f"{str(error).partition(';')[0]}; {self._before_any_step()}") from error
         if _written(plan.run.last) != self.found:
             plan = replace(plan, resume_from=plan.run.last, step=int(read_checkpoint(plan.run.last)["global_step"]))
         elif plan.resume_from is None:
@@ -111,21 +116,54 @@ class Returns:
             take_back_after(run, plan.step if plan.resume_from else None)
         return plan
 
+    def _before_any_step(self) -> str:
+        """What is known of a divergence that no learning rate caused."""
+        member: Learner = self.plan.module.members[0]
+        tried = "no step was taken yet, so that no learning rate mends it"
+        if (slope := infinite_slope(member)) is not None:
+            return f"{tried}: {slope}; {TO_WRITE}."
+        otherwise = " Look at f, g and the cost where closed loops lead, or choose a smaller Δt or X₀."
+        return f"{tried}.{self._cause() or otherwise}"
+
     def _diagnosis(self) -> str:
         """Why going back has not helped, where that is known."""
-        member: Learner = self.plan.module.members[0]
         if not self.count:  # several processes
             return ""
         share = f"{self.plan.module.rate_share:.2g}"
-        tried = f" {self.count} returns did not help, the last with {share} of the learning rate."
+        return f" {self.count} returns did not help, the last with {share} of the learning rate.{self._cause()}"
+
+    def _cause(self) -> str:
+        """What is wrong with the law or with the start, in a sentence; empty where nothing is known to be."""
+        member: Learner = self.plan.module.members[0]
         if isinstance(member.rollout.closed_loop.policy, HJBPolicy):
             stiff = stiffness(in_float64(member.problem))
             if stiff.advice:
-                return f"{tried} The law is too stiff: {stiff.found}; take {stiff.advice}."
+                return f" The law is too stiff: {stiff.found}; take {stiff.advice}."
         if self.start is not None and self.start.chosen.finite < 1:
             known = f"{self.start.chosen.finite:.0%}"
-            return f"{tried} The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."
-        return tried
+            return f" The start is finite on {known} of X₀ alone: choose a smaller X₀, or a shorter horizon."
+        return ""
+
+
+def infinite_slope(member: Learner) -> str | None:
+    """Which of f, g, q and φ has a slope that is not finite along closed loops from X₀, and where; None: none has."""
+    problem, names = in_float64(member.problem), member.problem.system.state_names
+    try:
+        with torch.no_grad():
+            x0 = member.problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0))
+            x = member.rollout(x0).x.to(problem.goal).flatten(0, -2)
+    except DivergenceError:
+        return None
+    parts = type(problem.system).__name__, type(problem.cost).__name__
+    for name, function in (
+        (f"{parts[0]}.f(x)", problem.system.f), (f"{parts[0]}.g(x)", problem.system.g),
+        (f"q(x) of {parts[1]}", problem.cost.state), (f"φ(x) of {parts[1]}", problem.cost.terminal),
+    ):  # fmt: skip
+        if (found := without_slope(function, [x])) is not None:
+            i, slope, _, component = found
+            where = ", ".join(f"{value:.6g}" for value in x[i].tolist())
+            return f"the slope of {name} by {names[component]} is {slope} at x = ({where}), where a closed loop leads"
+    return None
 
 
 def _written(path: Path) -> int | None:

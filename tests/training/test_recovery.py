@@ -12,6 +12,7 @@ from lyapnet.checkpoint import read_checkpoint
 from lyapnet.config import config_from_plain
 from lyapnet.errors import DivergenceError
 from lyapnet.files import read_json
+from lyapnet.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
@@ -144,3 +145,34 @@ def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
     assert again.folder == run.folder
     assert math.isclose(read_checkpoint(run.last)["lyapnet"]["rate_share"], 1 / SLOWER)
     assert len(read_json(run.folder / "run.json", "")["returns"]) == 1
+
+
+def test_before_the_first_step_no_rate_is_to_blame(config, capsys, monkeypatch):
+    Breaks(monkeypatch, range(1, 100))
+    with pytest.raises(DivergenceError, match=r"got nan.*no learning rate mends it\. Look at f") as error:
+        run_of(config, capsys)
+    assert "Going back" not in capsys.readouterr().out
+    assert "lower training.learning_rate" not in str(error.value)
+
+
+class Rough(ControlAffineSystem):
+    """ẋ = √max(x, 0) − 1 + u, whose guard leaves a slope that is not a number below 0, where closed loops lead."""
+
+    state_names, state_units = ("speed",), ("m/s",)
+    control_names, control_units = ("force",), ("N",)
+
+    def f(self, x):
+        return torch.where(x > 0, torch.sqrt(x), 0.0) - 1
+
+    def g(self, x):
+        return torch.ones_like(x)[..., None]
+
+
+def test_a_slope_that_is_not_finite_is_named(config, capsys):
+    config["system"] = {"name": f"{__name__}:Rough"}
+    config["cost"] = {"Q": [1], "R": [1], "Q_T": [1]}
+    config["initial_states"] = {"lower": [0.1], "upper": [0.3]}
+    config["rollout"] = {**config["rollout"], "gradient": "backprop"}
+    with pytest.raises(DivergenceError, match=r"slope of Rough\.f\(x\) by speed is nan at x = .*lyapnet\.norm"):
+        run_of(config, capsys)
+    assert "Going back" not in capsys.readouterr().out

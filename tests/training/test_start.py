@@ -228,17 +228,15 @@ class Rooted(ControlAffineSystem):
         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
 
 
-@pytest.mark.parametrize("lower", [[1.0, 0.0], [-2.0, -1.0]])
-def test_optima_are_sought_where_there_is_no_expansion(lower):
-    """Between (1, 0) and (2, 0), where all begin at rest, and around the goal, where the centre says nothing."""
-    task = {**LINEAR, "system": {"name": "mine:Rooted"}, "initial_states": {"lower": lower, "upper": [2, -lower[1]]}}
+def test_optima_are_sought_where_there_is_no_expansion():
+    """Around a goal at which f has no slope, where the centre of X₀ says nothing."""
+    task = {**LINEAR, "system": {"name": "mine:Rooted"}, "initial_states": {"lower": [-2, -1], "upper": [2, 1]}}
     module = build_module(config_from_plain(task), Parts(system=Rooted()))
     start = choose_start(list(module.members))
     names = [candidate.name for candidate in start.candidates if candidate.missing is None]
     assert start.chosen.name == "12 optima from states of X₀"
-    assert ("the optimum from the centre of X₀" in names) == (lower[1] == 0)
+    assert "the optimum from the centre of X₀" not in names
     assert "no Riccati solution at the goal: f + gu* has no finite slope" in str(start)
-    assert ("derivatives that do not exist at 12 of 612 nodes" in str(start)) == (lower[1] == 0)
     x = module.members[0].problem.initial_states.sample(64)
     smooth = drag_without_root(module.members[0].problem)
     guess = torch.zeros(50, 64, 1)

@@ -2,9 +2,10 @@
 
 from lyapnet.contracts.derivatives import TO_WRITE, without_slope
 from lyapnet.contracts.functions import called, check_function, copied, initialised, remedy
+from lyapnet.contracts.jumps import SLOPE, Jump, jumps
 from lyapnet.contracts.memory import Memory, check_memory, differences, reaches_own_code, state_of
 
 __all__ = [
-    "TO_WRITE", "Memory", "called", "check_function", "check_memory", "copied", "differences",
-    "initialised", "reaches_own_code", "remedy", "state_of", "without_slope",
+    "SLOPE", "TO_WRITE", "Jump", "Memory", "called", "check_function", "check_memory", "copied", "differences",
+    "initialised", "jumps", "reaches_own_code", "remedy", "state_of", "without_slope",
 ]  # fmt: skip

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.build.classes import float64_defaults
+from lyapnet.contracts import SLOPE, jumps
 from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import in_float64
 from lyapnet.horizon import TABLEAUX
@@ -52,7 +53,7 @@ def facts_of(
 
     with float64_defaults():  # as the problem is built, so that f computes with the same constants
         exact = in_float64(problem)
-        tell(_task(exact))
+        tell(_task(exact), *jump_facts(exact))
         around = linearised(exact)
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
@@ -76,6 +77,26 @@ def facts_of(
         return facts
     tell(*_chosen(start))
     return facts
+
+
+def jump_facts(problem: Problem) -> list[Fact]:
+    """Where f, g and the cost jump, on X₀ and beside it as far as the goal; optima take them as smooth."""
+    problem, box = in_float64(problem), problem.initial_states
+    cost = problem.cost.cost if isinstance(problem.cost, PenaltyCost) else problem.cost
+    low, high = (end(getattr(box, side).double(), problem.goal) for side, end in
+                 (("lower", torch.minimum), ("upper", torch.maximum)))  # fmt: skip
+    width, size = high - low, torch.maximum(low.abs(), high.abs())
+    room = width.where(width > 0, size.where(size > 0, 1.0)) / 2
+    system, written = type(problem.system).__name__, type(cost).__name__
+    with float64_defaults():
+        return [
+            Fact("jumps", jump.told(name, problem.system.state_names), SLOPE)
+            for name, function in (
+                (f"{system}.f(x)", problem.system.f), (f"{system}.g(x)", problem.system.g),
+                (f"q(x) of {written}", cost.state), (f"φ(x) of {written}", cost.terminal),
+            )
+            for jump in jumps(function, low - room, high + room)
+        ]  # fmt: skip
 
 
 def _chosen(start: Start | None) -> Iterator[Fact]:

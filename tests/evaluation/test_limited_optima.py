@@ -11,7 +11,7 @@ from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.oracles.multistart import Candidate
 from lyapnet.expansions import optimal_trajectories
-from lyapnet.sets import ControlBox
+from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import Linear
 from tests.problems import problem_of
 
@@ -26,7 +26,7 @@ def limited(cost=1.0, unit=1.0):
     return problem_of(system, QuadraticCost(weight, [[cost * unit**2]], weight), 60, 0.05, controls=controls)
 
 
-@pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e-4, 1.0), (1e4, 1.0), (1.0, 1e4)])
+@pytest.mark.parametrize(("cost", "unit"), [(1.0, 1.0), (1e-4, 1.0), (1e12, 1.0), (1.0, 1e4), (1.0, 1e-6)])
 def test_units_do_not_matter(cost, unit):
     problem = limited(cost, unit)
     x0 = problem.initial_states.sample(3, torch.Generator().manual_seed(0))
@@ -38,6 +38,36 @@ def test_units_do_not_matter(cost, unit):
     )
     assert problem.controls.contains(optima.u).all()
     assert (expected.u.abs() == problem.controls.upper).any()
+
+
+def test_units_of_states_do_not_matter():
+    """Metres, and 10⁻⁴ and 10⁴ of them: the same optima, from the same lines."""
+    costs = []
+    for position, speed in ((1.0, 1.0), (1e4, 1e-4), (1e-4, 1e4)):
+        weight = torch.diag(torch.tensor([10 / position**2, 0.1 / speed**2]))
+        system = Linear([[0.0, position / speed], [0.0, 0.0]], [[0.0], [speed]])
+        cost, controls = QuadraticCost(weight, [[1.0]], weight), ControlBox(-0.5, 0.5)
+        problem = problem_of(system, cost, 60, 0.05, Box([-position, -speed], [position, speed]), controls)
+        costs.append(oracle_of(problem).solve(torch.tensor([[position, speed], [-position, 0.3 * speed]])).cost)
+    assert_close(costs[1], costs[0], rtol=1e-8, atol=0)
+    assert_close(costs[2], costs[0], rtol=1e-8, atol=0)
+
+
+class Dragged(Linear):
+    """A double integrator with drag √(v²) v, of which no slope exists at rest."""
+
+    def __init__(self):
+        super().__init__([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+
+    def f(self, x):
+        return super().f(x) - torch.tensor([0.0, 0.3]) * x[..., 1:].square().sqrt() * x[..., 1:]
+
+
+def test_slopes_need_not_exist_where_a_path_begins():
+    problem = limited().replaced(system=Dragged())
+    x0 = torch.tensor([[1.0, 0.0], [0.7, 0.0]])
+    optima = oracle_of(problem).solve(x0)
+    assert_close(optima.cost, optimal_trajectories(problem, x0, torch.zeros(60, 2, 1)).path.cost, rtol=1e-6, atol=0)
 
 
 def test_a_bent_path_is_a_start_too():

@@ -196,6 +196,25 @@ def test_minima_spread_to_the_states_around():
     assert [candidate.cost for candidate in search.best] == [1.0] * 20
 
 
+@pytest.mark.parametrize("solvable", [None, 3])
+def test_the_first_failures_in_a_row_spare_the_others(solvable):
+    tried = []
+
+    def minimise(x0, start):
+        tried.append(int(x0[0]))
+        return Candidate(start.x, start.u, 1.0) if x0[0] == solvable else "none"
+
+    search = MultiStart(np.arange(20.0)[:, None], [None] * 20, minimise)
+    start = Candidate(np.zeros((1, 1)), np.zeros((1, 1)), math.inf)
+    search.run({i: [start] for i in range(20)}, lambda done, total: None)
+    if solvable is None:
+        assert tried == list(range(8))
+        assert search.reasons[7] == "none"
+        assert "none, from 8 states in a row" in search.reasons[19]
+    else:
+        assert set(tried) == set(range(20)), "one that is found, and all are tried"
+
+
 # The cache
 
 

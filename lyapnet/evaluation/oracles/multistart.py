@@ -1,5 +1,6 @@
 """Local minima of one problem for each initial state, each from several starts and from its neighbours' ends."""
 
+import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -8,6 +9,8 @@ import numpy as np
 
 from lyapnet.evaluation.oracles.base import Report
 
+HOPELESS = 8  # failures from the first states on, after which there is nothing to be expected for the others
+SECONDS = 15.0  # of the starts of one state, after which no further one is made
 NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
 SAME = 1e-6  # relative difference of two costs that are the same
 
@@ -50,10 +53,19 @@ class MultiStart:
 
     def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
         """Try the starts of some states, given by their indices, then what that found from the states around."""
+        failures, last = 0, ""  # in a row, from the first state on; the reason of the last one
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
+            if failures == HOPELESS:
+                self.reasons[i] = self.reasons[i] or f"{last}, from {HOPELESS} states in a row; this one was not tried"
+                continue
+            began = time.monotonic()
             for start in own:
                 self._try(i, start)
+                if time.monotonic() - began > SECONDS:
+                    break
+            failures = failures + 1 if self.best[i] is None and failures == done else -1
+            last = self.reasons[i]
         nearest = [self._nearest(i) for i in range(len(self.x0))]
         followers = defaultdict(list)
         for i, neighbours in enumerate(nearest):

@@ -4,7 +4,7 @@ Ground truth for tests and tables, never used in training. The model is the torc
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from io import StringIO
 
@@ -19,11 +19,17 @@ from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
-from lyapnet.expansions import riccati
+from lyapnet.evaluation.oracles.scales import Scales
 from lyapnet.problem import Problem
 from lyapnet.types import ControlPath, PerState, State, StatePath
 
+CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+ACCEPTABLE = 1e-7  # tolerances in units of the scales, at which IPOPT may end after five iterations that gain nothing
 VIOLATED = 1e-6  # h that is still taken for zero
+ASIDE = 1e-3  # of the extents: how far from the goal straight lines end, where slopes may not exist
+BESIDE = 1e-8  # of the extents: how far from x₀ a path may begin, for a cost that is the same
+INVALID = "IPOPT: Invalid_Number_Detected"
+SECONDS = 10.0  # of one start
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
 
 
@@ -31,10 +37,13 @@ class Transcription(Oracle):
     """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu)
     and h(x_n) ≤ 0 for n ≥ 1; by another Runge-Kutta method, of the cost and along the steps that it makes with u held.
 
+    States, controls, steps and J are in units of the extents of tried paths, which are parameters of the program.
+
     The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
-    the goal, random curves, the controls that the caller knows, and the optima of its neighbours in the batch. The
-    least cost counts, as a rollout of its controls in torch has it, and is kept on disk. What no start leads to, or
-    the rollout does not confirm, is NaN. Controls that violate a constraint are none to compare with.
+    close by the goal, random curves, the controls that the caller knows, a tried path where none of these leads to a
+    minimum, and the optima of its neighbours in the batch. The least cost counts, as a rollout of its controls in torch
+    has it, and is kept on disk. What no start leads to, or the rollout does not confirm, is NaN, and once the first few
+    states have none, the others are not tried. Controls that violate a constraint are none to compare with.
 
     Args:
         problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
@@ -57,11 +66,11 @@ class Transcription(Oracle):
         limits = self.problem.controls.limits
         bounded = self.problem.controls.limited or self.task.inside is not None
         self._solver = _solver(self.task, horizon.steps, iterations, bounded)
-        self._riccati = riccati(self.problem) if bounded else None
+        self._scales = Scales(self.problem)
         assert limits is not None  # oracle_of asks before
-        free = np.full(system.n * horizon.steps, np.inf)
+        free, extents = np.full(system.n * horizon.steps, np.inf), self._scales.of_controls
         self._bounds = [
-            np.concatenate([np.tile(side.expand(system.m).numpy(), horizon.steps), sign * free])
+            np.concatenate([np.tile(side.expand(system.m).numpy() / extents, horizon.steps), sign * free])
             for side, sign in zip(limits, (-1, 1), strict=True)
         ]
         # the defects of the steps vanish, and h ≤ 0
@@ -87,7 +96,8 @@ class Transcription(Oracle):
         search = MultiStart(states.numpy(), stored, self.minimise)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
-            self._search(search, dict(zip(pending, self._starts(states, pending, given), strict=True)), progress)
+            starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
+            self._search(search, starts, progress)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
@@ -112,12 +122,13 @@ class Transcription(Oracle):
         return candidates
 
     def _starts(
-        self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None]
-    ) -> Iterator[list[Candidate]]:
+        self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None], search: MultiStart
+    ) -> Iterator[Iterator[Candidate]]:
         """For each pending state: what the caller knows, and the line to the goal with the control that costs nothing.
 
         A few states, evenly spread over the batch, try random curves around that line too; a better minimum that these
-        find reaches the others from neighbour to neighbour.
+        find reaches the others from neighbour to neighbour. Where nothing has led to a minimum, the path that was tried
+        is the last one.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()
@@ -125,17 +136,19 @@ class Transcription(Oracle):
         waves = np.stack([np.sin(k * np.pi * s) / k for k in (1, 2, 3)])  # smooth, and zero at both ends
         extent = states.abs().amax(0).numpy()
         scale = np.where(extent > 0, extent, 1.0)
+        tried, aside = self._scales.paths(states), ASIDE * self._scales.of_states * s
         curves = math.ceil(BENT * BENDS / min(BENT, len(pending)))
         bent = {len(pending) * k // BENT for k in range(BENT)}
         for k, i in enumerate(pending):
-            line = goal + (1 - s) * (states[i].numpy() - goal)
+            line = goal + (1 - s) * (states[i].numpy() - goal) + aside
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
             paths = (line, *(line + bends)) if k in bent else (line,)
             cold = [Candidate(x, rest, math.inf) for x in paths]
             known = given[i]
-            yield cold if known is None else [known, *cold]
+            path = Candidate(tried.x[1:, i].numpy(), tried.u[:, i].numpy(), math.inf)
+            yield _until(search, i, cold if known is None else [known, *cold], path)
 
-    def _search(self, search: MultiStart, starts: Mapping[int, list[Candidate]], progress: Report) -> None:
+    def _search(self, search: MultiStart, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
         """Run a search; Ctrl-C and SIGTERM end it."""
         self._stopped = False
         with signals_taken(self._stop):
@@ -152,27 +165,28 @@ class Transcription(Oracle):
 
     def minimise(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
         """The local minimum that IPOPT finds from a start, or its reason for none."""
+        found = self._minimum(x0, start)
+        if found == INVALID:  # where slopes do not exist at x₀ itself, as those of |v| at rest
+            found = self._minimum(x0 + BESIDE * self._scales.of_states, start)
+        return found
+
+    def _minimum(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
         lower, upper = self._bounds
-        guess = np.concatenate([start.u.ravel(), start.x.ravel()])
-        scale = self._scale(torch.from_numpy(x0))
+        of_x, of_u, scale = self._scales.of_states, self._scales.of_controls, self._scales.of_cost(x0)
+        guess = np.concatenate([(start.u / of_u).ravel(), (start.x / of_x).ravel()])
+        given = np.concatenate([x0, [scale], of_x, of_u])
         least, greatest = self._held
         with redirect_stderr(StringIO()):  # CasADi warns of what ends it; it goes on as a reason, or as what was raised
-            result = self._solver(x0=guess, p=np.append(x0, scale), lbx=lower, ubx=upper, lbg=least, ubg=greatest)
+            result = self._solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
         status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()
-        if status != "Solve_Succeeded":
+        if status not in CONVERGED:
             return f"IPOPT: {status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
-        u = self.problem.controls.project(torch.from_numpy(u.reshape(start.u.shape))).numpy()  # which IPOPT may pass
-        return Candidate(x.reshape(start.x.shape), u, scale * float(result["f"]))
-
-    def _scale(self, x0: State) -> float:
-        """A cost of about the size of J*, as IPOPT's barrier is absolute; 1 where there is none, or no barrier."""
-        if self._riccati is None:
-            return 1.0
-        cost = float(self._riccati.initially(x0))
-        return cost if 0 < cost < math.inf else 1.0
+        u = of_u * u.reshape(start.u.shape)
+        u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # which IPOPT may pass
+        return Candidate(of_x * x.reshape(start.x.shape), u, scale * float(result["f"]))
 
     def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
         """The costs of the best controls in a rollout, where that confirms them."""
@@ -184,6 +198,13 @@ class Transcription(Oracle):
             if candidate is not None and not reasons[i]:
                 cost[i], u[:, i] = candidate.cost, torch.from_numpy(candidate.u)
         return Optima(cost, reasons, u)
+
+
+def _until(search: MultiStart, i: int, starts: Sequence[Candidate], last: Candidate) -> Iterator[Candidate]:
+    """Some starts of a state, and one more where none of them has led to a minimum."""
+    yield from starts
+    if search.best[i] is None:
+        yield last
 
 
 def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str) -> str:
@@ -201,19 +222,23 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
 def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> casadi.Function:
     """IPOPT for the transcribed task, with exact sparse derivatives.
 
-    Variables are (u, x), parameters x₀ and what J is divided by.
+    Variables are (u, x) in units of their scales, parameters x₀, what J is divided by, and those scales.
     """
     n, m = task.step.size1_in(0), task.step.size1_in(1)
-    x0, x, u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
+    x0, scaled_x, scaled_u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
+    scale, of_x, of_u = casadi.MX.sym("scale"), casadi.MX.sym("of_x", n), casadi.MX.sym("of_u", m)
+    x, u = casadi.diag(of_x) @ scaled_x, casadi.diag(of_u) @ scaled_u
     following, step_cost = task.step.map(steps)(casadi.horzcat(x0, x[:, :-1]), u)
     J = casadi.sum2(step_cost) + task.end(x[:, -1])
-    variables, scale = casadi.veccat(u, x), casadi.MX.sym("scale")
-    zero = casadi.vec(following - x)
+    variables, zero = casadi.veccat(scaled_u, scaled_x), casadi.vec(casadi.diag(1 / of_x) @ (following - x))
     held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
-    problem = {"x": variables, "p": casadi.vertcat(x0, scale), "f": J / scale, "g": held}
+    problem = {"x": variables, "p": casadi.vertcat(x0, scale, of_x, of_u), "f": J / scale, "g": held}
     # within the limits themselves, and with a barrier of which nothing is seen in J
     exact = {"ipopt.bound_relax_factor": 0.0, "ipopt.tol": 1e-10} if limited else {}
+    # where rounding or a kink ends it before: a rollout confirms the cost, or nothing is found
+    enough = {"tol": ACCEPTABLE, "constr_viol_tol": ACCEPTABLE, "compl_inf_tol": ACCEPTABLE, "dual_inf_tol": 1e-4}
+    acceptable = {f"ipopt.acceptable_{name}": value for name, value in enough.items()}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-    # acceptable_iter 0: only what meets the tolerances themselves has converged
-    options = {**quiet, **exact, "ipopt.max_iter": iterations, "ipopt.acceptable_iter": 0}
+    ends = {"ipopt.max_iter": iterations, "ipopt.max_wall_time": SECONDS, "ipopt.acceptable_iter": 5}
+    options = {**quiet, **exact, **acceptable, **ends}
     return casadi.nlpsol("transcription", "ipopt", problem, options)

@@ -1,0 +1,76 @@
+"""Units in which a transcribed task has numbers of about 1: how far tried paths go, and what they cost."""
+
+import math
+
+import numpy as np
+import torch
+
+from lyapnet.expansions import Path, at_rest, cheapest, greedy_law, path_under, riccati, sizes
+from lyapnet.problem import Problem
+from lyapnet.types import State
+
+TRIED = 16  # states of X₀ from which paths are tried
+
+
+class Scales:
+    """The extents of paths from states of X₀: of each state the cheapest under no control, Riccati's, the middle of U.
+
+    Attributes:
+        of_states, of_controls: (n,), (m,); of a component that stays where it is, its size, or 1.
+
+    Args:
+        problem: in float64 on the CPU; U a box.
+    """
+
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self._riccati = riccati(problem)
+        if not all(part.isfinite().all() for part in self._riccati):
+            self._riccati = None
+        x0 = torch.cat(
+            [problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0)), problem.initial_states.ends(TRIED)]
+        )
+        paths = self.paths(x0)
+        some = paths.cost.isfinite()
+        x = paths.x[:, some] if bool(some.any()) else x0[None]
+        box = torch.stack([problem.initial_states.lower, problem.initial_states.upper])
+        self.of_states = _extents(torch.cat([x.flatten(0, 1), box]))
+        self.of_controls = self._of_controls(paths.u[:, some])
+        size = sizes(paths.cost[some])
+        self._of_cost = (float(size.median()) if len(size) else 0.0) or 1.0
+
+    def paths(self, x0: State) -> Path:
+        """The cheapest of the tried paths from each state (b, n)."""
+        low, high = (side.expand(self.problem.system.m) for side in self._limits)
+        middle = ((low + high) / 2).where(low.isfinite() & high.isfinite(), 0.0)
+        laws = [at_rest(self.problem), lambda _, x: middle.expand(*x.shape[:-1], -1)]
+        if self._riccati is not None:
+            laws.append(greedy_law(self.problem, self._riccati))
+        return cheapest([path_under(self.problem, law, x0) for law in laws])
+
+    def of_cost(self, x0: np.ndarray) -> float:
+        """A cost of about the size of J*(x₀), as IPOPT's barrier is absolute."""
+        if self._riccati is not None:
+            cost = float(self._riccati.initially(torch.from_numpy(x0)))
+            if 0 < cost < math.inf:
+                return min(cost, self._of_cost)
+        return self._of_cost
+
+    @property
+    def _limits(self) -> tuple[torch.Tensor, torch.Tensor]:
+        limits = self.problem.controls.limits
+        assert limits is not None
+        return limits
+
+    def _of_controls(self, u: torch.Tensor) -> np.ndarray:
+        """The width of U, or how far tried controls go where it has none."""
+        low, high = (side.expand(self.problem.system.m) for side in self._limits)
+        width = (high - low) / 2
+        tried = torch.from_numpy(_extents(u.flatten(0, 1))) if u.numel() else torch.ones_like(width)
+        return width.where(width.isfinite(), tried).numpy()
+
+
+def _extents(values: torch.Tensor) -> np.ndarray:
+    """How far each column goes, or its size where it stays, or 1 where that is 0."""
+    extent, size = values.amax(0) - values.amin(0), values.abs().amax(0)
+    return extent.where(extent > 1e-9 * size, size.where(size > 0, 1.0)).numpy()

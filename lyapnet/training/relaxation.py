@@ -1,7 +1,10 @@
 """How dear training makes it to come close to what the constraints exclude: found on optima before the first step."""
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
+
+from torch import Tensor
 
 from lyapnet.cost import PenaltyCost
 from lyapnet.expansions import (
@@ -13,6 +16,7 @@ from lyapnet.expansions import (
     in_float64,
     optimal_trajectories,
     path_under,
+    sizes,
 )
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
@@ -20,7 +24,8 @@ from lyapnet.training.stages import Report
 from lyapnet.training.start import expansions_of
 
 STATES = 24  # of X₀, from which optima are sought
-FIRST, FACTOR, WEIGHTS = 1e-2, 10**0.25, 25  # the least weight, in units of the mean cost per second, and further ones
+FIRST, FACTOR, WEIGHTS = 1e-2, 10**0.25, 60  # the least weight, in units of the cost per second, and further ones
+STALLED, MOVED = 8, 1e-2  # weights in a row by which h, in units of the margin, does not move any more
 RESERVE = 0.5  # of the margin, which is left for a law that is not quite the optimum
 
 
@@ -29,17 +34,22 @@ class Relaxation(NamedTuple):
 
     weight: float  # in cost per second
     kept: int  # of the optima, how many stay within the constraints, with the reserve
-    cost_ratio: float  # their mean cost, penalty included, against that of optima without constraints
+    cost_ratio: float | None  # their mean cost, penalty included, against that without constraints; None without a goal
     states: int
+    price: float  # the difference of the two
+    largest: float  # the largest weight that was tried
+    worst: float  # the greatest h of the optima
 
     def __str__(self) -> str:
         said = f"constraints: penalty of {self.weight:.3g}/s at h = 0"
         if self.kept == self.states:
-            ratio = f"{self.cost_ratio:.3g} times the cost without"
-            return f"{said}; optima from {self.states} states keep them, at {ratio}"
+            dearer = f"{self.price:.3g} more than without" if self.cost_ratio is None else ""
+            at = dearer or f"{self.cost_ratio:.3g} times the cost without"
+            return f"{said}; optima from {self.states} states keep them, at {at}"
         return (
-            f"{said}; from {self.states - self.kept} of {self.states} states no path was found that keeps them: look "
-            "at limits, horizon and X₀"
+            f"{said}; from {self.states - self.kept} of {self.states} states no path was found that keeps them with "
+            f"half of the margin left, by penalties up to {self.largest:.3g}/s (greatest h {self.worst:.3g}): look at "
+            "limits, horizon and X₀"
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -49,8 +59,9 @@ class Relaxation(NamedTuple):
 def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     """The weight of a relaxed problem's penalty: the least of a series that keeps optima within h ≤ 0.
 
-    The optima are those without constraints at first, and then follow the weight as it grows. Where none keeps all of
-    them, it is the first of those that keep most.
+    The optima are those without constraints at first, and then follow the weight as it grows, until all of them are
+    kept; or until the penalty is most of what they cost and a hundredfold weight moves none of them any more. Then the
+    weight is the first of those that keep most.
 
     Args:
         problem: as Problem.relaxed gives it.
@@ -62,16 +73,27 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     report("optima without constraints")
     path = _free_optima(exact.replaced(cost=cost.cost, constraints=None), report)
     finite = path.cost[path.cost.isfinite()]
-    free = (float(finite.mean()) if len(finite) else 0.0) or 1.0
-    tried = list[Relaxation]()
+    free = float(finite.mean()) if len(finite) else 0.0
+    unit = (float(sizes(exact, finite).mean()) if len(finite) else 0.0) or 1.0
+    tried, worst = list[Relaxation](), list[Tensor]()
     for k in range(WEIGHTS):
-        cost.weight.fill_(free / problem.horizon.duration * FIRST * FACTOR**k)
-        report("optima with a penalty, dearer each time", k, WEIGHTS)
+        weight = unit / problem.horizon.duration * FIRST * FACTOR**k
+        cost.weight.fill_(weight)
+        report("optima with a penalty, dearer each time", k, 0)
         path = optimal_trajectories(exact, path.x[0], path.u).path
-        tried.append(Relaxation(float(cost.weight), _kept(exact, path), float(path.cost.mean()) / free, STATES))
-        if tried[-1].kept == STATES:
+        worst.append(_worst(exact, path))
+        kept = int((worst[-1] <= -RESERVE * cost.margin).sum())
+        mean = float(path.cost.mean())
+        ratio = mean / free if exact.has_goal and free else None
+        tried.append(Relaxation(weight, kept, ratio, STATES, mean - free, weight, float(worst[-1].max())))
+        if kept == STATES or (mean - free > abs(free) + unit and _is_stalled(worst, cost.margin)):
             break
-    return max(tried, key=lambda each: each.kept)
+    return max(tried, key=lambda each: each.kept)._replace(largest=tried[-1].weight, worst=tried[-1].worst)
+
+
+def _is_stalled(worst: Sequence[Tensor], margin: float) -> bool:
+    """Whether the greatest h of no trajectory has moved much by the last STALLED weights."""
+    return len(worst) > STALLED and bool(((worst[-1 - STALLED] - worst[-1]).abs() <= MOVED * margin).all())
 
 
 def _free_optima(problem: Problem, report: Report) -> Path:
@@ -84,9 +106,7 @@ def _free_optima(problem: Problem, report: Report) -> Path:
     return optimal_trajectories(problem, x0, path.u, progress=progress).path
 
 
-def _kept(problem: Problem, path: Path) -> int:
-    """How many of some trajectories keep the constraints with the reserve, from the first step on."""
-    constraints, cost = problem.constraints, problem.cost
-    assert constraints is not None
-    assert isinstance(cost, PenaltyCost)
-    return int((constraints.worst(path.x[1:]).amax(0) <= -RESERVE * cost.margin).sum())
+def _worst(problem: Problem, path: Path) -> Tensor:
+    """The greatest h of each of some trajectories, from the first step on."""
+    assert problem.constraints is not None
+    return problem.constraints.worst(path.x[1:]).amax(0)

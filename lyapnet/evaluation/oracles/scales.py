@@ -24,8 +24,8 @@ class Scales:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self._riccati = riccati(problem)
-        if not all(part.isfinite().all() for part in self._riccati):
+        self._riccati = riccati(problem) if problem.has_goal else None
+        if self._riccati is not None and not all(part.isfinite().all() for part in self._riccati):
             self._riccati = None
         x0 = torch.cat(
             [problem.initial_states.sample(TRIED, torch.Generator().manual_seed(0)), problem.initial_states.ends(TRIED)]
@@ -36,7 +36,7 @@ class Scales:
         box = torch.stack([problem.initial_states.lower, problem.initial_states.upper])
         self.of_states = _extents(torch.cat([x.flatten(0, 1), box]))
         self.of_controls = self._of_controls(paths.u[:, some])
-        size = sizes(paths.cost[some])
+        size = sizes(problem, paths.cost[some])
         self._of_cost = (float(size.median()) if len(size) else 0.0) or 1.0
 
     def paths(self, x0: State) -> Path:

@@ -186,7 +186,7 @@ class Problem(nn.Module):
         """
         if self.constraints is None:
             return self
-        cost = PenaltyCost(self.cost, self.constraints, self.constraints.margin, weight)
+        cost = PenaltyCost(self.cost, self.constraints, self.constraints.margin, weight, self.horizon.dt)
         return self.replaced(cost=cost.to(self.initial_states.lower))
 
     def check(self) -> None:

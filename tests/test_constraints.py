@@ -118,8 +118,10 @@ def test_the_penalty():
     assert isinstance(cost, PenaltyCost)
     v = torch.tensor([0.0, 0.5 * (1 - 1.01 * m), 0.5 * (1 - m / 2), 0.5, 0.5 * (1 + m), -0.5])
     x = torch.stack([torch.zeros_like(v), v], -1)
-    assert_close(cost.state(x) - cost.cost.state(x), 3.0 * torch.tensor([0, 0, 1 / 8, 1, 8, 1]), atol=1e-9, rtol=1e-9)
-    assert_close(cost.terminal(x), cost.cost.terminal(x))
+    paid = 3.0 * torch.tensor([0, 0, 1 / 8, 1, 8, 1])
+    assert_close(cost.state(x) - cost.cost.state(x), paid, atol=1e-9, rtol=1e-9)
+    end = problem.horizon.dt * paid  # the last state pays for a step
+    assert_close(cost.terminal(x) - cost.cost.terminal(x), end, atol=1e-9, rtol=1e-9)
     assert not problem_of(constrained()).constraints
     assert problem_of(constrained()).relaxed().constraints is None
 

@@ -5,13 +5,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.cost.base import Cost
-from lyapnet.types import PerState, State
+from lyapnet.types import PerState
 
 THIN = 1e-3  # of the mean size of costs, which their spread counts for at the least: X₀ may be a point
 VANISHING = 1e-3  # of what q and φ are in the mean, below which they vanish
 
 
-def reason_for_no_goal(cost: Cost, goal: State, x: State) -> str:
+def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "b n"]) -> str:
     """Why a state is no goal of a cost; empty where it is one.
 
     At a goal q and φ vanish with their slopes, and nowhere are they negative: V is then a distance to it, in units of

@@ -12,7 +12,8 @@ from lyapnet.types import PerState, State
 class PenaltyCost(MadeOfAnother):
     """Another cost, and w Σ_j max(0, 1 + h_j(x)/m)³ per second, for constraints h(x) ≤ 0: w at h = 0, zero from −m on.
 
-    It is twice continuously differentiable, as the value function then is. With w large enough for the task the
+    The last state pays for one step more, for which it would stay. The penalty is twice continuously differentiable, as
+    the value function then is. With w large enough for the task the
     optimum keeps within h ≤ 0, at less cost than if h ≤ −m were asked for.
 
     Args:
@@ -20,22 +21,36 @@ class PenaltyCost(MadeOfAnother):
         constraints: h, x ↦ (*batch, k).
         margin: m, in the unit of h.
         weight: w.
+        step: Δt, in s.
 
     Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalties), with the constraint moved by m.
     """
 
     constraints: nn.Module
     margin: float
+    step: float
     weight: Float[Tensor, ""]  # w, in cost per second
 
-    def __init__(self, cost: Cost, constraints: nn.Module, margin: float, weight: float = 0.0):
+    def __init__(self, cost: Cost, constraints: nn.Module, margin: float, weight: float = 0.0, step: float = 0.0):
         super().__init__(cost)
-        self.constraints, self.margin = constraints, margin
+        self.constraints, self.margin, self.step = constraints, margin, step
         self.register_buffer("weight", torch.tensor(float(weight)), persistent=False)
 
     def state(self, x: State) -> PerState:
+        return self.cost.state(x) + self._penalty(x)
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(x) + self.step * self._penalty(x)
+
+    def _penalty(self, x: State) -> PerState:
         close = torch.relu(1 + self.constraints(x) / self.margin)
-        return self.cost.state(x) + self.weight * (close**3).sum(-1)
+        return self.weight * (close**3).sum(-1)
 
     def ignores(self, i: int, n: int) -> bool:
-        return self.cost.ignores(i, n) and bool(self.constraints.ignores(i, n))  # pyright: ignore[reportCallIssue]
+        return self.cost.ignores(i, n) and self._constraints_ignore(i, n)
+
+    def ignores_at_end(self, i: int, n: int) -> bool:
+        return self.cost.ignores_at_end(i, n) and self._constraints_ignore(i, n)
+
+    def _constraints_ignore(self, i: int, n: int) -> bool:
+        return bool(self.constraints.ignores(i, n))  # pyright: ignore[reportCallIssue]

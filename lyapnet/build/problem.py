@@ -13,6 +13,7 @@ from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
 from lyapnet.build.constraints import ball_of, build_constraints
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
+from lyapnet.build.free_controls import refuse_free_controls
 from lyapnet.build.stationary import without_end
 from lyapnet.build.target import Trim, about_target, trim
 from lyapnet.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
@@ -27,7 +28,7 @@ from lyapnet.cost import (
     QuadraticCost,
     RegulatorTail,
 )
-from lyapnet.errors import UsageError
+from lyapnet.errors import LyapnetError, UsageError
 from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.problem import Problem
 from lyapnet.sets import Box, ControlBox, ControlSet
@@ -57,6 +58,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             method = config.rollout.method
             held = method if method in TABLEAUX else "rk4"  # of an adaptive method
             horizon = Horizon(config.horizon.steps, config.horizon.dt, held, config.horizon.stationary)
+        if cost is None and config.cost.name in COSTS:
+            _refuse_free_controls(config, system, controls, initial_states, horizon)
         with section("cost"):
             cost = build_cost(_weights(config), system) if cost is None else cost.double()
             if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
@@ -70,6 +73,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
+        if not config.family and config.cost.name not in COSTS:
+            refuse_free_controls(problem, problem.cost.R(initial_states.lower[None]))
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
@@ -103,6 +108,23 @@ def _weights(config: Config) -> CostConfig:
     if config.cost.Q_T is not None:
         raise UsageError("Expected no cost.Q_T with horizon.stationary, got one; φ is the regulator's: remove it.")
     return replace(config.cost, Q_T=config.cost.Q)
+
+
+def _refuse_free_controls(
+    config: Config, system: ControlAffineSystem, controls: ControlSet | None, initial_states: Box, horizon: Horizon
+) -> None:
+    """Refuse a quadratic cost whose R has no weight for a control that has limits; other faults are found later."""
+    try:
+        R = torch.as_tensor(_control_weight(config.cost.R, system), dtype=torch.float64)
+        if torch.linalg.eigvalsh(R)[0] > 0:
+            return
+        weighted = build_cost(replace(_weights(config), R=1.0), system)
+        controls = build_controls(config.controls, system) if controls is None else controls.double()
+        cost = about_target(config, weighted, system, controls, initial_states)
+        problem = Problem(system, cost, controls, initial_states, horizon)
+    except (LyapnetError, ValueError, TypeError, RuntimeError):
+        return
+    refuse_free_controls(problem, R)
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:

@@ -181,7 +181,7 @@ class OperatingPoints:
         within = [
             bool((x[i] >= low) & (x[i] <= high)) for i, (low, high) in enumerate(zip(*self.state_limits, strict=True))
         ]
-        return OperatingPoint(x.detach(), u.detach(), rate, bool(self.controls.contains(u)) and all(within))
+        return OperatingPoint(x.detach(), u.detach() + 0.0, rate, bool(self.controls.contains(u)) and all(within))
 
     def _rates(self, x: State, u: Control) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """ẋ and its slopes by x and by u, with ẋ, x and u in their units."""

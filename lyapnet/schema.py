@@ -20,6 +20,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from lyapnet.errors import UsageError, did_you_mean, one_line
 from lyapnet.files import LARGEST_TEXT, read_file
 
+_NUMBER = re.compile(r"\s*[-+]?[\d._]+(e[-+]?\d+)?\s*|.*\$\{.*", re.I)  # in quotes; or an interpolation
+
 
 class Names(Sequence[str]):
     """The names of a registry of lyapnet, which is loaded, with torch, when they are first asked for."""
@@ -177,6 +179,8 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
             _refuse_scalar(
                 key, value, "a number or a list of numbers" if of_floats else "a list", f.metadata.get("doc", "")
             )
+        elif annotation == "dict[str, float]":
+            _refuse_all_but_numbers(key, value, f.metadata.get("doc", ""))
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
             for name, entry in value.items():
                 _refuse_scalar(f"{key}.{name}", entry, "a list", f.metadata.get("doc", ""))
@@ -196,6 +200,15 @@ def _without_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], s
         ):
             found.pop(f.name, None)
     return found
+
+
+def _refuse_all_but_numbers(key: str, value: Any, doc: str) -> None:
+    """Refuse what is no mapping of names to numbers, but for what is missing or an interpolation."""
+    if value is not None and not isinstance(value, Mapping | str):
+        raise UsageError(f"Expected {key} as {{name: number}}, got {value!r}; correct it: {doc}")
+    for name, entry in value.items() if isinstance(value, Mapping) else ():
+        if not (type(entry) in (int, float) or (isinstance(entry, str) and _NUMBER.fullmatch(entry))):
+            raise UsageError(f"Expected {key}.{name} as a number, got {entry!r}; correct it: {doc}")
 
 
 def _refuse_scalar(key: str, value: Any, kind: str, doc: str) -> None:

@@ -152,7 +152,7 @@ def holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
     worst = int(left.abs().argmax())
     if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
         raise _not_held(system, x, f"choose another, or {ELSEWHERE}")
-    return u
+    return u + 0.0  # 0 in the place of −0
 
 
 def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:

@@ -74,7 +74,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
         if not config.family and config.cost.name not in COSTS:
-            refuse_free_controls(problem, problem.cost.R(initial_states.lower[None]))
+            _refuse_free_controls_of_own(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
@@ -125,6 +125,17 @@ def _refuse_free_controls(
     except (LyapnetError, ValueError, TypeError, RuntimeError):
         return
     refuse_free_controls(problem, R)
+
+
+def _refuse_free_controls_of_own(problem: Problem) -> None:
+    """The same for a cost of the user's own; one whose R is no matrix for each state is refused by its check."""
+    m = problem.system.m
+    try:
+        R: Any = problem.cost.R(problem.initial_states.lower[None])
+    except Exception:  # of any kind: the code is the user's
+        return
+    if isinstance(R, Tensor) and R.shape == (1, m, m):
+        refuse_free_controls(problem, R)
 
 
 def build_system(config: SystemConfig) -> ControlAffineSystem:

@@ -50,7 +50,7 @@ class Problem(nn.Module):
         constraints: h; None: there are none.
 
     Raises:
-        ValueError: X₀ has another dimension than the system.
+        ValueError: X₀, or a goal or rest of the cost, has another dimension than the system.
     """
 
     system: ControlAffineSystem
@@ -77,6 +77,13 @@ class Problem(nn.Module):
                 f"Expected initial_states with {system.n} entries ({', '.join(system.state_names)}), got "
                 f"{initial_states.dimension}; give one for each."
             )
+        for name, expected in (("goal", system.n), ("rest", system.m)):
+            given = getattr(cost, name)
+            if given is not None and given.shape != (expected,):
+                raise UsageError(
+                    f"Expected {name} of {type(cost).__name__} of shape ({expected},), got {tuple(given.shape)}; give "
+                    "one number for each."
+                )
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
         self._no_goal = None  # not known yet

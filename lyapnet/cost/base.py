@@ -2,7 +2,8 @@
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -12,12 +13,15 @@ from lyapnet.errors import UsageError
 from lyapnet.linear_algebra import apply, solve
 from lyapnet.types import Control, ControlMatrix, Matrix, PerState, State
 
+BUFFERS = ("goal", "rest", "R_constant", "R_inverse")  # facts of a cost, which may be None
+
 
 class Cost(nn.Module, ABC):
     """ℓ(x, u) = q(x) + uᵀR(x)u in cost per second along the way, and φ(x) at the end.
 
     q and φ are smooth, R(x) is symmetric positive definite. A subclass writes `state`, `R` and `terminal` with torch
-    operations on tensors of any leading shape. About a target, u is counted from what holds it there (TargetCost).
+    operations on tensors of any leading shape. What it knows of `goal` and the other facts below it says in its body,
+    as in `goal = [1.0, 0.0]`, or in `__init__`. About a target, u is counted from what holds it there (TargetCost).
     Where q and φ vanish at a goal and are nowhere negative, V is a distance to it; a profit or a harvest has none.
     """
 
@@ -26,11 +30,25 @@ class Cost(nn.Module, ABC):
     R_constant: Matrix | None  # R and R⁻¹, where they are the same at every state
     R_inverse: Matrix | None
 
+    _declared: ClassVar[Mapping[str, Any]] = {}  # of the buffers below, what a class says of them in its body
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take `goal = torch.tensor(…)` in the body of a class as the value of that buffer, which it would hide."""
+        super().__init_subclass__(**options)
+        values = {name: vars(cls)[name] for name in BUFFERS if name in vars(cls)}
+        values = {name: value for name, value in values.items() if not hasattr(value, "__get__")}  # no property
+        for name in values:
+            delattr(cls, name)
+        cls._declared = {**cls._declared, **values}
+
     # Not persistent, here and in sets and systems: facts of the problem come from its config, never from a checkpoint.
     def __init__(self):
         super().__init__()
-        for name in ("goal", "rest", "R_constant", "R_inverse"):
-            self.register_buffer(name, None, persistent=False)
+        for name in BUFFERS:
+            if not hasattr(type(self), name):  # as a property has it
+                value = self._declared.get(name)
+                as_tensor = None if value is None else torch.as_tensor(value, dtype=torch.get_default_dtype()).clone()
+                self.register_buffer(name, as_tensor, persistent=False)
 
     @abstractmethod
     def state(self, x: State) -> PerState:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lyapnet.cost.base import Cost, quadratic_form
+from lyapnet.cost.base import BUFFERS, Cost, quadratic_form
 from lyapnet.cost.quadratic import is_quadratic
 from lyapnet.linear_algebra import apply
 from lyapnet.types import ControlMatrix, PerState, State
@@ -22,7 +22,7 @@ class MadeOfAnother(Cost):
     def __init__(self, cost: Cost):
         super().__init__()
         self.cost = cost
-        for name in ("goal", "rest", "R_constant", "R_inverse"):
+        for name in BUFFERS:
             self.register_buffer(name, getattr(cost, name), persistent=False)
 
     def state(self, x: State) -> PerState:

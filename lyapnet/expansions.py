@@ -13,6 +13,8 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 "Control-limited differential dynamic programming", ICRA 2014.
 """
 
+import math
+import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -157,6 +159,7 @@ def optimal_trajectories(
     iterations: int = 80,
     rivals: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    seconds: float = math.inf,
 ) -> Optimum:
     """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
 
@@ -169,7 +172,9 @@ def optimal_trajectories(
         rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
             that still cost HOPELESS times as much are left as they are.
         progress: is told how many trajectories are done, of how many, each descent counting for its share.
+        seconds: after which trajectories are left as they are then.
     """
+    until = time.monotonic() + seconds
     problem = in_float64(problem)
     x0, u = x0.double(), problem.controls.project(u.double())
 
@@ -184,10 +189,10 @@ def optimal_trajectories(
 
     if higher_order:
         roughly = problem.in_steps(method="euler")
-        euler = _descended(roughly, under(u, roughly), False, iterations, NEAR, rivals, settled(0))
+        euler = _descended(roughly, under(u, roughly), False, iterations, NEAR, rivals, settled(0), until)
         now = cheapest([now, under(euler.u)])
-    now = _descended(problem, now, False, iterations, NEAR, rivals, settled(kinds - 2))
-    now = _descended(problem, now, True, iterations, SETTLED, rivals, settled(kinds - 1))
+    now = _descended(problem, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
+    now = _descended(problem, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
     backward = _backward(problem, now.x, now.u)
     return Optimum(now, backward.expansion, backward.mended.sum(0))
 
@@ -200,13 +205,14 @@ def _descended(
     enough: float,
     rivals: bool,
     progress: Callable[[int], None],
+    until: float,
 ) -> Path:
     """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
     damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
     for k in range(iterations):
         rows = torch.nonzero(~settled).flatten()
         progress(len(settled) - len(rows))
-        if not len(rows):
+        if not len(rows) or time.monotonic() > until:
             break
         was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])
         tried = _line_search(problem, was, _backward(problem, was.x, was.u, damping[rows], curved))

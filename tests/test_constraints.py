@@ -187,7 +187,7 @@ def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
     monkeypatch.setattr("lyapnet.training.relaxation.STATES", 6)
 
 
@@ -195,7 +195,7 @@ def few_optima(monkeypatch):
 def run(tmp_path_factory):
     content = {**constrained(**SPEED), "logs": str(tmp_path_factory.mktemp("logs"))}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.pretraining.STEPS", (500, 250))
+        patch.setattr("lyapnet.training.pretraining.STEPS", (1000, 500))
         return lyapnet.train(content, [*BRIEF, "rollout.policy=sampled"])  # which is faster as it is written
 
 

@@ -1,6 +1,7 @@
 """Optimal trajectories from many states of X₀, each sought where its neighbours were found."""
 
 import math
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -27,40 +28,48 @@ from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
+SMALL = {1: 48, 2: 192}  # in all, for tasks of one or two states, where they are close to one another so
 WAVES = 6  # random controls from which optima are sought where there is no expansion
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum
+CHUNK = 4  # states at a time that the oracle is asked for
+SECONDS = 30.0  # in which optima are sought, in each of three ways
+FINER, MANY = 0.999, 0.25  # by which share an oracle's are better, and of how many, for it to go on
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
 
 
 def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: Report = silent) -> Optimum:
     """Optimal trajectories from a batch of states.
 
-    The first few are sought: from the controls that expansions ask for, or none if cheaper, or random waves where there
-    is no expansion; and some of them by the oracle, where there is one, whose starts need not be trajectories. The
-    others begin with the laws of the few that are nearest. Which local minimum a start leads to is luck, but the least
-    cost is continuous in x₀: at last, what was found from one state is tried from the states around it.
+    Each search has SECONDS, after which what it has found is taken. The first few are sought: from the controls that
+    expansions ask for, or none if cheaper, or random waves where there is no expansion; and some of them by the oracle,
+    where there is one, whose starts need not be trajectories. The others begin with the laws of the few that are
+    nearest. Which local minimum a start leads to is luck, but the least cost is continuous in x₀: at last, what was
+    found from one state is tried from the states around it.
 
     Args:
         report: is told what is being done.
     """
     exact = in_float64(problem)
-    x0 = x0.double().cpu()[: _affordable(problem)]
+    x0 = x0.double().cpu()[: how_many(problem)]
     few, others = x0[:SOUGHT], x0[SOUGHT:]
     laws = [*(greedy_law(exact, each) for each in expansions), at_rest(exact)]
     if not expansions:
         laws += waves(exact, float(sizes(exact, path_under(exact, laws[0], few).cost).median()), WAVES)
-    progress = partial(report, f"optima from {len(few)} states of X₀")
+    progress = partial(report, f"optima from {len(few)} states of X₀ within {SECONDS:.0f} s")
     progress(0, len(few))
     u = cheapest([path_under(exact, law, few) for law in laws]).u
-    optimum = optimal_trajectories(problem, few, u, progress=progress)
-    optimum = _followed(exact, _by_oracle(problem, optimum, few[:FAR], report), report)
-    if len(others):
-        progress = partial(report, f"optima from {len(others)} further states of X₀")
+    optimum = optimal_trajectories(problem, few, u, progress=progress, seconds=SECONDS)
+    optimum, further = _by_oracle(problem, optimum, few, others, report)
+    optimum = _followed(exact, optimum, report)
+    if further is not None:
+        optimum = _joined(optimum, further)
+    elif len(others):
+        progress = partial(report, f"optima from {len(others)} further states of X₀ within {SECONDS:.0f} s")
         progress(0, len(others))
         columns = nearest(others, few).unbind(1)
         u = cheapest([_along(exact, optimum, column, others) for column in columns]).u
-        optimum = _joined(optimum, optimal_trajectories(problem, others, u, progress=progress))
+        optimum = _joined(optimum, optimal_trajectories(problem, others, u, progress=progress, seconds=SECONDS))
     return _followed(exact, optimum, report)
 
 
@@ -93,22 +102,44 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
     return optimum.member(kept)
 
 
-def _by_oracle(problem: Problem, optimum: Optimum, x0: State, report: Report) -> Optimum:
-    """The first of some optima, exchanged for those of the oracle that cost less."""
+def _by_oracle(
+    problem: Problem, optimum: Optimum, few: Tensor, others: Tensor, report: Report
+) -> tuple[Optimum, Optimum | None]:
+    """Some optima, the first of them exchanged for those of the oracle that cost less, and as long as these are many,
+    the next ones too; and then those of the oracle from other states, of which it is the better guide, else None.
+    """
     oracle = optimal_cost(problem)
     if oracle is None:  # none is installed, or none is for such a problem
-        return optimum
-    progress = partial(report, "optima by the oracle")
-    progress(0, len(x0))
-    found = oracle.solve(x0, progress=progress)
-    if found.u is None:
-        return optimum
-    better = torch.nonzero(
-        found.cost < optimum.path.cost[: len(x0)] - (1 - BETTER) * sizes(problem, optimum.path.cost)[: len(x0)]
-    ).flatten()
-    if not len(better):
-        return optimum
-    return _with(optimum, better, optimal_trajectories(problem, x0[better], found.u[:, better]))
+        return optimum, None
+    progress, began = partial(report, f"optima by the oracle within {SECONDS:.0f} s"), time.monotonic()
+    every, further, gained = torch.cat([few, others]), list[Optimum](), 0
+    for first in range(0, len(every), CHUNK):
+        progress(first, FAR if first < FAR else len(every))
+        rows = torch.arange(first, min(first + CHUNK, len(every)))
+        found = oracle.solve(every[rows])
+        known = found.cost.isfinite()
+        if found.u is None or not bool(known.any()):
+            break
+        if first >= len(few):
+            further.append(optimal_trajectories(problem, every[rows[known]], found.u[:, known]))
+        else:
+            rows = rows[rows < len(few)]
+            cost, size = (part[rows] for part in (optimum.path.cost, sizes(problem, optimum.path.cost)))
+            better = rows[found.cost[: len(rows)] < cost - (1 - FINER) * size]
+            gained += len(better)
+            if len(better):
+                closer = optimal_trajectories(problem, few[better], found.u[:, better - first])
+                optimum = _with(optimum, better, closer)
+        if time.monotonic() - began > SECONDS or (
+            first + CHUNK >= FAR and gained < MANY * min(first + CHUNK, len(few))
+        ):
+            break
+    if not further:
+        return optimum, None
+    whole = further[0]
+    for each in further[1:]:
+        whole = _joined(whole, each)
+    return optimum, whole
 
 
 def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
@@ -161,7 +192,7 @@ def _with(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
     return Optimum(exchanged(optimum.path, rows, others.path), expansion, mended)
 
 
-def _affordable(problem: Problem) -> int:
-    """How many trajectories at a time have second derivatives that fit into memory."""
+def how_many(problem: Problem) -> int:
+    """From how many states optima are sought: as many as V needs, and have second derivatives that fit into memory."""
     n, m = problem.system.n, problem.system.m
-    return max(1, min(OPTIMA, NUMBERS // (problem.horizon.steps * (n + m) ** 2)))
+    return max(1, min(OPTIMA, SMALL.get(problem.system.n, OPTIMA), NUMBERS // (problem.horizon.steps * (n + m) ** 2)))

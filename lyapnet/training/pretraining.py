@@ -2,6 +2,7 @@
 
 import copy
 import math
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -20,6 +21,9 @@ from lyapnet.training.stages import Report, silent
 from lyapnet.types import PerState, State, StatePath
 
 STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
+SECONDS = 60.0, 30.0  # in which those steps are taken, or as many of them as there is time for
+SHARES = {1: 0.25, 2: 0.5}  # of those steps, for V of one or two states
+GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
 ROUNDS, GOOD = 4, 1.02  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
@@ -177,8 +181,8 @@ def relative_misfit(V: ValueFunction, examples: Examples) -> float:
 def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report = silent) -> None:
     """Lower both errors of V at examples from optimal trajectories, and then where its own law leads too.
 
-    The second is repeated, ROUNDS times at most, until the law costs no more than GOOD times the optima. The V whose
-    law cost least stays.
+    The second is repeated, ROUNDS times at most, until the law costs no more than GOOD times the optima, or a further
+    round gains nothing. The V whose law cost least stays.
 
     Args:
         report: is told what is being done.
@@ -186,17 +190,29 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
-    enough = float((optimum.path.cost + (GOOD - 1) * sizes(learner.problem, optimum.path.cost)).mean())
+    share, before = SHARES.get(learner.problem.system.n, 1.0), math.inf
+    size = float(sizes(learner.problem, optimum.path.cost).mean())
+    enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
     for k in range(ROUNDS + 1):
         again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
-        progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again}")
-        _lower(learner.V, examples, rows, STEPS[min(k, 1)], RATE[min(k, 1)], progress)
+        within = f"within {SECONDS[min(k, 1)]:.0f} s"
+        progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
+        _lower(
+            learner.V,
+            examples,
+            rows,
+            max(1, int(share * STEPS[min(k, 1)])),
+            RATE[min(k, 1)],
+            progress,
+            SECONDS[min(k, 1)],
+        )
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == ROUNDS or (k and now[1] <= enough):
+        if k == ROUNDS or (k and (now[1] <= enough or before - now[1] <= gain)):
             break
+        before = now[1]
         examples = examples.with_further(examples_visited(learner.problem, optimum, path))
     learner.V.load_state_dict(best)
 
@@ -208,13 +224,18 @@ def _lower(
     steps: int,
     rate: float,
     progress: Callable[[int, int], None],
+    seconds: float,
 ) -> None:
-    """Lower both errors at the examples, by Adam."""
+    """Lower both errors at the examples, by Adam, whose rate falls as a cosine over the steps, or the seconds."""
     trained = [p for p in V.parameters() if p.requires_grad]
     examples = examples.to(trained[0])
-    optimizer = torch.optim.Adam(trained, rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, rate / 1000)
+    optimizer, began = torch.optim.Adam(trained, rate), time.monotonic()
     for k in range(steps):
+        share = max(k / steps, (time.monotonic() - began) / seconds)
+        if share >= 1:
+            break
+        for group in optimizer.param_groups:
+            group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
         progress(k, steps)
         rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
         value_error, excess = errors(V, examples, rows)
@@ -222,5 +243,4 @@ def _lower(
         (VALUE_WEIGHT * value_error + excess).backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
-        schedule.step()
     optimizer.zero_grad()

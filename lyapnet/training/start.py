@@ -26,7 +26,7 @@ from lyapnet.random_streams import START, stream
 from lyapnet.training.candidates import CALM, Candidate, Start
 from lyapnet.training.initial_networks import kept_of, network_of, take, take_nothing
 from lyapnet.training.learner import Learner
-from lyapnet.training.optima import OPTIMA, minima, optima_for, waves
+from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
 from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, relative_misfit
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import State
@@ -121,8 +121,8 @@ def _fit_to_optima(
     """
     problem, x0, report = learners[0].problem, trials.x0, trials.report
     before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
-    report(f"optima from {OPTIMA} states of X₀")
     states = problem.initial_states.sample(OPTIMA, stream(0, START, 2)).to(x0)
+    report(f"optima from {min(OPTIMA, how_many(problem))} states of X₀")
     try:
         sought = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
@@ -142,7 +142,6 @@ def _fit_to_optima(
         rivals.append(trials.roll_out("the regulator, up to where it is right"))
         if _best(rivals) != base:
             before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
-    report(f"fitting V to {found} optima")
     for learner in learners:
         fit(learner, optimum, examples, report)
     fitted = trials.roll_out(name)

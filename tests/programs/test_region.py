@@ -136,7 +136,7 @@ def test_what_does_not_suit_a_region_is_refused(overrides, message):
 
 def test_training_for_it_makes_the_region_larger(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (100, 50))
+    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (200, 100))
     (learner,) = build_module(config_from_plain(OWN | OSCILLATOR, ["pointwise.points=128"])).members
     choose_start([learner])
     condition, optimizer = learner.pointwise, torch.optim.Adam(learner.V.parameters(), 0.003)

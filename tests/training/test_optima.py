@@ -9,9 +9,9 @@ from torch.testing import assert_close
 
 from lyapnet.evaluation.oracles import Optima
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
-from lyapnet.systems import Linear
+from lyapnet.systems import IntegratorChain, Linear
 from lyapnet.training import optima
-from lyapnet.training.optima import optima_for
+from lyapnet.training.optima import how_many, optima_for
 from tests.problems import problem_of
 from tests.test_expansions import hanging
 
@@ -46,16 +46,21 @@ def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
     assert_close(optimum.expansion.hessian, expected.expansion.hessian, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize(("share", "taken"), [(0.5, [5, 3]), (math.inf, [5])])
-def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without_oracle):
+@pytest.mark.parametrize(
+    ("share", "many", "taken"), [(0.5, 0.25, [5, 3, 2]), (0.5, 2.0, [5, 3]), (2.0, 0.25, [5]), (math.inf, 0.25, [5])]
+)
+def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, without_oracle):
+    """And where that is so for many of the first, of the others too."""
     problem = hanging(steps=40)
     x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
     monkeypatch.setattr(optima, "ROUNDS", 0)
-    monkeypatch.setattr(optima, "FAR", 3)
+    for name, value in (("FAR", 3), ("CHUNK", 3), ("MANY", many)):
+        monkeypatch.setattr(optima, name, value)
     good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
     def solve(states, **progress):
-        return Optima(share * good.cost[: len(states)], [""] * len(states), good.u[:, : len(states)])
+        rows = slice(0, 3) if len(states) == 3 else slice(3, 5)
+        return Optima(share * idle.cost[rows], [""] * len(states), good.u[:, rows])
 
     def spoiled(problem, x0, u, **progress):
         batches.append(len(x0))
@@ -65,8 +70,22 @@ def test_what_an_oracle_knows_better_is_taken(share, taken, monkeypatch, without
     monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
     cost = optima_for(problem, expansions, x0).path.cost
     assert batches == taken
-    assert_close(cost[3:], idle.cost[3:])
+    assert_close(cost[3:], (good if 2 in taken else idle).cost[3:], rtol=1e-6, atol=0)
     assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
+
+
+def test_a_search_ends_in_its_seconds(without_oracle):
+    problem = hanging(steps=40)
+    x0 = problem.initial_states.sample(3)
+    u = torch.zeros(40, 3, 1)
+    idle, found = (optimal_trajectories(problem, x0, u, seconds=seconds) for seconds in (0, 100))
+    assert torch.equal(idle.path.u, u)
+    assert (found.path.cost < idle.path.cost / 2).all()
+
+
+def test_a_small_task_has_fewer_optima():
+    counts = [how_many(problem_of(IntegratorChain(n))) for n in (1, 2, 3)]
+    assert counts == [48, 192, 512]
 
 
 def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_oracle):

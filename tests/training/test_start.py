@@ -40,7 +40,7 @@ SWING = LINEAR | {
 def _few_optima():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 12)
-        patch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+        patch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
         yield
 
 
@@ -89,7 +89,8 @@ def test_the_learning_rate_rises_before_it_falls():
 
 def test_far_from_the_goal_optima_are_the_best_start(swing):
     learner, start, told = swing
-    stages = ["the optimum from the centre of X₀", "optima from 12 states of X₀", "fitting V to 12 optima"]
+    stages = ["the optimum from the centre of X₀", "optima from 12 states of X₀ within 30 s",
+              "fitting V to 12 optima within 60 s"]  # fmt: skip
     assert [stage for stage in told if stage in stages] == stages
     assert told[stages[1]][-1] == (12, 12)
     assert told[stages[2]][-1] == (129, 130)
@@ -244,7 +245,7 @@ def test_optima_are_sought_where_there_is_no_expansion():
     cost = module.members[0].rollout(x).cost.detach()
     assert float((cost / optimum).median()) < 1.03
     calm = next(candidate for candidate in start.candidates if candidate.name == CALM)
-    assert calm.cost > 3 * start.chosen.cost, "what it was before"
+    assert calm.cost > 1.5 * start.chosen.cost, "what it was before"
 
 
 def drag_without_root(problem):

@@ -1,0 +1,98 @@
+"""Two formulations of each task without a goal, by us in torch and by us in CasADi, are the same task."""
+
+import pytest
+import torch
+import yaml
+
+from lyapnet.cost import reason_for_no_goal
+from tests.pages import ROOT, blocks
+from tests.tasks_without_goal.optima import AGREES, TASKS, replay
+from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, optima_of, problem_of
+
+ALL = (*WORKING, *KEPT)
+
+
+def misses(name, controls=None):
+    """By how much of the largest J* the replayed cost of what is kept differs from it."""
+    kept = optima_of(name)
+    controls = kept["controls"] if controls is None else controls
+    optima = torch.tensor(kept["optima"])
+    J = replay(name, kept["states"][: len(controls)], controls)
+    return (J - optima[: len(controls)]) / optima.abs().max()
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_optimal_controls_cost_the_same_by_our_steps(name):
+    assert misses(name).abs().max() < AGREES
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_other_controls_cost_more(name):
+    """The twin that must fail: half the way to the middle of what is allowed."""
+    low, high = map(torch.tensor, TASKS[name].controls)
+    other = 0.5 * torch.tensor(optima_of(name)["controls"]) + 0.25 * (low + high)
+    assert misses(name, other.tolist()).min() > AGREES or breaks_a_limit(name, other)
+
+
+def breaks_a_limit(name, controls):
+    problem, kept = problem_of(name), optima_of(name)
+    if problem.constraints is None:
+        return False
+    x = torch.tensor(kept["states"][: len(controls)])
+    for u in controls.unbind(1):
+        x, _ = problem.step(x, u)
+        if bool((problem.constraints(x) > 1e-6).any()):
+            return True
+    return False
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_optimal_controls_keep_every_limit(name):
+    kept = optima_of(name)
+    low, high = map(torch.tensor, TASKS[name].controls)
+    controls = torch.tensor(kept["controls"])
+    assert bool(((controls >= low) & (controls <= high)).all())
+    assert not breaks_a_limit(name, controls)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_states_are_of_X0(name):
+    states, box = torch.tensor(optima_of(name)["states"]), problem_of(name).initial_states
+    assert states.shape == (64, len(box.lower))
+    assert bool(((states >= box.lower - 1e-6) & (states <= box.upper + 1e-6)).all())
+
+
+# −amount · volume and its slope vanish at the origin, and on all of X₀, where nothing is secreted yet.
+MISTAKEN = pytest.mark.xfail(strict=True, reason="a φ that is zero on X₀ and negative elsewhere is taken for a goal's")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=MISTAKEN) if n == "secreted_protein" else n for n in ALL])
+def test_no_task_has_a_goal(name):
+    problem = problem_of(name)
+    problem.check()
+    x = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
+    assert reason_for_no_goal(problem.cost, torch.zeros_like(x[0]), x)
+
+
+def test_the_readme_and_the_page_name_every_task():
+    rows = [line for line in (HERE / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    assert [row.split("`")[1] for row in rows] == list(ALL)
+    assert [row.rstrip("| ").endswith("kept") for row in rows] == [name in KEPT for name in ALL]
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_file_has_four_sections_and_limits(name):
+    content = yaml.safe_load((HERE / name / "task.yaml").read_text(encoding="utf-8"))
+    assert {"experiment", "system", "cost", "controls", "initial_states", "horizon"} <= content.keys()
+    assert content.keys() <= {"experiment", "system", "cost", "controls", "initial_states", "horizon", "constraints"}
+    assert content["horizon"]["steps"] <= 200
+
+
+def test_the_cost_on_the_page_has_no_goal():
+    (source,) = [block for block in blocks("python", ROOT / "docs" / "systems.md") if "lyapnet.Cost" in block]
+    space = {}
+    exec(source, space)
+    cost = space["Loss"]()
+    x = torch.rand(8, 1)
+    cost.check(x)
+    assert reason_for_no_goal(cost, torch.zeros(1), x)

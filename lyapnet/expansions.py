@@ -172,9 +172,9 @@ def optimal_trajectories(
         rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
             that still cost HOPELESS times as much are left as they are.
         progress: is told how many trajectories are done, of how many, each descent counting for its share.
-        seconds: after which trajectories are left as they are then.
+        seconds: of this thread's work, after which trajectories are left as they are then.
     """
-    until = time.monotonic() + seconds
+    until = time.thread_time() + seconds
     problem = in_float64(problem)
     x0, u = x0.double(), problem.controls.project(u.double())
 
@@ -212,7 +212,7 @@ def _descended(
     for k in range(iterations):
         rows = torch.nonzero(~settled).flatten()
         progress(len(settled) - len(rows))
-        if not len(rows) or time.monotonic() > until:
+        if not len(rows) or time.thread_time() > until:
             break
         was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])
         tried = _line_search(problem, was, _backward(problem, was.x, was.u, damping[rows], curved))

@@ -8,13 +8,30 @@ from types import FrameType
 from typing import Any
 
 import torch
-from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
 from lyapnet.errors import Interrupted
 from lyapnet.training.learner import mean_over_processes
 from lyapnet.training.modules import labelled
 from lyapnet.training.runs import Run
+
+
+class KeptStart(Callback):
+    """best.ckpt as soon as training has its start: what compiling and optima take from there may be broken off.
+
+    Args:
+        best: label ↦ each member's best checkpoint.
+    """
+
+    def __init__(self, best: Mapping[str, Path]):
+        self.best = best
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        module: Any = pl_module
+        if trainer.global_step == 0:
+            for member in module.members:
+                module.save_member(member, self.best[member.label])
 
 
 class Checkpoints(Checkpoint):

@@ -33,7 +33,8 @@ from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
 from lyapnet.training.stages import PATIENCE, Stages, silent
-from lyapnet.training.start import REMEDY, choose_start, has_place_for_start
+from lyapnet.training.start import REMEDY, has_place_for_start
+from lyapnet.training.start_cache import kept_or_chosen
 from lyapnet.training.trainer import build_trainer
 
 
@@ -168,7 +169,7 @@ def _relax(plan: Plan, console: Console, told: bool) -> None:
 def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
     with Stages(console, "start") if told else nullcontext(silent) as report:
-        start = choose_start(list(plan.module.members), report)
+        start = kept_or_chosen(list(plan.module.members), report)
     if told and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)

@@ -28,7 +28,8 @@ from lyapnet.training.fact import Fact, listed
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import REMEDY, SMALLER, choose_start
+from lyapnet.training.start import REMEDY, SMALLER
+from lyapnet.training.start_cache import kept_or_chosen
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
@@ -70,7 +71,7 @@ def facts_of(
             relaxation = find_relaxation(problem, report)
             problem.cost.weight.fill_(relaxation.weight)
             tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
-        start = choose_start([learner], report, lambda candidate: tell(_tried(candidate, facts)))
+        start = kept_or_chosen([learner], report, lambda candidate: tell(_tried(candidate, facts)))
     except LinAlgError as error:
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))

@@ -21,7 +21,7 @@ from lyapnet.training.stages import Report, silent
 from lyapnet.types import PerState, State, StatePath
 
 STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
-SECONDS = 60.0, 30.0  # in which those steps are taken, or as many of them as there is time for
+SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
 SHARES = {1: 0.25, 2: 0.5}  # of those steps, for V of one or two states
 GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
@@ -195,7 +195,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
     for k in range(ROUNDS + 1):
         again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
-        within = f"within {SECONDS[min(k, 1)]:.0f} s"
+        within = f"within {SECONDS[min(k, 1)]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
         _lower(
             learner.V,
@@ -229,9 +229,9 @@ def _lower(
     """Lower both errors at the examples, by Adam, whose rate falls as a cosine over the steps, or the seconds."""
     trained = [p for p in V.parameters() if p.requires_grad]
     examples = examples.to(trained[0])
-    optimizer, began = torch.optim.Adam(trained, rate), time.monotonic()
+    optimizer, began = torch.optim.Adam(trained, rate), time.thread_time()
     for k in range(steps):
-        share = max(k / steps, (time.monotonic() - began) / seconds)
+        share = max(k / steps, (time.thread_time() - began) / seconds)
         if share >= 1:
             break
         for group in optimizer.param_groups:

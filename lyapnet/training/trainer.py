@@ -8,7 +8,7 @@ from rich.console import Console
 from lyapnet.config import configs_of_seeds
 from lyapnet.training.certified_share import CertifiedShare
 from lyapnet.training.checkpoint_files import CheckpointFiles
-from lyapnet.training.checkpoints import Checkpoints
+from lyapnet.training.checkpoints import Checkpoints, KeptStart
 from lyapnet.training.compilation import Compilation, earns_compilation
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.dashboard import Dashboard
@@ -51,6 +51,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
     certified = CertifiedShare(every * options.certify_every, options.certified_states, options.confidence)
     stages = Stages(console, "training", PATIENCE)
     return [
+        KeptStart(best),
         *_compilation(plan, stages),
         ValidationOptimum(stages, options.optimum),
         Dashboard(configs_of_seeds(config)),

@@ -89,8 +89,8 @@ def test_the_learning_rate_rises_before_it_falls():
 
 def test_far_from_the_goal_optima_are_the_best_start(swing):
     learner, start, told = swing
-    stages = ["the optimum from the centre of X₀", "optima from 12 states of X₀ within 30 s",
-              "fitting V to 12 optima within 60 s"]  # fmt: skip
+    stages = ["the optimum from the centre of X₀", "optima from 12 states of X₀ within 30 s of work",
+              "fitting V to 12 optima within 60 s of work"]  # fmt: skip
     assert [stage for stage in told if stage in stages] == stages
     assert told[stages[1]][-1] == (12, 12)
     assert told[stages[2]][-1] == (129, 130)

@@ -9,7 +9,15 @@ import torch
 from torch import nn
 
 from lyapnet.after_horizon import REMEDY, from_plain
-from lyapnet.build import REGISTRIES, Parts, build_problem, build_program, build_rollout, build_value_function
+from lyapnet.build import (
+    REGISTRIES,
+    Parts,
+    build_problem,
+    build_program,
+    build_rollout,
+    build_value_function,
+    default_of,
+)
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import AFTER_HORIZON, KEY, read_checkpoint
 from lyapnet.config import Config, config_from_plain
@@ -57,8 +65,16 @@ def load(
     parts = Parts(system, cost, controls, constraints, network, program)
     require_parts(config, parts, path)
     _require_dimension(config, system, path)
+    with default_of(config):
+        return _controller_of(content, config, parts, path, device, beyond)
+
+
+def _controller_of(
+    content: dict[str, Any], config: Config, parts: Parts, path: str | Path, device: Any, beyond: str | None
+) -> Controller:
+    """The controller of what a checkpoint holds."""
     problem = build_problem(config, parts)
-    V = build_value_function(config, problem, network)
+    V = build_value_function(config, problem, parts.network)
     load_value_function(V, content, path)
     problem.check_value_function(V)
     after_horizon = from_plain(content[KEY].get(AFTER_HORIZON))
@@ -69,7 +85,7 @@ def load(
             path, ", ".join(others),
         )  # fmt: skip
     problem, V = problem.to(device), V.to(device)
-    own = build_program(config) if program is None else program
+    own = build_program(config) if parts.program is None else parts.program
     if beyond is None and after_horizon is not None and not after_horizon.holds:
         logging.getLogger(__name__).warning("note: %s; %s.", after_horizon, REMEDY)
     rollout = build_rollout(config, problem, V)

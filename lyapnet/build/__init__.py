@@ -1,6 +1,6 @@
 """From a config to the objects it names."""
 
-from lyapnet.build.classes import REGISTRIES, Parts, own_parts, resolve
+from lyapnet.build.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
 from lyapnet.build.entries import entry_per_state
 from lyapnet.build.family import knows, member
 from lyapnet.build.learner import build_program, build_rollout, build_value_function
@@ -8,6 +8,7 @@ from lyapnet.build.named_parts import parts_named, parts_of
 from lyapnet.build.problem import build_problem, build_system, operating_point, with_parameters
 
 __all__ = [
+    "DTYPES",
     "REGISTRIES",
     "Parts",
     "build_problem",
@@ -15,6 +16,7 @@ __all__ = [
     "build_rollout",
     "build_system",
     "build_value_function",
+    "default_of",
     "entry_per_state",
     "knows",
     "member",

@@ -22,6 +22,8 @@ from lyapnet.programs import PROGRAMS, Program
 from lyapnet.sets import CONTROL_SETS, ControlSet
 from lyapnet.systems import SYSTEMS, ControlAffineSystem
 
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -127,11 +129,24 @@ def section(name: str):
 
 
 @contextmanager
-def float64_defaults():
-    """Build in float64 whatever the precision, so that float32 runs start from the rounded float64 weights."""
+def default_dtype(dtype: torch.dtype):
+    """Have tensors of floats be of this type where nothing else is said, as in torch.tensor([[0.0], [1 / L]]).
+
+    One type for all that a command computes: 1/L in float32 is another number, by 5e-8 of it, than the build has used.
+    """
     previous = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float64)
+    torch.set_default_dtype(dtype)
     try:
         yield
     finally:
         torch.set_default_dtype(previous)
+
+
+def float64_defaults():
+    """Build in float64 whatever the precision, so that float32 runs start from the rounded float64 weights."""
+    return default_dtype(torch.float64)
+
+
+def default_of(config: Config):
+    """The type of a config's precision as the default, for training and measuring."""
+    return default_dtype(DTYPES[config.training.precision])

@@ -5,9 +5,8 @@ from typing import Any
 
 import torch
 
-from lyapnet.build.classes import check_parameters, class_of, float64_defaults, section
+from lyapnet.build.classes import DTYPES, check_parameters, class_of, float64_defaults, section
 from lyapnet.build.entries import entry_per_state
-from lyapnet.build.problem import DTYPES
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import Config
 from lyapnet.cost import Cost

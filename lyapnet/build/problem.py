@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.build.classes import Parts, float64_defaults, instance_of, section
+from lyapnet.build.classes import DTYPES, Parts, float64_defaults, instance_of, section
 from lyapnet.build.constraints import ball_of, build_constraints
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
@@ -33,8 +33,6 @@ from lyapnet.horizon import TABLEAUX, Horizon
 from lyapnet.problem import Problem
 from lyapnet.sets import Box, ControlBox, ControlSet
 from lyapnet.systems import ControlAffineSystem, Linear
-
-DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
 def build_problem(config: Config, parts: Parts | None = None) -> Problem:

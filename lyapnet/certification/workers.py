@@ -77,7 +77,7 @@ def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Call
     worker = cluster.remote(num_cpus=1, runtime_env={"env_vars": places})(ClusterWorker)
     them = [worker.remote() for _ in range(workers)]
     try:
-        cluster.get([each.begin.remote(make_question) for each in them], timeout=PATIENCE)
+        cluster.get([each.begin.remote(make_question, torch.get_default_dtype()) for each in them], timeout=PATIENCE)
         pool = cluster.util.ActorPool(them)
         yield lambda asked: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), asked))
     except cluster.exceptions.GetTimeoutError as error:
@@ -93,8 +93,9 @@ def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Call
 class ClusterWorker:
     """A worker on another machine."""
 
-    def begin(self, make_question: Callable[[], Any]) -> None:
+    def begin(self, make_question: Callable[[], Any], default: torch.dtype) -> None:
         torch.set_num_threads(1)
+        torch.set_default_dtype(default)
         _own[:] = [make_question()]
 
     def undecided(self, asked: tuple[Any, ...]) -> tuple[Any, ...]:

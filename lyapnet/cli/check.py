@@ -93,7 +93,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     try:
         import torch
 
-        from lyapnet.build import build_problem, parts_of
+        from lyapnet.build import build_problem, default_of, parts_of
         from lyapnet.config import load_config
         from lyapnet.training.build_learner import build_learner
         from lyapnet.training.facts import facts_of
@@ -102,7 +102,8 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     resolved = dataclasses.replace(load_config(config, overrides), seeds=1)
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
-    facts_of(build_learner(resolved, build_problem(resolved, parts).relaxed(), parts), report, known)
+    with default_of(resolved):
+        facts_of(build_learner(resolved, build_problem(resolved, parts).relaxed(), parts), report, known)
 
 
 def print_fact(console: Console, fact: Any) -> None:

@@ -93,6 +93,7 @@ class Given:
         """The controller."""
         import torch
 
+        from lyapnet.build import DTYPES
         from lyapnet.loading import load
 
         self.report(f"loading {self.title}")
@@ -103,6 +104,7 @@ class Given:
 
             controller = imported_controller(self.checkpoint, *self.functions, self.named)
         torch.set_num_threads(controller.config.training.threads)
+        torch.set_default_dtype(DTYPES[controller.config.training.precision])  # until the command ends
         return member_of(controller, self.at) if self.at else controller
 
 
@@ -124,9 +126,15 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
         own, checkpoint = {name: options.pop(name) for name in OWN}, options.pop("checkpoint")
         with stages_of(command.__name__) as report:
             report(f"importing torch for {checkpoint}")
+            import torch
+
             from lyapnet.checkpoint import located  # takes seconds
 
-            command(**{given: Given(located(checkpoint), own, options.pop("at"), report)}, **options)
+            before = torch.get_default_dtype()
+            try:
+                command(**{given: Given(located(checkpoint), own, options.pop("at"), report)}, **options)
+            finally:
+                torch.set_default_dtype(before)
 
     def keyword(name: str, annotation: Any, **more: Any) -> inspect.Parameter:
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, **more)

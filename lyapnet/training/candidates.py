@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from lyapnet.linearisation import Missing
 
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
+ALIKE = 5e-4  # of a cost: candidates that differ by less are told as equal
 CALM = "V = 0"
 
 
@@ -54,7 +55,8 @@ class Start(NamedTuple):
             return f"no {other.name.removeprefix('the ')}: {other.missing.reason}"
         if other.finite < 1 or not 0 < self.chosen.cost < math.inf:
             return f"{other.name}: {format_cost(other)}"
-        return f"{other.name}: {other.cost / self.chosen.cost:.4g} times its cost"
+        ratio = other.cost / self.chosen.cost
+        return f"{other.name}: {'as cheap' if abs(ratio - 1) < ALIKE else f'{ratio:.4g} times its cost'}"
 
     def as_json(self) -> dict[str, Any]:
         notes = {c.name: c.note for c in self.candidates if c.note}

@@ -61,7 +61,7 @@ class Compilation(Callback):
             self._ahead.wait()
         module.compile_for(self.batch_size)
         verb, seconds = "loaded" if on_disk else "compiled", time.perf_counter() - started
-        beside = " more than the start took" if self._ahead is not None and not on_disk else ""
+        beside = " besides the time in which the start was sought" if self._ahead is not None and not on_disk else ""
         self._say(trainer, f"{verb} machine code in {seconds:.0f} s{beside}, kept in {cache_folder()}")
         if trainer.is_global_zero:
             self.record(compiled=True, compilation_seconds=round(seconds, 2))

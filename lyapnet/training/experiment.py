@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 from rich.text import Text
 
-from lyapnet.build import Parts
+from lyapnet.build import Parts, default_of
 from lyapnet.checkpoint import AFTER_HORIZON, note_in_checkpoint
 from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
 from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
@@ -36,6 +36,8 @@ from lyapnet.training.stages import PATIENCE, Stages, silent
 from lyapnet.training.start import REMEDY, has_place_for_start
 from lyapnet.training.start_cache import kept_or_chosen
 from lyapnet.training.trainer import build_trainer
+
+DRAWN = "start: V as it is drawn, in which nothing is known yet; the first steps cost far more than the optimum"
 
 
 def train(
@@ -66,9 +68,10 @@ def train(
     else:
         content = to_plain(config) if isinstance(config, Config) else config
         resolved, again = config_from_plain(content, overrides), 'lyapnet.train(…, resume="last")'
-    plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
-    if not plan.finished:
-        fit(plan, console or Console(highlight=False, markup=False), again)
+    with default_of(resolved):
+        plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
+        if not plan.finished:
+            fit(plan, console or Console(highlight=False, markup=False), again)
     return plan.run
 
 
@@ -175,6 +178,8 @@ def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
         console.print(str(start), soft_wrap=True)
         if start.steps_miss:
             console.print(f"steps: {start.steps_miss}; {REMEDY}", soft_wrap=True)
+    if told and start is None:
+        console.print(DRAWN, soft_wrap=True)
     return start
 
 

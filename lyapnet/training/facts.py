@@ -21,6 +21,7 @@ from lyapnet.linearisation import (
     riccati_or_reason,
     singular,
 )
+from lyapnet.operating_points import HELD
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
 from lyapnet.training.candidates import CALM, Candidate, Start
@@ -32,8 +33,9 @@ from lyapnet.training.start import REMEDY, SMALLER
 from lyapnet.training.start_cache import kept_or_chosen
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
-REACHED = 1e-9  # of A, with states and controls in units of their own, above which one state acts on another
+REACHED = 1e-10  # of A, with states and controls in units of their own, above which one state acts on another
 ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
+ROUNDINGS = 100  # of the task's precision, for a rate that sums several terms
 
 
 def facts_of(
@@ -61,7 +63,7 @@ def facts_of(
         elif around.missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
-            tell(_goal(exact, around), *_modes(exact, around))
+            tell(_goal(exact, around, problem.goal.dtype), *_modes(exact, around))
             stiff = stiffness(exact, learner.rollout)
             if around.missing is not None and around.missing.reason in stiff.found:
                 stiff = Fact("stiffness", "unknown, for the reason above")
@@ -138,18 +140,19 @@ def _task(problem: Problem) -> Fact:
     )
 
 
-def _goal(problem: Problem, around: Linearisation) -> Fact:
-    """Whether the goal is an equilibrium, or which control makes it one."""
+def _goal(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:
+    """Whether the goal is an equilibrium, up to rounding in the precision of the task, or which control holds it."""
+    rounding = max(HELD, ROUNDINGS * torch.finfo(precision).eps)
     goal, system = problem.goal, problem.system
     f, rest = around.f, system.dynamics(goal, problem.rest)
     where = f"{_listed(goal)}, " if goal.any() else ""
     if not bool(problem.controls.contains(problem.rest)):
         return Fact("goal", f"{where}u = {_listed(problem.rest)} is beyond its limits", "the cost has no rest there")
-    if float(rest.abs().max()) <= 1e-9 * max(1.0, float(f.abs().max())):
+    if float(rest.abs().max()) <= rounding * max(1.0, float(f.abs().max())):
         control = f"at u = {_listed(problem.rest)}" if problem.rest.any() else "without control"
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
-    if float(left.abs().max()) <= 1e-9 * float(f.abs().max()):
+    if float(left.abs().max()) <= rounding * float(f.abs().max()):
         remedy = f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing"
         if problem.cost.rest is not None:  # target_control says from where
             remedy = ""
@@ -190,11 +193,16 @@ def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
     """The eigenvalues of the part of ẋ = Ax + Bu that u does not reach: by rotations, the states that B moves are split
     off, then those that these move, and so on, until nothing moves what is left.
 
-    States are in units of their extents, and each control in that in which it moves them by one.
+    States are in units of their extents, balanced, so that what one does to another is as large as what that does to it
+    where both act, and each control in that in which it moves them by one.
 
     Source: Van Dooren, "The generalized eigenstructure problem in linear system theory", IEEE Transactions on Automatic
     Control 1981 (the staircase form).
     """
+    from scipy.linalg import matrix_balance  # loaded where it is asked for: it takes a tenth of a second
+
+    _, (units, _) = matrix_balance((A * extent / extent[:, None]).numpy(), permute=False, separate=True)
+    extent = extent * torch.from_numpy(units)
     A, B = A * extent / extent[:, None], B / extent[:, None]
     B = B / B.norm(dim=0).clamp_min(torch.finfo(B.dtype).tiny)
     weakest = REACHED

@@ -168,5 +168,5 @@ def _require_same_experiment(config: Config, stored: Config, origin: Path) -> No
     if changed:
         raise UsageError(
             f"Expected the config of {str(origin)!r}, got another {', '.join(changed)}; resuming continues the "
-            "same run: undo the change, or start a new run with --finetune."
+            "same run: give what it was started with, or start a new run with --finetune."
         )

@@ -70,7 +70,7 @@ class TrainingProgress(ProgressBar):
         loss = fmean(float(output.loss) for output in outputs)
         cost = fmean(float(output.trajectory_cost) for output in outputs)
         speed = sum(member.steps_per_second for member in members)
-        line = f"loss {loss:.4g}  cost {cost:.4g}  {speed:,.0f} rollout steps/s"
+        line = f"loss {loss:.4g}, cost {cost:.4g} of its batch  {speed:,.0f} rollout steps/s"
         self._progress.update(self._task, completed=trainer.global_step, description=line)
         self._log(f"step {trainer.global_step} of {trainer.max_epochs}", line)
 

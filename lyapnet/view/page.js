@@ -237,7 +237,7 @@ function warn(loop) {
   const held = loop && facts.funnel && depth({ t: 0, x: loop.x[0], V: loop.V[0] }) > 0;
   element("outside").hidden = !loop?.outside;
   element("outside").textContent = "This start lies outside the initial states X₀ that the controller was trained on: " +
-    (held ? "only the proved funnel holds it." : "nothing is said about it.");
+    (held ? "only the proved funnel holds it." : "the training says nothing of it.");
 }
 function tell() {
   const head = ["", "J(x₀)", "V(0, x₀)", "time at a limit", "constraints"];

@@ -12,7 +12,7 @@ from lyapnet.cli import main
 from lyapnet.config import config_from_plain
 from lyapnet.systems import Linear
 from lyapnet.training.build_learner import build_learner
-from lyapnet.training.facts import facts_of
+from lyapnet.training.facts import facts_of, unreached_modes
 from lyapnet.training.start import Candidate, Start
 
 TASK = {
@@ -180,3 +180,26 @@ def test_the_next_command_is_the_experiment_that_was_checked(tmp_path, capsys):
     command = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("train"))
     expected = ["lyapnet", "train", "--config", str(path), "network.name=fcn", "network.hidden=[4, 4]"]
     assert shlex.split(command)[1:] == expected
+
+
+@pytest.mark.parametrize(
+    ("A", "B", "extent"),
+    [
+        ([[0, 1], [-1e12, 0]], [[0], [1e12]], [1, 1]),  # a mass of 1e-12 on a spring
+        ([[0, 1], [0, 0]], [[0], [1e12]], [1, 1]),
+        ([[0, 1], [0, 0]], [[0], [1]], [1e-9, 1e3]),
+        ([[-1e9, 0], [1e12, -1e6]], [[1e9], [0]], [1, 1]),
+    ],
+)
+def test_units_do_not_decide_what_is_reached(A, B, extent):
+    matrices = [torch.tensor(each, dtype=torch.float64) for each in (A, B, extent)]
+    assert not len(unreached_modes(*matrices))
+    A, B, extent = matrices
+    lost = torch.block_diag(A, torch.tensor([[-3.0]]))
+    assert len(unreached_modes(lost, torch.cat([B, torch.zeros(1, 1)]), torch.cat([extent, torch.ones(1)]))) == 1
+
+
+def test_a_mode_is_unreached_as_often_as_it_is():
+    alike = unreached_modes(torch.zeros(3, 3), torch.tensor([[1.0, 0], [0, 1], [0, 0]]), torch.ones(3))
+    assert len(alike) == 1, "of three alike one"
+    assert not len(unreached_modes(torch.zeros(2, 2), torch.eye(2), torch.ones(2)))

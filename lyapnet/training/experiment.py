@@ -37,7 +37,6 @@ from lyapnet.training.start import REMEDY, has_place_for_start
 from lyapnet.training.start_cache import kept_or_chosen
 from lyapnet.training.trainer import build_trainer
 
-
 DRAWN = "start: V as it is drawn, in which nothing is known yet; the first steps cost far more than the optimum"
 
 

@@ -114,8 +114,9 @@ def main() -> None:
               f"{run['wall']:.0f} s in all")  # fmt: skip
         found = measure(folder, given.name)
     ratio = f"cost / optimum {found['ratio']:.4f}, " if found["ratio"] == found["ratio"] else ""
+    kept = f"largest h {found['h']:.2e}, violated from {found['violated']:.1%} of the states; "
     print(f"regret {found['regret']:.3%} of the spread of J*, {found['largest']:.2%} at most; {ratio}mean J "
-          f"{found['J']:.6g}; largest h {found['h']:.2e}, violated from {found['violated']:.1%} of the states; "
+          f"{found['J']:.6g}; {kept if found['h'] > -torch.inf else ''}"
           f"controls beyond their limits by {found['beyond']:.1e}")  # fmt: skip
 
 

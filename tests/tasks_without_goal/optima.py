@@ -44,7 +44,7 @@ class Task:
     lower: dict[int, float] = field(default_factory=dict)  # limits of states by their index
     upper: dict[int, float] = field(default_factory=dict)
     tried: tuple[float, float] = (0.0, 1.0)  # shares of the way between the limits, of guesses
-    guesses: int = 3
+    guesses: int = 3  # from each state, and how many neighbours share their controls with it, itself included
     domain: dict[int, float] = field(default_factory=dict)  # kept above in the search; no optimum is near
 
 

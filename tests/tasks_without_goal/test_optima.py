@@ -1,12 +1,13 @@
 """Two formulations of each task without a goal, by us in torch and by us in CasADi, are the same task."""
 
+import numpy as np
 import pytest
 import torch
 import yaml
 
 from lyapnet.cost import reason_for_no_goal
 from tests.pages import ROOT, blocks
-from tests.tasks_without_goal.optima import AGREES, TASKS, replay
+from tests.tasks_without_goal.optima import AGREES, TASKS, Transcription, replay
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, optima_of, problem_of
 
 ALL = (*WORKING, *KEPT)
@@ -44,6 +45,15 @@ def breaks_a_limit(name, controls):
         if bool((problem.constraints(x) > 1e-6).any()):
             return True
     return False
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_search_stays_where_it_ended(name):
+    """What is kept is an optimum of the script as it is."""
+    kept, own = optima_of(name), Transcription(TASKS[name])
+    found = own.solve(np.array(kept["states"][0]), np.array(kept["controls"][0]))
+    assert found is not None
+    assert found[0] == pytest.approx(kept["optima"][0], rel=AGREES)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -40,6 +40,8 @@ class AfterHorizon(NamedTuple):
         law = f"after T follows {self.beyond} ({LAWS[self.beyond]})"
         if self.holds:
             return f"{law}, under which {self.held} of {self.loops} closed loops are {HELD}"
+        if not self.loops:
+            return f"{law}: {self.reason}"
         return f"{law}; no law was found under which all closed loops are {HELD} ({self.reason})"
 
 

@@ -107,13 +107,27 @@ class Problem(nn.Module):
         """Why there is no goal; empty where there is one."""
         if self._no_goal is None:
             try:
-                cost, box = copied(self.cost), copied(self.initial_states)
-                cost = cost.cost if isinstance(cost, PenaltyCost) else cost
-                goal = torch.zeros_like(box.lower) if cost.goal is None else cost.goal
-                self._no_goal = reason_for_no_goal(cost, goal, box.sample(TRIED, torch.Generator().manual_seed(0)))
+                own = copied(self)
+                cost = own.cost.cost if isinstance(own.cost, PenaltyCost) else own.cost
+                goal = torch.zeros_like(own.initial_states.lower) if cost.goal is None else cost.goal
+                self._no_goal = reason_for_no_goal(cost, goal, own._typical_states())
             except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
                 return ""
         return self._no_goal
+
+    @torch.no_grad()
+    def _typical_states(self) -> State:
+        """States (b, n) of X₀, and where random controls that do not change lead from there by T/2 and T."""
+        generator = torch.Generator().manual_seed(0)
+        x = self.initial_states.sample(TRIED, generator)
+        u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
+        states, N = [x], self.horizon.steps
+        for n in range(1, N + 1):
+            x = self.step(x, u)[0]
+            if n in (N // 2, N):
+                states.append(x)
+        every = torch.cat(states)
+        return every[every.isfinite().all(-1)]
 
     @property
     def rest(self) -> Control:

@@ -110,6 +110,31 @@ def test_a_task_without_a_goal_says_why(cost, reason):
     assert problem.in_steps(method="rk4").no_goal == problem.no_goal
 
 
+class Batch(Sledge):
+    """A volume that is fed, and a product in it that u makes: on X₀ there is none of it."""
+
+    state_names, state_units = ("product", "volume"), ("g", "l")
+
+    def f(self, x):
+        return torch.stack([torch.zeros_like(x[..., 0]), 0.1 + 0 * x[..., 1]], -1)
+
+    def g(self, x):
+        return torch.stack([x[..., 1], torch.zeros_like(x[..., 1])], -1)[..., None]
+
+
+class Yield(Far):
+    def terminal(self, x):
+        return -x[..., 0] * x[..., 1]
+
+
+def test_a_gain_that_is_zero_on_all_of_x0_is_no_goal():
+    horizon = lyapnet.Horizon(steps=20, dt=T / 20)
+    problem = lyapnet.Problem(
+        Batch(), Yield(), lyapnet.ControlBox([0.0], [1.0]), lyapnet.Box([0, 0.9], [0, 1.1]), horizon
+    )
+    assert "φ is negative" in problem.double().no_goal
+
+
 def test_a_regulator_has_a_goal():
     problem = far(cost=lyapnet.QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
     assert problem.has_goal

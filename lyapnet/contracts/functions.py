@@ -18,6 +18,8 @@ from lyapnet.errors import UsageError, raised
 REMEDIES = {  # what an error of torch's says ↦ what to do
     "before Module.__init__() call": "call super().__init__() first in __init__",
     "' already exists": "give that attribute of your class another name, which no buffer of it has",
+    "has no setter": "n, m, title and the like are reserved names of every system: give that attribute another one",
+    "object is not callable": "an attribute may hide a function of that name: give it another one",
     "Boolean value of Tensor": "write torch.where(x > 0, a, b) in the place of an if",
     "converted to Python scalars": "stay in torch: no float(x) and no x.item()",
     "numpy": "stay in torch: torch.sin for np.sin, and lyapnet.Table for np.interp",

@@ -6,6 +6,7 @@ operation. What is left are loops, of which RULES has the inner line; loops that
 Nothing is allocated but on the stack.
 """
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -19,6 +20,7 @@ from lyapnet.graphs.c_rules import RULES
 from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of
 
+aten = torch.ops.aten
 STACK = 1_000_000  # bytes of arrays in one function, at the most
 
 
@@ -54,10 +56,26 @@ def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], res
     Raises:
         ExportError: an operator has no rule; names it.
     """
+    graph = _without_shapes_alone(graph)
     inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
     outputs = _Reader(graph, text).run(*inputs)
     for name, output in zip(results, outputs, strict=True):
         text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
+    text.excuse_unread()
+
+
+def _without_shapes_alone(graph: GraphModule) -> GraphModule:
+    """The trace without what is computed for its shape alone, as x.sin() is in torch.zeros_like(x.sin())."""
+    nodes = copy.deepcopy(graph.graph)
+    for node in list(nodes.nodes):
+        if node.op == "call_function" and name_of(node.target) in SHAPED:
+            with nodes.inserting_before(node):
+                for source in node.all_input_nodes:
+                    shape = list(source.meta["val"].shape)
+                    blank = nodes.call_function(aten.zeros.default, (shape,), {"dtype": torch.float64})
+                    node.replace_input_with(source, blank)
+    nodes.eliminate_dead_code()
+    return GraphModule(graph, nodes)
 
 
 def helpers(code: str) -> list[str]:

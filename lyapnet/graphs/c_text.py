@@ -106,6 +106,17 @@ class Text:
         """Write that an array may serve nobody, which a compiler would point out else."""
         self.lines.append(f"(void){name};")
 
+    def excuse_unread(self) -> None:
+        """Write that arrays which are written to, and never read, serve nobody: a result that is not asked for, say."""
+        at = dict[str, list[int]]()
+        for k, line in enumerate(self.lines):
+            for name in set(re.findall(r"\bv\d+\b", line)):
+                at.setdefault(name, []).append(k)
+        for name, places in at.items():
+            written = rf"\s*{name}\[[^]]*\] = (?!.*\b{name}\b)"
+            if all(re.match(written, self.lines[k]) for k in places[1:]):
+                self.lines[places[0]] += f" (void){name};"
+
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
         """Write a line at every index of a shape: {0}, {1}, … are the values there, and {into} is where it goes.
 

@@ -28,6 +28,9 @@ class JavaScriptText(Text):
     def unused(self, name: str) -> None:
         pass
 
+    def excuse_unread(self) -> None:
+        pass
+
 
 def javascript_function(
     name: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: JavaScriptTables

@@ -1,5 +1,6 @@
 """What a system is: dynamics affine in the control, and facts about its coordinates."""
 
+import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -71,12 +72,14 @@ class ControlAffineSystem(nn.Module, ABC):
         return len(self.control_names)
 
     def check_coordinates(self) -> None:
-        """Refuse names and units that are no lists of as many strings, and angles that are no states.
+        """Refuse names and units that are no lists of as many strings, angles that are no states, and attributes that
+        hide what every system has, as g = 9.81 hides g(x).
 
         Raises:
             UsageError: naming the attribute.
         """
         name = type(self).__name__
+        self._refuse_hidden_names()
         for names, units in (("state_names", "state_units"), ("control_names", "control_units")):
             for attribute in (names, units):
                 listed = getattr(self, attribute)
@@ -94,6 +97,26 @@ class ControlAffineSystem(nn.Module, ABC):
             listed = getattr(self, attribute)
             if not all(isinstance(i, int) and 0 <= i < self.n for i in listed):
                 raise UsageError(f"Expected {name}.{attribute} as indices of states, got {listed!r}; count from 0.")
+
+    def _refuse_hidden_names(self) -> None:
+        base, name = ControlAffineSystem, type(self).__name__
+        for attribute in dir(base):
+            if not attribute.startswith("_") and callable(getattr(base, attribute)):
+                value = getattr(self, attribute)
+                if not callable(value):
+                    raise UsageError(
+                        f"Expected {name}.{attribute} as the function that every system has, got {value!r}; "
+                        f"{attribute} is a reserved name: give the attribute another one."
+                    )
+        for attribute, what, kind in (
+            ("n", "the number of states", int), ("m", "the number of controls", int), ("title", "a text", str),
+        ):  # fmt: skip
+            value = inspect.getattr_static(self, attribute)
+            if not isinstance(value, property | kind) or isinstance(value, bool):
+                raise UsageError(
+                    f"Expected {name}.{attribute} as {what}, got {value!r}; {attribute} is a reserved name: give the "
+                    "attribute another one."
+                )
 
     @property
     def state_labels(self) -> list[str]:

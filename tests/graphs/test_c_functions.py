@@ -28,6 +28,9 @@ FUNCTIONS = OF_CASADI | {
     "singular": lambda x: torch.linalg.det(torch.zeros(3, 3).to(x) * x[0, 0]) + x,
     "shares": lambda x: torch.softmax(x, -1) + torch.nn.functional.pad(x, (1, 0))[:, :4] + torch.hypot(x, x + 1),
     "alike": lambda x: x.sin().sum(-1) * x[0].sin() + x.sin() + (1 + x).sin().sum() + (1 + x[0]).cumsum(-1)[1:].sum(),
+    "shape of": lambda x: torch.zeros_like(x.sin()) + torch.full_like(x[:, 0] * 3, 2.0) + x.exp().new_ones(4),
+    "constant": lambda x: torch.ones_like(x) * torch.eye(4).to(x)[0],
+    "half asked for": lambda x: x.max(-1).values + x.sin().min(-1).indices + torch.stack([x, x.cos()]).unbind(0)[0],
     "undefined": lambda x: torch.nan_to_num(x / x - 1, nan=2.0),
 }  # fmt: skip
 POINT = torch.tensor([[0.3, -0.8, 1.7, -2.2]], dtype=torch.float64)

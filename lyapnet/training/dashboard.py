@@ -1,21 +1,29 @@
 """What loggers show besides curves and figures: the layout of TensorBoard, and the config."""
 
 import textwrap
+from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from lyapnet.config import Config, to_plain, to_yaml
-from lyapnet.training.curves import loggers_of_each
+from lyapnet.training.curves import loggers_of_each, members_of
 
 # a panel for each measure, a chart for each curve in it: TensorBoard gives all curves of a run one colour
 PANELS = {
     "constraint loss": ("constraint_loss/train", "constraint_loss/val"),
     "trajectory cost": ("trajectory_cost/train", "trajectory_cost/val"),
-    "optimality": ("optimality_gap/val", "regret/val", "value_error/val"),
+    "optimality": ("optimality_gap/val", "value_error/val"),
     "condition": ("satisfied_fraction/val", "falling_fraction/val"),
 }
-LAYOUT = {panel: {curve: ["Multiline", [curve]] for curve in curves} for panel, curves in PANELS.items()}
+WITHOUT_GOAL = {**PANELS, "optimality": ("regret/val", "value_error/val")}
+del WITHOUT_GOAL["condition"]
+
+
+def layout(has_goal: bool) -> dict[str, dict[str, list[Any]]]:
+    """TensorBoard's panels of curves, those that a task with or without a goal has."""
+    panels = PANELS if has_goal else WITHOUT_GOAL
+    return {panel: {curve: ["Multiline", [curve]] for curve in curves} for panel, curves in panels.items()}
 
 
 class Dashboard(Callback):
@@ -36,5 +44,5 @@ class Dashboard(Callback):
                 if not isinstance(logger, TensorBoardLogger):
                     logger.log_hyperparams(to_plain(config))
                 elif trainer.global_step == 0:
-                    logger.experiment.add_custom_scalars(LAYOUT)
+                    logger.experiment.add_custom_scalars(layout(members_of(pl_module)[0].problem.has_goal))
                     logger.experiment.add_text("config", textwrap.indent(to_yaml(config), "    "))

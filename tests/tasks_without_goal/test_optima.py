@@ -5,6 +5,7 @@ import pytest
 import torch
 import yaml
 
+from lyapnet.cost import reason_for_no_goal
 from tests.pages import ROOT, blocks
 from tests.tasks_without_goal.optima import AGREES, TASKS, Transcription, replay
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, optima_of, problem_of

@@ -17,6 +17,7 @@ from lyapnet.sets import Box, ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State
 
+LOOKED = 200  # steps, along which it is seen whether a task has a goal
 TRIED = 64  # states at which functions of others are tried
 LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
@@ -60,7 +61,6 @@ class Problem(nn.Module):
     horizon: Horizon
     constraints: Constraints | None
     findings: Findings
-    _no_goal: str | None
 
     def __init__(
         self,
@@ -86,7 +86,6 @@ class Problem(nn.Module):
                 )
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
-        self._no_goal = None  # not known yet
         self.findings = Findings()
 
     @property
@@ -105,23 +104,23 @@ class Problem(nn.Module):
     @property
     def no_goal(self) -> str:
         """Why there is no goal; empty where there is one."""
-        if self._no_goal is None:
+        if "no_goal" not in self.findings:
             try:
                 own = copied(self)
                 cost = own.cost.cost if isinstance(own.cost, PenaltyCost) else own.cost
                 goal = torch.zeros_like(own.initial_states.lower) if cost.goal is None else cost.goal
-                self._no_goal = reason_for_no_goal(cost, goal, own._typical_states())
+                self.findings["no_goal"] = reason_for_no_goal(cost, goal, own._typical_states())
             except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
                 return ""
-        return self._no_goal
+        return self.findings["no_goal"]
 
     @torch.no_grad()
     def _typical_states(self) -> State:
-        """States (b, n) of X₀, and where random controls that do not change lead from there by T/2 and T."""
+        """States (b, n) of X₀, and where random controls that do not change lead from there, within LOOKED steps."""
         generator = torch.Generator().manual_seed(0)
         x = self.initial_states.sample(TRIED, generator)
         u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
-        states, N = [x], self.horizon.steps
+        states, N = [x], min(self.horizon.steps, LOOKED)
         for n in range(1, N + 1):
             x = self.step(x, u)[0]
             if n in (N // 2, N):
@@ -189,10 +188,10 @@ class Problem(nn.Module):
         """The problem with some of its parts exchanged."""
         names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
         other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
-        if parts.keys().isdisjoint(("cost", "initial_states")):
-            other._no_goal = self._no_goal
         if parts.keys().isdisjoint(("cost", "system")):
             other.findings = self.findings
+        if "initial_states" in parts:
+            other.findings = Findings({name: found for name, found in other.findings.items() if name != "no_goal"})
         return other
 
     def in_steps(self, **changes: Any) -> "Problem":

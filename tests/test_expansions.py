@@ -177,6 +177,6 @@ def test_of_guesses_at_one_optimum_the_hopeless_are_left_once_one_has_settled(mo
 def test_differences_of_costs_are_held_against_their_size():
     cost, problem = torch.tensor([1.0, 3.0, torch.inf]), hanging()
     assert sizes(problem, cost) is cost, "with a goal zero is the least"
-    problem._no_goal = "nobody named one"
+    problem.findings["no_goal"] = "nobody named one"
     assert_close(sizes(problem, cost - 7), torch.tensor([1.0, 1.0, 1.0]))  # by how much the finite ones are spread
     assert_close(sizes(problem, torch.tensor([-1e-9, 1.0])), torch.tensor([0.5, 0.5]))

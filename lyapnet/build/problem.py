@@ -72,7 +72,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = _with_obstacles(config.cost, cost, system)
         problem = Problem(system, cost, controls, initial_states, horizon)
         if not config.family and config.cost.name not in COSTS:
-            _refuse_free_controls_of_own(problem)
+            _refuse_free_controls_of_own_cost(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
@@ -125,14 +125,13 @@ def _refuse_free_controls(
     refuse_free_controls(problem, R)
 
 
-def _refuse_free_controls_of_own(problem: Problem) -> None:
-    """The same for a cost of the user's own; one whose R is no matrix for each state is refused by its check."""
-    m = problem.system.m
+def _refuse_free_controls_of_own_cost(problem: Problem) -> None:
+    """The same for a cost of the user's own; an R that is no matrix, or raises, is found by its contract."""
     try:
         R: Any = problem.cost.R(problem.initial_states.lower[None])
-    except Exception:  # of any kind: the code is the user's
+    except Exception:  # of any kind: it is the user's
         return
-    if isinstance(R, Tensor) and R.shape == (1, m, m):
+    if isinstance(R, Tensor) and R.shape == (1, problem.system.m, problem.system.m):
         refuse_free_controls(problem, R)
 
 

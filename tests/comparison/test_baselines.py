@@ -5,6 +5,7 @@ import os
 import pickle
 import shutil
 import textwrap
+import time
 import zipfile
 
 import numpy as np
@@ -18,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lyapnet.comparison.baselines.baseline import Baseline
 from lyapnet.comparison.baselines.checkpoints import best_checkpoint, checkpoints
 from lyapnet.comparison.baselines.settings import SETTINGS
-from lyapnet.comparison.baselines.training import BaselineTraining, best_policy
+from lyapnet.comparison.baselines.training import BaselineTraining, _logger, best_policy
 from lyapnet.comparison.reference_problems import bounded_problem
 from lyapnet.comparison.scoring import costs_of
 from lyapnet.errors import LyapnetError, UsageError
@@ -109,6 +110,16 @@ def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
     assert sorted(drawn) == [p.environment_steps for p in whole.curve], "logged once"
     other = trained(tmp_path / "other", baseline_of(method, 2400, seed=1))
     assert other.curve[-1].cost != whole.curve[-1].cost
+
+
+def test_a_resumed_training_writes_in_a_later_second(tmp_path):
+    """Files of one second are read in the order of process and count as text, in which 10 comes before 9."""
+    now = int(time.time()) + 1
+    (tmp_path / f"events.out.tfevents.{now}.host.1.9").touch()
+    _logger(tmp_path, 5)
+    others = [path.name for path in tmp_path.glob("events.out.tfevents.*") if not path.name.endswith("host.1.9")]
+    assert len(others) == 2
+    assert all(int(name.split(".")[3]) > now for name in others)
 
 
 @pytest.mark.parametrize("method", SETTINGS)

@@ -171,12 +171,23 @@ def best_policy(baseline: Baseline, folder: Path) -> tuple[Path, BaselinePolicy]
 
 def _logger(folder: Path, resumed_at: int | None) -> Logger:
     """SB3's logger for TensorBoard, in which what was logged after the step of a resumption is not shown."""
+    if resumed_at is not None:
+        _wait_for_another_second(folder)
     output = TensorBoardOutputFormat(str(folder))
     if resumed_at is not None:
         assert output.writer is not None
         output.writer.close()
         output.writer = SummaryWriter(str(folder), purge_step=resumed_at + 1)
     return Logger(str(folder), [output])
+
+
+def _wait_for_another_second(folder: Path) -> None:
+    """Wait until a new event file comes after those that are there: they are read in the order of their names, of which
+    the second is a number of ten digits, and what tells files of one second apart is not in that order.
+    """
+    seconds = [int(path.name.split(".")[3]) for path in folder.glob("events.out.tfevents.*")]
+    while seconds and time.time() < max(seconds) + 1:
+        time.sleep(0.05)
 
 
 def _mean_return(model: BaseAlgorithm) -> float | None:

@@ -72,7 +72,7 @@ def rows_of(point: Point, run: Run) -> Iterator[SweepRow]:
     result = json.loads(read_file(run.folder / EVALUATION))
     record = run.record()
     for one, member in zip(result.get("seeds", [result]), run.members(config), strict=True):
-        measures = {key: one[key] for key in MEASURES}
+        measures = {key: one.get(key) for key in MEASURES}
         seconds, peak = record["training_seconds"], record["peak_bytes"]
         near = _seconds_to_near(member.folder)
         yield SweepRow(name, point.key, point.value, one["seed"], measures, near, seconds, peak, member.best)

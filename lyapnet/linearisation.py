@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.contracts import TO_WRITE
+from lyapnet.cost import goal_in_words
 from lyapnet.derivatives import jacobian
 from lyapnet.errors import one_line
 from lyapnet.expansions import Expansion, in_float64, riccati
@@ -75,13 +76,6 @@ def singular(error: RuntimeError) -> Missing:
     )
 
 
-def goal_in_words(problem: Problem) -> str:
-    """The goal, and where nobody named it that it stands in for one."""
-    if problem.cost.goal is None:
-        return "the origin, which stands in for a target: nobody named one"
-    return f"the goal {_listed(problem.goal)}"
-
-
 def _missing_values(problem: Problem, f: State, g: InputMatrix) -> Missing | None:
     for symbol, value in (("f", f[:, None]), ("g", g)):
         bad = torch.nonzero(~value.isfinite())
@@ -91,7 +85,7 @@ def _missing_values(problem: Problem, f: State, g: InputMatrix) -> Missing | Non
             if problem.cost.goal is not None:
                 remedy = "choose a target at which it is"
             rate = f"the rate of {problem.system.state_names[row]} has {float(value[row, column])} there"
-            return Missing(f"{symbol} is not finite at {goal_in_words(problem)}; {rate}", remedy)
+            return Missing(f"{symbol} is not finite at {goal_in_words(problem.cost, problem.goal)}; {rate}", remedy)
     return None
 
 
@@ -132,7 +126,3 @@ def _missing_cost(problem: Problem) -> Missing | None:
             if not part.isfinite().all():
                 return Missing(f"{symbol} has no finite {what} at the goal", TO_WRITE)
     return None
-
-
-def _listed(values: Tensor) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in values.tolist()) + ")"

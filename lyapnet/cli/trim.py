@@ -1,7 +1,6 @@
 """lyapnet trim."""
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,8 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from lyapnet.cli.options import FIRST, Debug
-from lyapnet.training.stages import PATIENCE, Stages
+from lyapnet.cli.options import Debug, stages_of
 
 
 def trim(
@@ -33,7 +31,7 @@ def trim(
         raise UsageError(
             "Expected a target whose control is solved for, got target_control; add target_control=null to the command."
         )
-    with Stages(Console(file=sys.stderr, highlight=False, markup=False), "trim", PATIENCE, FIRST) as report:
+    with stages_of("trim") as report:
         report("solving for the operating point")
         system, found = operating_point(resolved, parts_of(resolved))
     units = {

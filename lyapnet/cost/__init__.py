@@ -1,7 +1,7 @@
 """What a problem charges: a running cost and a terminal cost."""
 
 from lyapnet.cost.base import Cost
-from lyapnet.cost.goal import reason_for_no_goal, spread
+from lyapnet.cost.goal import goal_in_words, reason_for_no_goal, spread
 from lyapnet.cost.made_of_another import (
     MadeOfAnother,
     ObstacleCost,
@@ -28,6 +28,7 @@ __all__ = [
     "QuadraticCost",
     "RegulatorTail",
     "TargetCost",
+    "goal_in_words",
     "innermost",
     "is_quadratic",
     "is_quadratic_about_target",

@@ -22,9 +22,7 @@ def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "
         goal: (n,), that of the cost, or the origin.
         x: states (b, n) where the task begins.
     """
-    where = f"the goal {_listed(goal)}"
-    if cost.goal is None:
-        where = "the origin, which stands in for a target: nobody named one"
+    where = goal_in_words(cost, goal)
     reach = (x - goal).abs().amax(0)
     for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
         values = function(x).detach()
@@ -39,6 +37,13 @@ def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "
         if float(values[lowest]) < least:
             return f"{symbol} is negative, {float(values[lowest]):.3g}, at x = {_listed(x[lowest])}"
     return ""
+
+
+def goal_in_words(cost: Cost, goal: Float[Tensor, " n"]) -> str:
+    """The goal, and where nobody named it that it stands in for one."""
+    if cost.goal is None:
+        return "the origin, which stands in for a target: nobody named one"
+    return f"the goal {_listed(goal)}"
 
 
 def spread(cost: PerState) -> Float[Tensor, ""]:

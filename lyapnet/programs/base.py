@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lyapnet.cost import spread
-from lyapnet.errors import DivergenceError
+from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
 from lyapnet.types import PerState, ValuePath
@@ -41,6 +41,7 @@ class Program(ABC):
     degree: ClassVar[int]  # all terms but J are of this degree in units of cost
     weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
     recommended: ClassVar[Mapping[str, float | bool]] = {}  # arguments in the standard recipe
+    needs_goal: ClassVar[bool] = False  # whether V is a distance to a goal, towards which it falls
     pointwise: ClassVar[float] = 0.0  # the weight of its condition at points off the closed loops, unless it is given
 
     constraint: float = 1.0
@@ -125,8 +126,13 @@ class Program(ABC):
             reason: why it has none.
 
         Raises:
-            UsageError: the program is about a goal.
+            UsageError: it needs one.
         """
+        if self.needs_goal:
+            raise UsageError(
+                f"Expected a task with a goal, to which V falls, got none: {reason}; take program.name=value, or name "
+                "target: in the config."
+            )
         return self
 
     def check_terminal(self, exact: bool) -> None:  # noqa: B027  (most programs have nothing to refuse)

@@ -31,6 +31,7 @@ class LyapunovProgram(Program):
     """
 
     degree: ClassVar[int] = 1
+    needs_goal: ClassVar[bool] = True
     weighted: ClassVar[tuple[str, ...]] = (*Program.weighted, "bound")
     recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
         {"constraint": 50, "terminal": 50, "trajectory_cost": 1, "margin": 0.02, "bound": 1}
@@ -51,12 +52,6 @@ class LyapunovProgram(Program):
     def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
         """And that V decreases along the closed loop, within 1 % of V(0, x₀)."""
         return Tolerances(radius, 1e-2, cost)
-
-    def without_goal(self, reason: str) -> "LyapunovProgram":
-        raise UsageError(
-            f"Expected a task with a goal, to which V falls, got none: {reason}; take program.name=value, or name "
-            "target: in the config."
-        )
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
         return rate + (1 + self.margin) * running

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.errors import UsageError
 from lyapnet.networks import kept_states
 from lyapnet.programs.base import Program
 from lyapnet.programs.pointwise import PointwiseCondition
@@ -36,6 +35,7 @@ class RegionProgram(Program):
     """
 
     degree: ClassVar[int] = 1
+    needs_goal: ClassVar[bool] = True
     pointwise: ClassVar[float] = 5.0
     recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
         {"constraint": 0, "trajectory_cost": 1, "share": 0.4, "growth": 0.06}
@@ -50,12 +50,6 @@ class RegionProgram(Program):
             raise ValueError(f"Expected share in (0, 1], got {self.share}; V cannot pay for more than the cost.")
         if not self.growth >= 0:
             raise ValueError(f"Expected growth ≥ 0, got {self.growth}; the region is to grow.")
-
-    def without_goal(self, reason: str) -> "RegionProgram":
-        raise UsageError(
-            f"Expected a task with a goal, to which V falls, got none: {reason}; take program.name=value, or name "
-            "target: in the config."
-        )
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
         return rate + self.share * running

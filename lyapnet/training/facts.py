@@ -57,10 +57,9 @@ def facts_of(
     with float64_defaults():  # as the problem is built, so that f computes with the same constants
         exact = in_float64(problem)
         tell(_task(exact), *jump_facts(exact))
-        around = linearised(exact)
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
-        elif around.missing_values is not None:
+        elif (around := linearised(exact)).missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
             tell(_goal(exact, around, problem.goal.dtype), *_modes(exact, around))

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 
 import torch
 from torch import Tensor
@@ -33,9 +33,7 @@ WAVES = 6  # random controls from which optima are sought where there is no expa
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum
 CHUNK = 4  # states at a time that the oracle is asked for
-SECONDS = (
-    30.0  # of this thread's work, whatever else the machine does, in which optima are sought, in each of three ways
-)
+SECONDS = 30.0  # of this thread's work, whatever else the machine does, for each of three ways to seek optima
 FINER, MANY = 0.999, 0.25  # by which share an oracle's are better, and of how many, for it to go on
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
 
@@ -136,12 +134,7 @@ def _by_oracle(
             first + CHUNK >= FAR and gained < MANY * min(first + CHUNK, len(few))
         ):
             break
-    if not further:
-        return optimum, None
-    whole = further[0]
-    for each in further[1:]:
-        whole = _joined(whole, each)
-    return optimum, whole
+    return optimum, reduce(_joined, further) if further else None
 
 
 def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:

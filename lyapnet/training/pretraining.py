@@ -195,17 +195,10 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
     for k in range(ROUNDS + 1):
         again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
-        within = f"within {SECONDS[min(k, 1)]:.0f} s of work"
+        steps, rate, seconds = (part[min(k, 1)] for part in (STEPS, RATE, SECONDS))
+        within = f"within {seconds:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        _lower(
-            learner.V,
-            examples,
-            rows,
-            max(1, int(share * STEPS[min(k, 1)])),
-            RATE[min(k, 1)],
-            progress,
-            SECONDS[min(k, 1)],
-        )
+        _lower(learner.V, examples, rows, max(1, int(share * steps)), rate, progress, seconds)
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:

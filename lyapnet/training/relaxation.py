@@ -43,8 +43,8 @@ class Relaxation(NamedTuple):
     def __str__(self) -> str:
         said = f"constraints: penalty of {self.weight:.3g}/s at h = 0"
         if self.kept == self.states:
-            dearer = f"{self.price:.3g} more than without" if self.cost_ratio is None else ""
-            at = dearer or f"{self.cost_ratio:.3g} times the cost without"
+            ratio, price = self.cost_ratio, f"{self.price:.3g} more than without"
+            at = price if ratio is None else f"{ratio:.3g} times the cost without"
             return f"{said}; optima from {self.states} states keep them, at {at}"
         return (
             f"{said}; from {self.states - self.kept} of {self.states} states no path was found that keeps them with "

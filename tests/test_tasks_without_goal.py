@@ -11,6 +11,7 @@ from lyapnet.after_horizon import choose_law
 from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.cli import main
+from lyapnet.cost import ObstacleCost
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.optimality import in_spreads
@@ -139,6 +140,14 @@ def test_a_regulator_has_a_goal():
     problem = far(cost=lyapnet.QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
     assert problem.has_goal
     assert problem.goal.tolist() == [0.0]
+
+
+@pytest.mark.parametrize(("center", "goal"), [(0.6, True), (0.0, False)])
+def test_the_tail_of_an_obstacle_may_reach_a_goal(center, goal):
+    """The bump at the origin is 8e-5, of slope 0.003, or all of 8."""
+    regulator = lyapnet.QuadraticCost([[1.0]], [[1.0]], [[1.0]])
+    problem = far(cost=ObstacleCost(regulator, [0], [center], 0.25, 8.0))
+    assert problem.has_goal is goal
 
 
 def test_the_exact_v_has_no_regret_and_another_one_has():

@@ -8,7 +8,8 @@ from lyapnet.cost.base import Cost
 from lyapnet.types import PerState
 
 THIN = 1e-3  # of the mean size of costs, which their spread counts for at the least: X₀ may be a point
-VANISHING = 1e-3  # of what q and φ are in the mean, below which they vanish
+VANISHING = 1e-2  # of what q and φ are in the mean, below which they vanish: the tail of an obstacle may reach a goal
+NEGATIVE = 1e-3  # of the same, below zero: there V is no distance
 
 
 def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "b n"]) -> str:
@@ -23,18 +24,18 @@ def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "
         x: states (b, n) where the task begins.
     """
     where = goal_in_words(cost, goal)
-    reach = (x - goal).abs().amax(0)
+    distance = (x - goal).abs().median(0).values
     for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
         values = function(x).detach()
-        least = -VANISHING * float(values.abs().mean())
+        size = float(values.abs().mean())
         with torch.enable_grad():
             leaf = goal.detach().clone().requires_grad_()
             value = function(leaf)
             slope = torch.autograd.grad(value, leaf, materialize_grads=True)[0] if value.requires_grad else 0 * goal
-        if abs(float(value.detach())) > -least or float((slope * reach).abs().max()) > -least:
+        if max(abs(float(value.detach())), float((slope * distance).abs().max())) > VANISHING * size:
             return f"{symbol} is {float(value.detach()):.3g}, of slope {_listed(slope)}, at {where}"
         lowest = int(values.argmin())
-        if float(values[lowest]) < least:
+        if float(values[lowest]) < -NEGATIVE * size:
             return f"{symbol} is negative, {float(values[lowest]):.3g}, at x = {_listed(x[lowest])}"
     return ""
 

@@ -18,9 +18,10 @@ from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.stages import Report, silent
-from lyapnet.types import PerState, State, StatePath
+from lyapnet.types import Control, PerState, State, StatePath
 
 STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
+BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
 SHARES = {1: 0.25, 2: 0.5}  # of those steps, for V of one or two states
 GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
@@ -38,9 +39,11 @@ class Examples(NamedTuple):
     x: State
     value: PerState  # V(t_n, x_n)
     after: Tensor  # t_{n+1}
-    drifted: State  # F(x_n, u*), where the control that costs nothing leads
-    gradient: State  # V_x(t_{n+1}, drifted)
-    weight: Tensor  # L⁻¹Bᵀ (k, m, n), LLᵀ = ℓ_uu + Δt BᵀHB, B = F_u/Δt: for what a wrong V_x costs
+    drifted: State  # F(x_n, r), where the control r that costs nothing leads
+    by_control: Tensor  # B (k, n, m), F_u/Δt there
+    slope: Control  # ℓ_u there
+    weight: Tensor  # W (k, m, m), ℓ_uu + Δt BᵀHB
+    control: Control  # the best one, the minimiser of ½ (u − r)ᵀW(u − r) + bᵀ(u − r) over U, b = BᵀV_x + ℓ_u
     cost: PerState  # what errors of V are held against: J of the trajectory, or the median of all if that is more
     rate: PerState  # what excess cost per second is held against: the same per second of T
 
@@ -91,10 +94,12 @@ def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: fl
 
 
 def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor]) -> Examples:
-    """The rows at some deviations (N, b, n) from the finite trajectories."""
+    """The rows at some deviations (N, b, n) from the finite trajectories, where f, g and the cost are defined."""
     problem, optimum = in_float64(problem), _finite(optimum)
     parts = zip(*(_columns(problem, optimum, each) for each in deviations), strict=True)
-    return Examples(*(torch.cat(columns) for columns in parts))
+    examples = Examples(*(torch.cat(columns) for columns in parts))
+    defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
+    return examples.each(lambda column: column[defined])
 
 
 def _finite(optimum: Optimum) -> Optimum:
@@ -139,33 +144,44 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tens
     B = free.by_control
     values, vectors = torch.linalg.eigh(free.curvature + dt * B.mT @ H @ B)
     floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
-    weight = (vectors / values.maximum(floor).sqrt()[..., None, :]).mT @ B.mT
-    target = gradient[1:] + apply(H, free.x - x[1:])
+    weight = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
+    b = apply(B.mT, gradient[1:] + apply(H, free.x - x[1:])) + free.slope
+    u = problem.controls.minimise_now(weight / 2, problem.cost.about_rest(weight / 2, b))
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _costs_of(problem, optimum)
     rate = cost / problem.horizon.duration
     if problem.horizon.stationary:
         rate = rate.maximum(-value.diff(dim=0) / dt)
-    return [y.flatten(0, 1).detach() for y in (t[:-1], now, here, t[1:], free.x, target, weight, cost, rate)]
+    columns = (t[:-1], now, here, t[1:], free.x, B, free.slope, weight, u, cost, rate)
+    return [y.flatten(0, 1).detach() for y in columns]
 
 
-def errors(V: ValueFunction, examples: Examples, rows: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
-    """Of some of the examples: the means of (V − V*)²/J², and of T/(2J) ‖L⁻¹Bᵀ(V_x − V_x*)‖².
+def errors(
+    V: ValueFunction, examples: Examples, problem: Problem, rows: Tensor | slice = slice(None)
+) -> tuple[Tensor, Tensor]:
+    """Of some of the examples: the means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
 
-    The second is what the held controls of V cost beyond the optimum, to second order, as a share of J: a step with
-    controls u + e costs ½ Δt eᵀ(ℓ_uu + Δt BᵀHB)e more. Of a stationary V, J stands for V* and J/T for ℓ at each state.
+    Q(u) = ½ (u − r)ᵀW(u − r) + bᵀ(u − r) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
+    the second is zero where V asks for the optimal control u*, and convex in V_x, of slope B(u* − u). Without limits it
+    is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
+    all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state.
+
+    Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
-    t, x, value, after, drifted, gradient, weight, cost, rate = (column[rows] for column in examples)
-    wrong = weight @ (V.value_and_state_gradient(after, drifted)[1] - gradient)[..., None]
-    excess = ((wrong**2).sum((-2, -1)) / (2 * rate)).mean()
-    return (((V(t, x) - value) / cost) ** 2).mean(), excess
+    t, x, value, after, drifted, B, slope, W, best, cost, rate = (column[rows] for column in examples)
+    b = apply(B.mT, V.value_and_state_gradient(after, drifted)[1]) + slope
+    with torch.no_grad():
+        u = problem.controls.minimise_now(W / 2, problem.cost.about_rest(W / 2, b))
+    # (u* − u)ᵀ(½ W(u* + u − 2r) + b)
+    excess = ((best - u) * (apply(W, (best + u) / 2 - problem.rest.to(u)) + b)).sum(-1)
+    return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
 
 
-def misfit(V: ValueFunction, examples: Examples) -> float:
+def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:
     """What a fit lowers, at SOME of the examples."""
     rows = torch.linspace(0, len(examples.t) - 1, min(SOME, len(examples.t))).long()
     some = examples.each(lambda column: column[rows])
     with torch.no_grad():
-        value_error, excess = errors(V, some.to(next(V.parameters())))
+        value_error, excess = errors(V, some.to(next(V.parameters())), problem)
     return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
 
 
@@ -198,7 +214,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         steps, rate, seconds = (part[min(k, 1)] for part in (STEPS, RATE, SECONDS))
         within = f"within {seconds:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        _lower(learner.V, examples, rows, max(1, int(share * steps)), rate, progress, seconds)
+        _lower(learner.V, examples, learner.problem, rows, max(1, int(share * steps)), rate, progress, seconds)
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
@@ -210,9 +226,16 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     learner.V.load_state_dict(best)
 
 
+def fit_briefly(learner: Learner, examples: Examples) -> None:
+    """Lower both errors of V at examples in a few steps."""
+    rows = stream(learner.seed, START, 6)
+    _lower(learner.V, examples, learner.problem, rows, BRIEF, RATE[0], lambda done, total: None, SECONDS[0])
+
+
 def _lower(
     V: ValueFunction,
     examples: Examples,
+    problem: Problem,
     generator: torch.Generator,
     steps: int,
     rate: float,
@@ -231,7 +254,7 @@ def _lower(
             group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
         progress(k, steps)
         rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
-        value_error, excess = errors(V, examples, rows)
+        value_error, excess = errors(V, examples, problem, rows)
         optimizer.zero_grad()
         (VALUE_WEIGHT * value_error + excess).backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)

@@ -27,7 +27,7 @@ from lyapnet.training.candidates import CALM, Candidate, Start
 from lyapnet.training.initial_networks import kept_of, network_of, take, take_nothing
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
-from lyapnet.training.pretraining import Examples, examples_of, fit, misfit, relative_misfit
+from lyapnet.training.pretraining import Examples, examples_of, fit, fit_briefly, misfit, relative_misfit
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import State
 
@@ -35,6 +35,7 @@ STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's
 CLOSE, FEW = 1e-5, 16  # share of the cost by which nothing may improve on a law that leaves nothing to fit, from FEW
 LEVELS = tuple(4.0**-k for k in range(9))  # of the regulator's mean value on X₀, up to which it may be taken for right
+MISLEADING = 0.1  # misfit from which on an expansion says little of how wrong it is once it is fitted
 SMALLER = "choose a smaller X₀, or a shorter horizon"
 REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 
@@ -166,7 +167,7 @@ def _take_least_wrong(
     x0: State,
 ) -> None:
     """Put into the networks what a fit to examples begins with: of several expansions, and none, or of several levels
-    up to which the regulator is taken for right, the least wrong one.
+    up to which the regulator is taken for right, the least wrong one; where all mislead, after a brief fit.
 
     An expansion says much near its own path, and away from it, in a task with limits or several ways to the goal, worse
     than nothing.
@@ -181,13 +182,21 @@ def _take_least_wrong(
         else:
             take(network, problem, expansion, kept, x0, level)
 
-    wrong = list[float]()
     choices: list[tuple[Expansion | None, float]] = [(each, 1.0) for each in (*expansions, None)]
     if problem.horizon.stationary:
         choices = [(expansions[0], level) for level in LEVELS]
-    for choice in choices:
-        put(choice, first, calm[0])
-        wrong.append((relative_misfit if problem.horizon.stationary else misfit)(first.V, examples))
+
+    def wrongs(briefly_fitted: bool = False) -> Iterator[float]:
+        for choice in choices:
+            put(choice, first, calm[0])
+            if briefly_fitted:
+                fit_briefly(first, examples)
+            stationary = problem.horizon.stationary
+            yield relative_misfit(first.V, examples) if stationary else misfit(first.V, examples, problem)
+
+    wrong = list(wrongs())
+    if min(wrong) > MISLEADING and not problem.horizon.stationary:
+        wrong = list(wrongs(briefly_fitted=True))
     best = choices[wrong.index(min(wrong))]
     for learner, own in zip(learners, calm, strict=True):
         put(best, learner, own)

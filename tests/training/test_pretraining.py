@@ -11,6 +11,7 @@ from lyapnet.networks import FCN, Scaling
 from lyapnet.policy import SampledPolicy
 from lyapnet.programs import ValueProgram
 from lyapnet.rollout import Rollout
+from lyapnet.sets import ControlBox
 from lyapnet.systems import Linear
 from lyapnet.training import pretraining
 from lyapnet.training.learner import Learner
@@ -45,7 +46,7 @@ def test_examples_are_the_value_function_of_a_linear_problem(problem):
     assert torch.equal(along, optimum.path.x[:-1])
     apart = (along[:, :, None] - along[:, None]).abs().max()
     assert 0.1 * apart < (near - along).abs().max() <= apart / 2
-    value_error, excess = errors(shifted(problem, 0.0), examples)
+    value_error, excess = errors(shifted(problem, 0.0), examples, problem)
     assert float(value_error.detach()) < 1e-20
     assert float(excess.detach()) < 1e-20
 
@@ -59,10 +60,28 @@ def test_the_excess_is_what_wrong_controls_cost(problem):
     along = examples_of(
         problem, optimum._replace(path=optimum.path._replace(x=path.x), expansion=at(path.x, problem)), GENERATOR
     )
-    _, excess = errors(V, along)
+    _, excess = errors(V, along, problem)
     expected = float(path.cost - optimum.path.cost)
     assert expected > 0.01
     assert float(excess.detach()) * float(along.cost[0]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_wrong_slope_costs_nothing_where_the_control_stays_at_its_limit():
+    """ẋ = u with |u| ≤ 1 from so far away that u* is at its limit all the way."""
+    free = problem_of(Linear([[0.0]], [[1.0]]), QuadraticCost([[1.0]], [[0.01]], [[1.0]]), steps=10, dt=0.1)
+    limited = free.replaced(controls=ControlBox([-1.0], [1.0]))
+    optimum = optimal_trajectories(limited, torch.tensor([[5.0], [8.0]]), torch.zeros(10, 2, 1))
+    assert bool((optimum.path.u == -1).all())
+    start = examples_of(limited, optimum, GENERATOR).each(lambda column: column[:2])  # both states x₀
+
+    def excess(share, problem=limited):
+        scaled = Formula(lambda t, x: share * (optimum.expansion.gradient[1] * x).sum(-1))
+        return float(errors(scaled, start, problem)[1].detach())
+
+    assert excess(1.0) == pytest.approx(0, abs=1e-12)
+    assert excess(0.5) == pytest.approx(0, abs=1e-12)
+    assert excess(0.5, free) > 1, "the twin without limits"
+    assert excess(-1.0) > 0.5, "the twin at the other limit"
 
 
 def at(x, problem):
@@ -93,9 +112,9 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     problem, seen, unseen = swing
     examples, others = (examples_of(problem, optimum, GENERATOR) for optimum in (seen, unseen))
     learner = learner_of(problem, float(examples.cost.mean()))
-    before = [float(error.detach()) for error in errors(learner.V, others)]
+    before = [float(error.detach()) for error in errors(learner.V, others, problem)]
     fit(learner, seen, examples)
-    after = [float(error.detach()) for error in errors(learner.V, others)]
+    after = [float(error.detach()) for error in errors(learner.V, others, problem)]
     assert after[0] < before[0] / 20
     assert after[1] < before[1] / 20
 
@@ -167,7 +186,7 @@ def test_errors_count_against_what_their_own_trajectory_costs(problem):
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
     examples, exact = examples_of(problem, optimum, GENERATOR), shifted(problem, 0.0)
     wrong = Formula(lambda t, x: 1.1 * exact(t, x))
-    off = [errors(wrong, examples, torch.tensor([row]))[0].item() for row in range(3)]
+    off = [errors(wrong, examples, problem, torch.tensor([row]))[0].item() for row in range(3)]
     assert off == pytest.approx([0.01 * 1e-4, 0.01, 0.01], rel=1e-6)
 
 
@@ -187,9 +206,9 @@ def test_the_states_that_a_law_visits_are_examples(problem):
         problem, optimum, led_path._replace(x=optimum.path.x + 0.01 * (led_path.x - optimum.path.x))
     )
     assert_close(near.x.reshape(x.shape), best + 0.01 * (led - best), msg="and what lies near it is not")
-    for error in errors(shifted(problem, 0.0), visited):
+    for error in errors(shifted(problem, 0.0), visited, problem):
         assert float(error.detach()) < 1e-20
-    assert float(errors(shifted(problem, 0.1), visited)[1].detach()) > 1e-6
+    assert float(errors(shifted(problem, 0.1), visited, problem)[1].detach()) > 1e-6
     assert len(examples_of(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
 
 

@@ -150,6 +150,14 @@ class ConstraintsConfig:
 
 
 @dataclass
+class DomainConfig:
+    """Where f, g, q and φ are defined, besides the borders that are found; see constraints for what is to be kept."""
+
+    lower: dict[str, float] = option({}, "Borders below, of states by name.")
+    upper: dict[str, float] = option({}, "Borders above, likewise.")
+
+
+@dataclass
 class InitialStatesConfig:
     """X₀, the box of initial states; a single number is the bound of every state."""
 
@@ -263,6 +271,7 @@ class Config:
     cost: CostConfig = field(default_factory=CostConfig)
     controls: ControlsConfig = field(default_factory=ControlsConfig)
     constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
+    domain: DomainConfig = field(default_factory=DomainConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
     target: Any = option(

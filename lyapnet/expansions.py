@@ -261,7 +261,8 @@ def in_float64(problem: Problem) -> Problem:
 def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
     """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it.
 
-    A path that jumps over a pole of f, g, q or φ, where it divides by zero, has no finite cost: no trajectory does.
+    A path that leaves the domain has no finite cost, nor has one that jumps over a pole of f, g, q or φ, where it
+    divides by zero: no trajectory does.
     """
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
@@ -273,6 +274,8 @@ def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State
     x, poles = torch.stack(x).nan_to_num(), _poles_of(problem)
     if poles is not None:
         J = J.masked_fill(poles.crossed(x.double().cpu()).to(J.device), torch.inf)
+    if problem.domain is not None:
+        J = J.masked_fill(problem.domain.left(x), torch.inf)
     return Path(x, torch.stack(u).nan_to_num(), J)
 
 

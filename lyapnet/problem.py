@@ -1,6 +1,7 @@
 """The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from lyapnet.constraints import Constraints
 from lyapnet.contracts import called, check_function, check_memory, copied
 from lyapnet.cost import Cost, PenaltyCost, reason_for_no_goal
+from lyapnet.domain import Border, Domain, DomainCost, as_written, found_borders, size_of, within
 from lyapnet.errors import UsageError
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.linear_algebra import apply, convex_or
@@ -107,7 +109,7 @@ class Problem(nn.Module):
         if "no_goal" not in self.findings:
             try:
                 own = copied(self)
-                cost = own.cost.cost if isinstance(own.cost, PenaltyCost) else own.cost
+                cost = as_written(own.cost)
                 goal = torch.zeros_like(own.initial_states.lower) if cost.goal is None else cost.goal
                 self.findings["no_goal"] = reason_for_no_goal(cost, goal, own._typical_states())
             except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
@@ -126,7 +128,14 @@ class Problem(nn.Module):
             if n in (N // 2, N):
                 states.append(x)
         every = torch.cat(states)
-        return every[every.isfinite().all(-1)]
+        kept = every.isfinite().all(-1)
+        return every[kept if self.domain is None else kept & ~self.domain.left(every[None])]
+
+    @property
+    def domain(self) -> Domain | None:
+        """The states at which f, g, q and φ are defined; None where those are all that there are, or nobody asked."""
+        domain = getattr(self.system, "domain", None)
+        return domain if isinstance(domain, Domain) else None
 
     @property
     def rest(self) -> Control:
@@ -208,6 +217,31 @@ class Problem(nn.Module):
             return self
         cost = PenaltyCost(self.cost, self.constraints, self.constraints.margin, weight, self.horizon.dt)
         return self.replaced(cost=cost.to(self.initial_states.lower))
+
+    def borders(self) -> list[Border]:
+        """Where f, g, q and φ end, each state by itself; none where they are finite everywhere."""
+        own = copied(self)
+        system, cost = own.system, own.cost
+        functions = {"f": system.f, "g": system.g, "q": cost.state, "φ": cost.terminal}
+        try:
+            return found_borders(functions, own.initial_states, system.state_names)
+        except Exception:  # of any kind: a function of the user's that refuses such states
+            return []
+
+    @torch.no_grad()
+    def within(self, borders: Sequence[Border]) -> "Problem":
+        """The problem in the domain between some borders: beyond them its functions are those of the nearest state just
+        within, and each step that is spent there costs about as much as a closed loop, in units of a state's size.
+        """
+        if not borders:
+            return self
+        box, horizon = self.initial_states, self.horizon
+        domain = Domain(self.system.state_names, size_of(box), borders)
+        x = box.sample(TRIED, torch.Generator().manual_seed(0))
+        running, terminal = (part.abs().mean() for part in (self.cost.state(x), self.cost.terminal(x)))
+        price = float(horizon.duration * running + terminal) or 1.0
+        cost = DomainCost(self.cost, domain, price, horizon.dt)
+        return self.replaced(system=within(self.system, domain), cost=cost.to(box.lower))
 
     def check(self) -> None:
         """Hold f, g, the cost and the controls against their contracts on states of X₀, in float64.
@@ -317,7 +351,7 @@ class Problem(nn.Module):
         """
         own = copied(self)
         box, m = own.initial_states, own.system.m
-        cost = own.cost.cost if isinstance(own.cost, PenaltyCost) else own.cost  # what training adds is its own
+        cost = as_written(own.cost)  # what keeps closed loops off constraints, and in a domain, is lyapnet's own
         generator = torch.Generator().manual_seed(0)
         x = box.sample(3, generator)
         thin = torch.where(box.widths > 0, 0.0, torch.where(box.center == 0, 1.0, box.center.abs()))

@@ -25,6 +25,7 @@ LEVELS = (
     {"sizes"},
     {"files"},
     {"cluster", "constraints", "contracts", "cost", "derivatives", "devices", "horizon", "schema", "sets", "systems"},
+    {"domain"},
     {"calculus", "checkpoint", "graphs", "operating_points", "problem"},
     {"expansions", "family", "networks"},
     {"after_horizon", "linearisation", "policy", "regulator"},
@@ -41,10 +42,10 @@ LEVELS = (
     {"__main__"},
 )
 MATHEMATICS = {
-    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "derivatives", "errors", "expansions",
-    "family", "files", "graphs", "horizon", "interpolation", "linear_algebra", "linearisation", "networks",
-    "operating_points", "policy", "problem", "programs", "random_streams", "regulator", "rollout", "sets", "shapes",
-    "systems", "types",
+    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "derivatives", "domain", "errors",
+    "expansions", "family", "files", "graphs", "horizon", "interpolation", "linear_algebra", "linearisation",
+    "networks", "operating_points", "policy", "problem", "programs", "random_streams", "regulator", "rollout", "sets",
+    "shapes", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lyapnet.build.classes import DTYPES, Parts, float64_defaults, instance_of, section
 from lyapnet.build.constraints import ball_of, build_constraints
+from lyapnet.build.domain import in_domain
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
 from lyapnet.build.free_controls import refuse_free_controls
@@ -75,6 +76,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             _refuse_free_controls_of_own_cost(problem)
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
+        problem = in_domain(config.domain, problem)
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
             problem = without_end(problem)
         return problem.to(dtype)

@@ -66,9 +66,11 @@ class Evaluation(NamedTuple):
         if self.table.violated is not None:
             used["violated_fraction"] = float(self.table.violated.double().mean())
             used["constraints"] = self.table.violations(names_of(self.problem.constraints))
+        if self.table.left is not None:
+            used["left_domain_fraction"] = float(self.table.left.double().mean())
         return {
-            **self.table.summary(),
-            **paper,
+            **plain(self.table.summary()),
+            **plain(paper),
             **self._references(),
             **({"terminal_errors": self._terminal_errors()} if self.problem.has_goal else {}),
             **used,
@@ -164,6 +166,9 @@ def evaluation(
     trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
+    if (domain := controller.problem.domain) is not None:  # beyond it nothing is known of what is paid
+        left = domain.left(trajectory.x)
+        table = dataclasses.replace(table, left=left, cost=table.cost.masked_fill(left, torch.inf))
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     corner, problem = dearest_corner(controller), controller.problem
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)

@@ -34,6 +34,7 @@ class StateTable:
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
     worst: Tensor | None = None  # (b, k): max_n h(x_n), where there are constraints
     worst_time: Tensor | None = None  # (b, k): when
+    left: Tensor | None = None  # (b,) bool: whether the closed loop leaves the domain, where there is one
     has_goal: bool = True  # of the task; without one only costs, V and constraints say something
 
     def rows(self, chosen: slice) -> "StateTable":

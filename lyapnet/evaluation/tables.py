@@ -34,7 +34,8 @@ ROWS = {
     "satisfied_fraction_1e-3": "… within 0.1 %",
 }
 REFERENCES = ("held", "lqr")  # costs from the same states, shown as a ratio where the optimum is known
-VIOLATED = {"violated_fraction": "constraints violated, share of states"}  # where there are some
+LEFT = "left_domain_fraction"
+KEPT = {"violated_fraction": "constraints violated, share of states", LEFT: "domain left, share of states"}  # if any
 
 
 def evaluation_table(title: str, result: dict[str, Any]) -> Table:
@@ -79,7 +80,7 @@ def _rows(result: dict[str, Any]) -> dict[str, str]:
     known = result.get("regret", result["cost_ratio"]) is not None
     unknown = ("cost_mean",) if known else ("cost_ratio", "regret")
     left_out = {f"{name}_{key}" for name in REFERENCES for key in unknown}
-    labels = {**ROWS, **VIOLATED}
+    labels = {**ROWS, **KEPT}
     if "regret" in result:
         left_out.add("cost_ratio")
         labels["value_error"] = "value error, mean |V(0, x₀) − J*| / spread of J*"

@@ -10,7 +10,8 @@ from torch import Tensor
 from lyapnet.build.classes import float64_defaults
 from lyapnet.contracts import SLOPE, jumps
 from lyapnet.cost import PenaltyCost
-from lyapnet.expansions import in_float64
+from lyapnet.domain import as_written
+from lyapnet.expansions import in_float64, path_under
 from lyapnet.horizon import TABLEAUX
 from lyapnet.linearisation import (
     NAME_A_GOAL,
@@ -23,6 +24,7 @@ from lyapnet.linearisation import (
 )
 from lyapnet.operating_points import HELD
 from lyapnet.problem import Problem
+from lyapnet.random_streams import START, stream
 from lyapnet.rollout import Rollout
 from lyapnet.training.candidates import CALM, Candidate, Start
 from lyapnet.training.fact import Fact, listed
@@ -35,6 +37,7 @@ from lyapnet.training.start_cache import kept_or_chosen
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-10  # of A, with states and controls in units of their own, above which one state acts on another
 ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
+LOOPS = 64  # from as many states it is seen whether closed loops leave the domain
 ROUNDINGS = 100  # of the task's precision, for a rate that sums several terms
 
 
@@ -57,6 +60,8 @@ def facts_of(
     with float64_defaults():  # as the problem is built, so that f computes with the same constants
         exact = in_float64(problem)
         tell(_task(exact), *jump_facts(exact))
+        if exact.domain is not None:
+            tell(Fact("domain", str(exact.domain)))
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
         elif (around := linearised(exact)).missing_values is not None:
@@ -77,14 +82,28 @@ def facts_of(
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))
         return facts
-    tell(*_chosen(start))
+    tell(*_chosen(start), *_leaving(learner))
     return facts
+
+
+def _leaving(learner: Learner) -> Iterator[Fact]:
+    """From how many of LOOPS states of X₀ closed loops leave the domain, and what keeps them in it."""
+    domain = learner.problem.domain
+    if domain is None:
+        return
+    x0 = learner.problem.initial_states.sample(LOOPS, stream(0, START))
+    law = learner.rollout.closed_loop.policy
+    left = domain.left(path_under(learner.problem, lambda n, x: law(learner.problem.horizon.times(x)[n], x), x0).x)
+    if left.any():
+        limits = " ".join(f"constraints.{each.side}.{each.state}={each.value:g}" for each in domain.borders)
+        found = f"closed loops of the start leave it from {int(left.sum())} of {LOOPS} states of X₀"
+        yield Fact("domain", found, f"{limits}, which training then keeps, or a smaller horizon.dt")
 
 
 def jump_facts(problem: Problem) -> list[Fact]:
     """Where f, g and the cost jump, on X₀ and beside it as far as the goal; optima take them as smooth."""
     problem, box = in_float64(problem), problem.initial_states
-    cost = problem.cost.cost if isinstance(problem.cost, PenaltyCost) else problem.cost
+    cost = as_written(problem.cost)
     low, high = (end(getattr(box, side).double(), problem.goal) for side, end in
                  (("lower", torch.minimum), ("upper", torch.maximum)))  # fmt: skip
     width, size = high - low, torch.maximum(low.abs(), high.abs())

@@ -15,6 +15,7 @@ from rich.console import Console
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.contracts import TO_WRITE, without_slope
 from lyapnet.cost import spread
+from lyapnet.domain import as_written
 from lyapnet.errors import DivergenceError
 from lyapnet.expansions import in_float64
 from lyapnet.policy import HJBPolicy
@@ -154,7 +155,7 @@ def infinite_slope(member: Learner) -> str | None:
             x = member.rollout(x0).x.to(problem.goal).flatten(0, -2)
     except DivergenceError:
         return None
-    parts = type(problem.system).__name__, type(problem.cost).__name__
+    parts = type(problem.system).__name__, type(as_written(problem.cost)).__name__
     for name, function in (
         (f"{parts[0]}.f(x)", problem.system.f), (f"{parts[0]}.g(x)", problem.system.g),
         (f"q(x) of {parts[1]}", problem.cost.state), (f"φ(x) of {parts[1]}", problem.cost.terminal),

@@ -29,13 +29,15 @@ VIOLATED = 1e-6  # h that is still taken for zero
 ASIDE = 1e-3  # of the extents: how far from the goal straight lines end, where slopes may not exist
 BESIDE = 1e-8  # of the extents: how far from x₀ a path may begin, for a cost that is the same
 INVALID = "IPOPT: Invalid_Number_Detected"
+WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
 
 
 class Transcription(Oracle):
     """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu)
-    and h(x_n) ≤ 0 for n ≥ 1; by another Runge-Kutta method, of the cost and along the steps that it makes with u held.
+    and h(x_n) ≤ 0 for n ≥ 1, within the domain; by another Runge-Kutta method, of the cost and along the steps that it
+    makes with u held.
 
     States, controls, steps and J are in units of the extents of tried paths, which are parameters of the program.
 
@@ -64,15 +66,20 @@ class Transcription(Oracle):
         self.cache = OptimaCache(self.task.graphs, horizon.steps, system.m, self.problem.controls)
         self._stopped = False
         limits = self.problem.controls.limits
-        bounded = self.problem.controls.limited or self.task.inside is not None
+        domain = self.problem.domain
+        bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
         self._solver = _solver(self.task, horizon.steps, iterations, bounded)
         self._scales = Scales(self.problem)
         assert limits is not None  # oracle_of asks before
-        free, extents = np.full(system.n * horizon.steps, np.inf), self._scales.of_controls
+        free = torch.full((system.n,), torch.inf)
+        ends = (-free, free) if domain is None else domain.narrowed(WITHIN)
         self._bounds = [
-            np.concatenate([np.tile(side.expand(system.m).numpy() / extents, horizon.steps), sign * free])
-            for side, sign in zip(limits, (-1, 1), strict=True)
-        ]
+            np.concatenate([
+                np.tile(side.expand(system.m).numpy() / self._scales.of_controls, horizon.steps),
+                np.tile(end.numpy() / self._scales.of_states, horizon.steps),
+            ])
+            for side, end in zip(limits, ends, strict=True)
+        ]  # fmt: skip
         # the defects of the steps vanish, and h ≤ 0
         more = 0 if self.task.inside is None else horizon.steps * self.task.inside.size1_out(0)
         defects = np.zeros(system.n * horizon.steps)
@@ -113,6 +120,8 @@ class Transcription(Oracle):
             with torch.no_grad():
                 x, J = self.rollout(states[some], u)
                 admitted = torch.isfinite(x).all(-1).all(0) & J.isfinite()
+                if self.problem.domain is not None:
+                    admitted &= ~self.problem.domain.left(x, slack=0.0)
                 if self.problem.constraints is not None:
                     admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= VIOLATED
             columns = (x.unbind(1), u.unbind(1), J.tolist(), admitted.tolist())

@@ -128,11 +128,12 @@ class DomainCost(MadeOfAnother):
     domain: Domain
     weight: float
     step: float
-    words: str = "asked within the domain alone"
+    words: str
 
     def __init__(self, cost: Cost, domain: Domain, weight: float, step: float):
         super().__init__(cost)
         self.domain, self.weight, self.step = domain, weight, step
+        self.words = f"beyond {domain}: f, g, q and φ as just within, and what a state outside pays"
 
     def state(self, x: State) -> PerState:
         return self.cost.state(self.domain.nearest(x)) + self.weight / self.step * self.domain.price(x)

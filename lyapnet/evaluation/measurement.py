@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from lyapnet.after_horizon import LOOPS
 from lyapnet.constraints import names_of
@@ -19,6 +20,7 @@ from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.files import plain
 from lyapnet.problem import Problem
 from lyapnet.random_streams import TEST, stream
+from lyapnet.rollout import Trajectory
 from lyapnet.sizes import require_memory, size_of_loops
 from lyapnet.tables import csv_text
 from lyapnet.types import PerState
@@ -166,9 +168,8 @@ def evaluation(
     trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
-    if (domain := controller.problem.domain) is not None:  # beyond it nothing is known of what is paid
-        left = domain.left(trajectory.x)
-        table = dataclasses.replace(table, left=left, cost=table.cost.masked_fill(left, torch.inf))
+    cost, left = _within_domain(controller.problem, trajectory)
+    table = dataclasses.replace(table, cost=cost, left=left)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     corner, problem = dearest_corner(controller), controller.problem
     held = costs_of_plant(problem, controller.closed_loop.policy, first.x0)
@@ -186,13 +187,21 @@ def evaluation(
     return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, *further, about)
 
 
+def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
+    """J_N of closed loops, infinite where they leave the domain, and whether they do; None where there is none."""
+    if problem.domain is None:
+        return trajectory.cost, None
+    left = problem.domain.left(trajectory.x)
+    return trajectory.cost.masked_fill(left, torch.inf), left
+
+
 def dearest_corner(controller: Controller) -> Corner:
     """The corner of X₀ whose closed loop costs most, of those along its first CORNER_AXES axes."""
     x0 = controller.initial_states.corners(CORNER_AXES)
     with torch.no_grad():
         value = controller.value(0.0, x0)
         try:
-            cost = controller.rollout(x0).cost
+            cost = _within_domain(controller.problem, controller.rollout(x0))[0]
         except DivergenceError:
             cost = torch.full_like(value, torch.inf)
     i = int(cost.argmax())

@@ -1,6 +1,7 @@
 """Domains: borders that are found, against those of the functions; declared ones; and what leaves them."""
 
 import json
+import math
 
 import pytest
 import torch
@@ -11,11 +12,13 @@ from lyapnet.build import Parts, build_problem
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain
 from lyapnet.domain import SLACK, Border, Domain, DomainCost, as_written
-from lyapnet.errors import UsageError
+from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.evaluation import evaluate
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.expansions import optimal_trajectories, path_under
+from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
+from lyapnet.rollout import Rollout
 
 PLAIN = {
     "experiment": "economy",
@@ -263,6 +266,43 @@ def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
     assert str(lyapnet.load(run, system=Economy(), cost=Displeasure()).problem.domain).startswith("capital > 0")
 
 
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+@pytest.mark.parametrize("gradient", ["discrete", "backprop"])
+def test_the_gradient_of_a_closed_loop_that_leaves_is_finite(method, gradient):
+    problem, V = economy(rollout={"method": method}), Worth(0.0)
+    bare = problem.replaced(system=Economy(), cost=Displeasure())
+    slopes = []
+    for each in (problem, bare):
+        rollout = Rollout(each, lyapnet.SampledPolicy(each, V), gradient=gradient)
+        try:
+            cost = rollout(torch.tensor([[2.0], [8.0]], dtype=torch.float64)).cost.mean()
+        except DivergenceError:
+            continue
+        (slope,) = torch.autograd.grad(cost, V.price)
+        slopes.append(float(slope))
+    assert len(slopes) == 1, "the twin diverges"
+    assert math.isfinite(slopes[0])
+    assert method != "euler" or slopes[0] < 0, "capital that is worth more is kept"
+
+
+def test_a_family_has_a_domain():
+    problem = economy(system={"name": f"{__name__}:WithShare"}, family={"share": [0.3, 0.5]})
+    assert "capital > 0, where f is defined" in str(problem.domain)
+    assert isinstance(problem.system, FamilySystem)
+    x = torch.tensor([[-1.0, 0.4], [2.0, 0.4]], dtype=torch.float64)
+    assert problem.system.f(x).isfinite().all()
+    assert_close(problem.system.f(x)[1, :1], 0.8 * x[1, :1] ** 0.4 - 0.2)
+
+
+class WithShare(Economy):
+    def __init__(self, share=0.4):
+        super().__init__()
+        self.share = share
+
+    def f(self, x):
+        return 0.8 * x ** torch.as_tensor(self.share).to(x)[..., None] - 0.1 * x
+
+
 def test_an_evaluation_counts_what_leaves():
     kept, lost = (evaluate(lyapnet.Controller(economy(), Worth(each)), 16, optimum=False) for each in (0.8, 0.0))
     assert kept["left_domain_fraction"] == 0
@@ -276,7 +316,7 @@ class Worth(lyapnet.ValueFunction):
 
     def __init__(self, price):
         super().__init__()
-        self.price = price
+        self.price = torch.nn.Parameter(torch.tensor(price, dtype=torch.float64))
 
     def forward(self, t, x):
         return -self.price * x[..., 0] + 0 * t

@@ -23,6 +23,7 @@ ROOM = 1e-9  # of a state's size: how far within its border functions are asked
 ROUNDINGS = 64  # of the precision that x has, where these are more
 SOFT = 1e-3  # of a state's size, from which on the price of being outside is proportional to how far
 SLACK = 1e-2  # of a state's size, by which a step may pass a border, at that price; beyond it the domain is left
+ROUNDED = 1e-6  # of a state's size, by which rounding may pass a border
 TRIED = 8  # states of X₀, from each of which a border has to be the same
 REACH, PLACES, HALVINGS = 8.0, 64, 60  # in sizes, how far borders are sought; in how many places; and then by halving
 BEYOND = (1e-6, 1e-3)  # sizes beyond a border at which a function is undefined still: a pole is no border
@@ -96,21 +97,33 @@ class Domain:
 
 def within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
     """A copy of a system, of a class of the same name, whose f and g are asked at the nearest state of a domain."""
+    return _put_within(copy.deepcopy(system), domain)
+
+
+def _put_within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
+    """The same object with a class of its own."""
 
     def at_nearest(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def asked(self: Any, x: State, *others: Any) -> Any:
-            return function(self, self.domain.nearest(x), *others)
+            return function(self, domain.nearest(x), *others)
 
         return asked
 
-    own, cls = copy.deepcopy(system), type(system)
+    def reduced(self: Any, protocol: Any) -> tuple[Any, ...]:
+        """What copies and pickles are made of: the system without its domain, and the domain."""
+        plain = cls.__new__(cls)
+        plain.__dict__.update(self.__dict__)
+        return _put_within, (plain, domain)
+
+    cls = type(system)
     functions = {name: at_nearest(getattr(cls, name)) for name in OF_SYSTEM if hasattr(cls, name)}
     if cls.dynamics is ControlAffineSystem.dynamics:
         functions.pop("dynamics")  # the sum of f and g, which ask there
     said = {name: getattr(cls, name) for name in ("__module__", "__qualname__", "__doc__")}
-    own.__class__ = type(cls.__name__, (cls,), {**functions, **said, "domain": domain})
-    return own
+    own = {**functions, **said, "domain": domain, "__reduce_ex__": reduced}
+    system.__class__ = type(cls.__name__, (cls,), own)
+    return system
 
 
 class DomainCost(MadeOfAnother):

@@ -11,6 +11,7 @@ from torch import Tensor
 from lyapnet.after_horizon import LOOPS
 from lyapnet.constraints import names_of
 from lyapnet.controller import Controller
+from lyapnet.domain import ROUNDED, SLACK
 from lyapnet.errors import DivergenceError, OracleError
 from lyapnet.evaluation.afterwards import share_at_goal
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
@@ -188,11 +189,13 @@ def evaluation(
 
 
 def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
-    """J_N of closed loops, infinite where they leave the domain, and whether they do; None where there is none."""
+    """J_N of closed loops, infinite where they go far out of the domain, and whether they leave it at all; None where
+    there is none.
+    """
     if problem.domain is None:
         return trajectory.cost, None
-    left = problem.domain.left(trajectory.x)
-    return trajectory.cost.masked_fill(left, torch.inf), left
+    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, ROUNDED))
+    return trajectory.cost.masked_fill(far, torch.inf), left
 
 
 def dearest_corner(controller: Controller) -> Corner:

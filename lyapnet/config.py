@@ -34,7 +34,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
-    "rollout": {"policy": "sampled", "gradient": "discrete"},
+    "rollout": {"policy": "sampled", "choose_policy": True, "gradient": "discrete"},
     "training": {
         "iterations": 400,
         "batch_size": 32,
@@ -202,6 +202,9 @@ class RolloutConfig:
     """How the closed loop is integrated and differentiated; see Rollout."""
 
     policy: str = option("hjb", "The control law that V defines.", choices=POLICIES)
+    choose_policy: bool = option(
+        False, "Take lookahead in its place where the search for a start finds that this costs much less."
+    )
     method: str = option("euler", "The integrator.", choices=METHODS)
     gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
     compile: str = option(
@@ -347,6 +350,8 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     recipe = dict(STANDARD)
     if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
+    if recipe["rollout"]["policy"] == "lookahead" or _names(("policy",), "rollout", content, overrides):
+        recipe["rollout"] = {**recipe["rollout"], "choose_policy": False}
     program, gradient = (
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))

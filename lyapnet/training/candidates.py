@@ -8,6 +8,7 @@ from lyapnet.linearisation import Missing
 
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 ALIKE = 5e-4  # of a cost: candidates that differ by less are told as equal
+MUCH = 0.03  # of the cost: what a law that looks ahead has to gain, as it takes longer
 CALM = "V = 0"
 
 
@@ -28,6 +29,7 @@ class Start(NamedTuple):
     chosen: Candidate
     candidates: Sequence[Candidate]
     held_cost: float  # of the chosen one in continuous time, u held for Δt
+    gain_ahead: float = 0.0  # share of the cost that the law that looks ahead saves, with the chosen V
 
     @property
     def steps_miss(self) -> str:
@@ -41,6 +43,16 @@ class Start(NamedTuple):
         if self.chosen.cost < 0 and math.isfinite(ratio):
             by = f"{self.held_cost:.4g} in the place of {self.chosen.cost:.4g}"
         return f"in continuous time, u held for Δt, the law that training starts from costs {by}"
+
+    @property
+    def should_look_ahead(self) -> bool:
+        """Whether V's sampled law costs much more than the one that looks ahead."""
+        return self.gain_ahead > MUCH
+
+    @property
+    def about_law(self) -> str:
+        """What looking ahead saves."""
+        return f"rollout.policy=lookahead, with V as it is, costs {self.gain_ahead:.2g} of the cost less than sampled"
 
     def __str__(self) -> str:
         others = "; ".join(self._beside(other) for other in self.candidates if other != self.chosen)
@@ -64,6 +76,7 @@ class Start(NamedTuple):
             "chosen": self.chosen.name,
             "tried": {c.name: c.cost if c.finite == 1 else None for c in self.candidates},
             "held_cost": self.held_cost if math.isfinite(self.held_cost) else None,
+            "gain_ahead": self.gain_ahead,
             "seconds": {c.name: round(c.seconds, 2) for c in self.candidates},
             **({"notes": notes} if notes else {}),
         }

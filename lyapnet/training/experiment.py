@@ -28,7 +28,7 @@ from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.facts import jump_facts
 from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
-from lyapnet.training.plan import Plan, plan_run
+from lyapnet.training.plan import Plan, plan_run, under_policy
 from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
@@ -119,7 +119,12 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
             _relax(plan, console, trainer.is_global_zero)
         with _compiling_beside_start(plan, trainer):
             start = _choose_start(plan, console, trainer.is_global_zero) if _seeks_start(plan) else None
-            trainer = _train(plan, trainer, console, start)
+            looks_ahead = start is not None and start.should_look_ahead and config.rollout.choose_policy
+            if not looks_ahead:
+                trainer = _train(plan, trainer, console, start)
+        if looks_ahead:
+            plan = _looking_ahead(plan, console, trainer.is_global_zero)
+            trainer = _train(plan, build_trainer(plan, console), console, start)
     except Interrupted as stop:
         hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
         raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
@@ -178,9 +183,20 @@ def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
         console.print(str(start), soft_wrap=True)
         if start.steps_miss:
             console.print(f"steps: {start.steps_miss}; {REMEDY}", soft_wrap=True)
+        if start.should_look_ahead:
+            console.print(f"law: {start.about_law}", soft_wrap=True)
     if told and start is None:
         console.print(DRAWN, soft_wrap=True)
     return start
+
+
+def _looking_ahead(plan: Plan, console: Console, told: bool) -> Plan:
+    """The plan under the law that looks ahead, which its run's folder then names."""
+    plan = under_policy(plan, "lookahead")
+    if told:
+        write_atomically(plan.run.folder / CONFIG, to_yaml(plan.config).encode())
+        console.print("law: lookahead is trained from here on; rollout.policy=sampled keeps the other", soft_wrap=True)
+    return plan
 
 
 def _prepare_folder(plan: Plan) -> None:

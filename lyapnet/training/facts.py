@@ -127,6 +127,8 @@ def _chosen(start: Start | None) -> Iterator[Fact]:
         return
     if start.steps_miss:
         yield Fact("steps", start.steps_miss, REMEDY)
+    if start.should_look_ahead:
+        yield Fact("law", start.about_law)
     advice = ""
     if start.chosen.finite < 1:
         advice = f"no candidate is finite on all of X₀: {SMALLER}"

@@ -1,8 +1,9 @@
 """What a training is to do: start a run, resume one, or start one from the weights of another."""
 
+import copy
 import logging
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -99,11 +100,25 @@ def plan_run(
             plan = Plan(config, parts, module, callbacks, run, anew=True, lock=lock)
         else:
             content = _read(checkpoint, run)
-            _require_same_experiment(config, config_of(content, checkpoint), checkpoint)
+            stored = config_of(content, checkpoint)
+            if config.rollout.choose_policy and stored.rollout.policy != config.rollout.policy:
+                config.rollout.policy = stored.rollout.policy
+                module = build_module(config, parts)
+            _require_same_experiment(config, stored, checkpoint)
             plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock=lock)
         if not plan.finished:
             stack.pop_all()
         return plan
+
+
+def under_policy(plan: Plan, policy: str) -> Plan:
+    """The same plan under another control law, with V as it is."""
+    config = copy.deepcopy(plan.config)
+    config.rollout.policy = policy
+    module = build_module(config, plan.parts)
+    for member, before in zip(module.members, plan.module.members, strict=True):
+        member.V.load_state_dict(before.V.state_dict())
+    return replace(plan, config=config, module=module)
 
 
 def _note_another_target(target: Any, problem: Problem, checkpoint: Path) -> None:

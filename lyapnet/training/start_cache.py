@@ -105,7 +105,8 @@ def _digest(learner: Learner) -> str:
 
 def _plain(start: Start) -> dict[str, Any]:
     rows = [[*each[:4], None if each.missing is None else [*each.missing], each.note] for each in start.candidates]
-    return {"chosen": [*start.candidates].index(start.chosen), "candidates": rows, "held_cost": start.held_cost}
+    chosen = [*start.candidates].index(start.chosen)
+    return {"chosen": chosen, "candidates": rows, "rest": [start.held_cost, start.gain_ahead]}
 
 
 def _start_from(plain: dict[str, Any]) -> Start:
@@ -113,7 +114,7 @@ def _start_from(plain: dict[str, Any]) -> Start:
         Candidate(name, cost, finite, seconds, missing and Missing(*missing), note)
         for name, cost, finite, seconds, missing, note in plain["candidates"]
     ]
-    return Start(candidates[plain["chosen"]], candidates, plain["held_cost"])
+    return Start(candidates[plain["chosen"]], candidates, *plain["rest"])
 
 
 def kept_or_chosen(

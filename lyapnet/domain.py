@@ -113,7 +113,7 @@ def _put_within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSys
     def reduced(self: Any, protocol: Any) -> tuple[Any, ...]:
         """What copies and pickles are made of: the system without its domain, and the domain."""
         plain = cls.__new__(cls)
-        plain.__dict__.update(self.__dict__)
+        vars(plain).update(vars(self))
         return _put_within, (plain, domain)
 
     cls = type(system)

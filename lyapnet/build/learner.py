@@ -51,9 +51,12 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         "embedded_angles": angles if options.embed_angles else None,
     }
     chosen = {key: value for key, value in chosen.items() if value is not None}
-    accepted = inspect.signature(cls).parameters
+    accepted, domain = inspect.signature(cls).parameters, problem.domain
     if "constants" in accepted:
         chosen["constants"] = [kept.index(i) for i in problem.system.constants if i in kept]
+    if "borders" in accepted and domain is not None:
+        places = {problem.system.state_names[i]: place for place, i in enumerate(kept)}
+        chosen["borders"] = [(places[each.state], each) for each in domain.borders if each.state in places]
     if "scaling" not in accepted:
         raise UsageError(
             f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."

@@ -7,10 +7,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.domain import Border
 from lyapnet.interpolation import Curve, SmoothCurve
 from lyapnet.linear_algebra import apply
 from lyapnet.networks.base import Scaling
 from lyapnet.networks.fcn import FCN
+from lyapnet.networks.near_borders import NearBorders
 from lyapnet.types import PerState, State, Time
 
 FEW = 4  # states for which a narrower network is enough
@@ -38,6 +40,8 @@ class ExpansionNetwork(ValueFunction):
     S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
     ξ_y.
 
+    Where f, g, q or φ end at borders of some states, the logarithms of distances from these are further inputs of N.
+
     Where the expansion is φ at T, N is multiplied by 1 − t/T: V(T, ·) = φ for any weights, and close to T, where hardly
     anything is left to pay and to learn from, V is what the Riccati equation or the optimum says.
 
@@ -45,6 +49,7 @@ class ExpansionNetwork(ValueFunction):
         scaling: of the task, for what starts without an expansion.
         hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
         constants: indices of the states that stay what they are.
+        borders: of the domain, with the indices of their states.
         smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear.
     """
 
@@ -61,12 +66,14 @@ class ExpansionNetwork(ValueFunction):
         activation: str = "tanh",
         constants: Sequence[int] = (),
         smooth: bool = False,
+        borders: Sequence[tuple[int, Border]] = (),
     ):
         super().__init__()
         self.constants = list(constants)
         n = self.n = len(scaling.state)
         hidden = standard_widths(n) if hidden is None else hidden
-        self.network = FCN(Scaling([1.0] * n, scaling.duration, 1.0), hidden, activation)
+        self.near_borders = NearBorders(borders) if borders else None
+        self.network = FCN(Scaling([1.0] * (n + len(borders)), scaling.duration, 1.0), hidden, activation)
         nn.init.zeros_(self.network.output.weight)
         nn.init.zeros_(self.network.output.bias)
         self.register_buffer("scale", torch.tensor(scaling.value))
@@ -84,20 +91,27 @@ class ExpansionNetwork(ValueFunction):
     def forward(self, t: Time, x: State) -> PerState:
         c, p, H, delta = self._around(t, x)
         xi = delta @ self.coordinates
-        rest = self._fading(t, 1 - self.at_goal * self._near(xi)) * self.network(t, xi)
+        rest = self._fading(t, 1 - self.at_goal * self._near(xi)) * self.network(t, self._inputs(x, xi))
         return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * rest
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         """V and V_x = p + Hδ + s C (ρ N_ξ + N ρ_ξ)."""
         c, p, H, delta = self._around(t, x)
         xi = delta @ self.coordinates
-        N, N_xi = self.network.value_and_state_gradient(t, xi)
+        N, slopes = self.network.value_and_state_gradient(t, self._inputs(x, xi))
         near, curved = self._near(xi), apply(H, delta)
         share = self._fading(t, 1 - self.at_goal * near)
         value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
         slope = self._fading(t, 2 * self.at_goal * near**2)
-        rest_xi = share[..., None] * N_xi + (slope * N)[..., None] * self._moving(xi)
-        return value, p + curved + self.scale * (rest_xi @ self.coordinates.mT)
+        rest_xi = share[..., None] * slopes[..., : self.n] + (slope * N)[..., None] * self._moving(xi)
+        rest_x = rest_xi @ self.coordinates.mT
+        if self.near_borders is not None:
+            rest_x = rest_x + self.near_borders.pull_back(x, share[..., None] * slopes[..., self.n :])
+        return value, p + curved + self.scale * rest_x
+
+    def _inputs(self, x: State, xi: State) -> Tensor:
+        """ξ, and the logarithms."""
+        return xi if self.near_borders is None else torch.cat([xi, self.near_borders(x)], -1)
 
     def _fading(self, t: Time, rho: PerState) -> PerState:
         """ρ, or its slope, of which nothing is left at T where the expansion is φ there."""

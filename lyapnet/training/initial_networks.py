@@ -50,6 +50,8 @@ def take(
     curvature = _curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
     network.take(*(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost))
+    if network.near_borders is not None:
+        network.near_borders.take(torch.cat([expansion.x, x0]))
 
 
 def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, kept: list[int]) -> None:
@@ -68,6 +70,8 @@ def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, 
     cost, like = typical(sizes(problem, optimum.path.cost)) or 1.0, network.scale
     t = problem.horizon.times(expansion.x)
     network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
+    if network.near_borders is not None:
+        network.near_borders.take(expansion.x.flatten(0, 1))
 
 
 def _curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:

@@ -190,6 +190,7 @@ class NetworkConfig:
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
     smooth: bool | None = option(None, "Smooth in time, for sound certificates (expansion).")
+    penalty: bool = option(False, "Add to N what a state pays in one step for coming close to constraints.")
     terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
     state_scale: list[float] | None = option(
         None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0
@@ -350,6 +351,8 @@ def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[
     recipe = dict(STANDARD)
     if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
+        law = _asked("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
+        recipe["network"] = {**STANDARD["network"], "penalty": law == "lookahead"}
     if recipe["rollout"]["policy"] == "lookahead" or _names(("policy",), "rollout", content, overrides):
         recipe["rollout"] = {**recipe["rollout"], "choose_policy": False}
     program, gradient = (

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.contracts import copied
-from lyapnet.cost import spread
+from lyapnet.cost import PenaltyCost, spread
 from lyapnet.derivatives import Steps, steps_along, with_curvature
 from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
@@ -243,6 +243,19 @@ def sizes(problem: Problem, cost: PerState) -> PerState:
     if problem.has_goal or not len(finite):
         return cost
     return spread(finite).expand_as(cost)
+
+
+def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
+    """What states pay in one step for being close to constraints, to second order; zero where nothing is relaxed."""
+    if isinstance(problem.cost, PenaltyCost):
+        return problem.cost.in_one_step(x)
+    return torch.zeros_like(x[..., 0]), torch.zeros_like(x), torch.zeros_like(x[..., None] * x[..., None, :])
+
+
+def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
+    """What is left of an expansion of V without what each state pays in one step for being close to constraints."""
+    value, gradient, hessian = penalty_of_one_step(in_float64(problem), expansion.x)
+    return Expansion(expansion.x, expansion.value - value, expansion.gradient - gradient, expansion.hessian - hessian)
 
 
 def cheapest(paths: Sequence[Path]) -> Path:

@@ -17,7 +17,7 @@ from lyapnet.sets import ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State, Time
 
-DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
+DESCENTS, SHARES = 5, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
 
 
 class PolicyOutput(NamedTuple):

@@ -9,7 +9,7 @@ import torch
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.build import Parts, build_problem, build_value_function, member
+from lyapnet.build import Parts, build_problem, member
 from lyapnet.certification.draws import draws_of
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain, load_config
@@ -25,6 +25,7 @@ from lyapnet.random_streams import TEST, stream
 from lyapnet.systems import SYSTEMS, Pendulum
 from lyapnet.systems.base import MechanicalSystem
 from lyapnet.training import pretraining, start
+from lyapnet.training.build_learner import build_learner
 from lyapnet.training.initial_networks import take
 from lyapnet.training.optima import minima
 from tests.configs import objects
@@ -127,9 +128,10 @@ def started(plain):
     """(problem, V) with V on top of the Riccati solution, and random weights."""
     config = config_from_plain(plain)
     task = build_problem(config)
-    V = build_value_function(config, task)
+    learner = build_learner(config, task)
+    V = learner.V
     assert isinstance(V, ExpansionNetwork)
-    take(V, task, riccati(task), list(range(task.system.n)), task.initial_states.sample(64))
+    take(learner, riccati(task), task.initial_states.sample(64))
     torch.nn.init.normal_(V.network.output.weight)
     return task, V
 

@@ -19,6 +19,7 @@ from lyapnet.networks import (
     StationaryNetwork,
     TerminalAnchor,
     Timeless,
+    WithPenalty,
 )
 from lyapnet.policy import POLICIES
 from lyapnet.problem import Problem
@@ -78,6 +79,8 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
             V = Timeless(V)
         if len(kept) < n:
             V = IgnoringStates(V, kept, n)
+        if options.penalty and problem.constraints is not None:
+            V = WithPenalty(V, problem.constraints, problem.constraints.margin, problem.horizon.dt)
     V.made_for = POLICIES[config.rollout.policy]
     return V.to(DTYPES[config.training.precision])
 

@@ -12,7 +12,7 @@ from lyapnet.cost.made_of_another import (
     innermost,
     is_quadratic_about_target,
 )
-from lyapnet.cost.penalty import PenaltyCost
+from lyapnet.cost.penalty import PenaltyCost, closeness
 from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
@@ -28,6 +28,7 @@ __all__ = [
     "QuadraticCost",
     "RegulatorTail",
     "TargetCost",
+    "closeness",
     "goal_in_words",
     "innermost",
     "is_quadratic",

@@ -6,7 +6,13 @@ from torch import Tensor, nn
 
 from lyapnet.cost.base import Cost
 from lyapnet.cost.made_of_another import MadeOfAnother
+from lyapnet.derivatives import jacobian
 from lyapnet.types import PerState, State
+
+
+def closeness(constraints: nn.Module, margin: float, x: State) -> PerState:
+    """Σ_j max(0, 1 + h_j(x)/m)³: 1 at h = 0 of a single constraint, zero from h = −m on."""
+    return (torch.relu(1 + constraints(x) / margin) ** 3).sum(-1)
 
 
 class PenaltyCost(MadeOfAnother):
@@ -42,9 +48,16 @@ class PenaltyCost(MadeOfAnother):
     def terminal(self, x: State) -> PerState:
         return self.cost.terminal(x) + self.step * self._penalty(x)
 
+    def in_one_step(self, x: State) -> tuple[PerState, State, Float[Tensor, "*batch n n"]]:
+        """What a state pays in one step for being close to constraints, to second order: value, gradient, Hessian."""
+        with torch.enable_grad():
+            z = x.detach().requires_grad_()
+            value = self.step * self._penalty(z)
+            gradient = jacobian(value[..., None], z)[..., 0, :]
+            return value.detach(), gradient.detach(), jacobian(gradient, z)
+
     def _penalty(self, x: State) -> PerState:
-        close = torch.relu(1 + self.constraints(x) / self.margin)
-        return self.weight * (close**3).sum(-1)
+        return self.weight * closeness(self.constraints, self.margin, x)
 
     def ignores(self, i: int, n: int) -> bool:
         return self.cost.ignores(i, n) and self._constraints_ignore(i, n)

@@ -13,6 +13,7 @@ from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.networks.ignoring import IgnoringStates, kept_states
 from lyapnet.networks.quadratic import QuadraticForm
 from lyapnet.networks.stationary import StationaryNetwork, Timeless
+from lyapnet.networks.with_penalty import WithPenalty
 
 NETWORKS: dict[str, type[ValueFunction]] = {
     "fcn": FCN,
@@ -39,5 +40,6 @@ __all__ = [
     "StationaryNetwork",
     "TerminalAnchor",
     "Timeless",
+    "WithPenalty",
     "kept_states",
 ]

@@ -7,6 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
+from lyapnet.networks.with_penalty import WithPenalty
 from lyapnet.types import PerState, State, Time
 
 
@@ -46,4 +47,5 @@ class IgnoringStates(ValueFunction):
 
 def kept_states(V: ValueFunction, n: int) -> list[int]:
     """The indices of the states, of n, on which a V depends."""
+    V = V.network if isinstance(V, WithPenalty) else V
     return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(n))

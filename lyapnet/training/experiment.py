@@ -22,6 +22,7 @@ from lyapnet.evaluation import evaluate
 from lyapnet.files import write_atomically, write_json
 from lyapnet.loading import load
 from lyapnet.machine import peak_memory
+from lyapnet.networks import WithPenalty
 from lyapnet.training.build import build_data
 from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
@@ -169,6 +170,9 @@ def _relax(plan: Plan, console: Console, told: bool) -> None:
         relaxation = find_relaxation(plan.module.members[0].problem, report)
     assert plan.module.penalty is not None
     plan.module.penalty.weight.fill_(relaxation.weight)
+    for member in plan.module.members:
+        if isinstance(member.V, WithPenalty):
+            member.V.weight.fill_(relaxation.weight)
     if told:
         plan.run.note(relaxation=relaxation.as_json())
         console.print(str(relaxation), soft_wrap=True)

@@ -7,9 +7,8 @@ from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import is_quadratic_about_target
-from lyapnet.expansions import Expansion, Optimum, sizes
-from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, kept_states
-from lyapnet.problem import Problem
+from lyapnet.expansions import Expansion, Optimum, sizes, without_penalty
+from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, WithPenalty, kept_states
 from lyapnet.training.learner import Learner
 from lyapnet.training.pretraining import typical
 from lyapnet.types import State
@@ -20,6 +19,7 @@ AROUND = 0.25  # of how far optima go: how far beside them a goal may be that th
 
 def network_of(V: ValueFunction) -> Any:
     """The network that an expansion can be put into, if there is one."""
+    V = V.network if isinstance(V, WithPenalty) else V
     inner = V.network if isinstance(V, IgnoringStates) else V
     return inner if isinstance(inner, ExpansionNetwork | StationaryNetwork) else None
 
@@ -29,20 +29,14 @@ def kept_of(learner: Learner) -> list[int]:
     return kept_states(learner.V, learner.problem.system.n)
 
 
-def take(
-    network: ExpansionNetwork | StationaryNetwork,
-    problem: Problem,
-    expansion: Expansion,
-    kept: list[int],
-    x0: State,
-    level: float = 1.0,
-) -> None:
-    """Start a network from an expansion.
+def take(learner: Learner, expansion: Expansion, x0: State, level: float = 1.0) -> None:
+    """Start the network of a learner from an expansion.
 
     Args:
         level: up to which share of its mean value on X₀ a stationary V takes the regulator for right.
     """
-    expansion, x0 = expansion.restricted_to(kept), x0[..., kept].double().cpu()
+    network, problem, kept = network_of(learner.V), learner.problem, kept_of(learner)
+    expansion, x0 = _of_network(learner, expansion).restricted_to(kept), x0[..., kept].double().cpu()
     if isinstance(network, StationaryNetwork):
         mean = float(expansion.initially(x0).mean()) or 1.0  # of an X₀ that is the goal alone
         network.take(*(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean)
@@ -54,12 +48,13 @@ def take(
         network.near_borders.take(torch.cat([expansion.x, x0]))
 
 
-def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, kept: list[int]) -> None:
-    """Start a network from V = 0, in units of where optima lead, what they cost, and how V curves along them.
+def take_nothing(learner: Learner, optimum: Optimum) -> None:
+    """Start the network of a learner from V = 0, in units of where optima lead, what they cost, and how V curves there.
 
     The centre is the goal, in those states in which optima begin, end or pass there, and else the mean of the optima.
     """
-    expansion = optimum.expansion.restricted_to(kept)
+    network, problem, kept = network_of(learner.V), learner.problem, kept_of(learner)
+    expansion = _of_network(learner, optimum.expansion).restricted_to(kept)
     goal, (least, most) = problem.goal.double().cpu()[kept], expansion.x.flatten(0, 1).aminmax(dim=0)
     reach = AROUND * (most - least)
     at_goal = (network.moves.cpu() > 0) & (least - reach <= goal) & (goal <= most + reach)
@@ -72,6 +67,11 @@ def take_nothing(network: ExpansionNetwork, problem: Problem, optimum: Optimum, 
     network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
     if network.near_borders is not None:
         network.near_borders.take(expansion.x.flatten(0, 1))
+
+
+def _of_network(learner: Learner, expansion: Expansion) -> Expansion:
+    """What an expansion of V leaves for the network, which knows the penalty of one step."""
+    return without_penalty(learner.problem, expansion) if isinstance(learner.V, WithPenalty) else expansion
 
 
 def _curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:

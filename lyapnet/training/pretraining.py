@@ -11,8 +11,18 @@ import torch
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import FLOOR, Optimum, Path, in_float64, path_under, sizes
+from lyapnet.expansions import (
+    FLOOR,
+    Optimum,
+    Path,
+    in_float64,
+    path_under,
+    penalty_of_one_step,
+    sizes,
+    without_penalty,
+)
 from lyapnet.linear_algebra import apply
+from lyapnet.policy import LookaheadPolicy
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.learner import Learner
@@ -25,6 +35,7 @@ BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
 SHARES = {1: 0.25, 2: 0.5}  # of those steps, for V of one or two states
 GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
+NEWTON = 6  # steps to where a law that looks ahead looks at V
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
 ROUNDS, GOOD = 4, 1.02  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
@@ -39,11 +50,12 @@ class Examples(NamedTuple):
     x: State
     value: PerState  # V(t_n, x_n)
     after: Tensor  # t_{n+1}
-    drifted: State  # F(x_n, r), where the control r that costs nothing leads
+    about: Control  # c, where the law looks at V: the control that costs nothing, or the best one
+    led: State  # F(x_n, c)
     by_control: Tensor  # B (k, n, m), F_u/Δt there
     slope: Control  # ℓ_u there
     weight: Tensor  # W (k, m, m), ℓ_uu + Δt BᵀHB
-    control: Control  # the best one, the minimiser of ½ (u − r)ᵀW(u − r) + bᵀ(u − r) over U, b = BᵀV_x + ℓ_u
+    best: Control  # the minimiser of ½ (u − c)ᵀW(u − c) + bᵀ(u − c) over U, b = BᵀV_x + ℓ_u
     cost: PerState  # what errors of V are held against: J of the trajectory, or the median of all if that is more
     rate: PerState  # what excess cost per second is held against: the same per second of T
 
@@ -60,7 +72,7 @@ class Examples(NamedTuple):
         return self.each(lambda column: column.to(like))
 
 
-def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) -> Examples:
+def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator, ahead: bool = False) -> Examples:
     """The examples of those trajectories that are finite, in float64: a row at each node, and one at a state near it.
 
     The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
@@ -68,10 +80,10 @@ def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator) 
     """
     optimum = _finite(optimum)
     near = _trusted(problem, optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)
-    return _examples(problem, optimum, [torch.zeros_like(near), near])
+    return _examples(problem, optimum, [torch.zeros_like(near), near], ahead)
 
 
-def examples_visited(problem: Problem, optimum: Optimum, path: Path) -> Examples:
+def examples_visited(problem: Problem, optimum: Optimum, path: Path, ahead: bool = False) -> Examples:
     """A row at each state that a law led to from where the optimal trajectories begin, as their expansions say.
 
     A law that V defines leaves the states that V was fitted at, along directions in which V is then free; so the
@@ -82,7 +94,7 @@ def examples_visited(problem: Problem, optimum: Optimum, path: Path) -> Examples
     """
     optimum = _finite(optimum)
     deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    return _examples(problem, optimum, [_trusted(problem, optimum, deviation, TRUSTED)])
+    return _examples(problem, optimum, [_trusted(problem, optimum, deviation, TRUSTED)], ahead)
 
 
 def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
@@ -93,10 +105,10 @@ def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: fl
     return ratio.sqrt().clamp_max(1)[..., None] * deviation
 
 
-def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor]) -> Examples:
+def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
     """The rows at some deviations (N, b, n) from the finite trajectories, where f, g and the cost are defined."""
     problem, optimum = in_float64(problem), _finite(optimum)
-    parts = zip(*(_columns(problem, optimum, each) for each in deviations), strict=True)
+    parts = zip(*(_columns(problem, optimum, each, ahead) for each in deviations), strict=True)
     examples = Examples(*(torch.cat(columns) for columns in parts))
     defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
     return examples.each(lambda column: column[defined])
@@ -135,23 +147,37 @@ def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
     return share * (x[before, neighbour] - x[before, every])
 
 
-def _columns(problem: Problem, optimum: Optimum, deviation: Tensor) -> list[Tensor]:
-    """The columns of the examples at the nodes of some optima, each a deviation away from them."""
-    (x, value, gradient, hessian), dt = optimum.expansion, problem.horizon.dt
+def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool) -> list[Tensor]:
+    """The columns of the examples at the nodes of some optima, each a deviation away from them.
+
+    A penalty for constraints is no quadratic: of what V has of it in one step the known value is taken.
+    """
+    (x, value, gradient, hessian), dt = without_penalty(problem, optimum.expansion), problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
     here = value[:-1] + ((gradient[:-1] + apply(hessian[:-1], deviation) / 2) * deviation).sum(-1)
-    free, R = problem.response(now), problem.cost.R(now)
-    B = free.by_control
-    values, vectors = torch.linalg.eigh(free.curvature + dt * B.mT @ H @ B)
-    floor = 2 * FLOOR * torch.linalg.eigvalsh(R)[..., :1]
-    weight = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
-    b = apply(B.mT, gradient[1:] + apply(H, free.x - x[1:])) + free.slope
-    u = problem.controls.minimise_now(weight / 2, problem.cost.about_rest(weight / 2, b))
+    here = here + penalty_of_one_step(problem, now)[0]
+    floor = 2 * FLOOR * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1]
+
+    def responses(about: Control) -> tuple[State, Tensor, Control, Tensor, Control]:
+        """(F, B, ℓ_u, W) about a control, and the best one as V is to second order there."""
+        answer = problem.response(now, about)
+        _, slope, bend = penalty_of_one_step(problem, answer.x)
+        B = answer.by_control
+        values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
+        W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
+        b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
+        return answer.x, B, answer.slope, W, problem.controls.minimise_now(W / 2, b - apply(W, about))
+
+    about = problem.rest.to(now).expand(*now.shape[:-1], -1)
+    led, B, slope, W, best = responses(about)
+    for _ in range(NEWTON if ahead else 0):
+        about = best
+        led, B, slope, W, best = responses(about)
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _costs_of(problem, optimum)
     rate = cost / problem.horizon.duration
     if problem.horizon.stationary:
         rate = rate.maximum(-value.diff(dim=0) / dt)
-    columns = (t[:-1], now, here, t[1:], free.x, B, free.slope, weight, u, cost, rate)
+    columns = (t[:-1], now, here, t[1:], about, led, B, slope, W, best, cost, rate)
     return [y.flatten(0, 1).detach() for y in columns]
 
 
@@ -160,19 +186,18 @@ def errors(
 ) -> tuple[Tensor, Tensor]:
     """Of some of the examples: the means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
 
-    Q(u) = ½ (u − r)ᵀW(u − r) + bᵀ(u − r) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
+    Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
     the second is zero where V asks for the optimal control u*, and convex in V_x, of slope B(u* − u). Without limits it
     is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
     all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state.
 
     Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
-    t, x, value, after, drifted, B, slope, W, best, cost, rate = (column[rows] for column in examples)
-    b = apply(B.mT, V.value_and_state_gradient(after, drifted)[1]) + slope
+    t, x, value, after, about, led, B, slope, W, best, cost, rate = (column[rows] for column in examples)
+    b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = problem.controls.minimise_now(W / 2, problem.cost.about_rest(W / 2, b))
-    # (u* − u)ᵀ(½ W(u* + u − 2r) + b)
-    excess = ((best - u) * (apply(W, (best + u) / 2 - problem.rest.to(u)) + b)).sum(-1)
+        u = problem.controls.minimise_now(W / 2, b - apply(W, about))
+    excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
 
 
@@ -222,8 +247,13 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         if k == ROUNDS or (k and (now[1] <= enough or before - now[1] <= gain)):
             break
         before = now[1]
-        examples = examples.with_further(examples_visited(learner.problem, optimum, path))
+        examples = examples.with_further(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
     learner.V.load_state_dict(best)
+
+
+def looks_ahead(learner: Learner) -> bool:
+    """Whether the law of a learner looks at V where its own control leads, and not the one that costs nothing."""
+    return isinstance(learner.rollout.closed_loop.policy, LookaheadPolicy)
 
 
 def fit_briefly(learner: Learner, examples: Examples) -> None:

@@ -26,10 +26,10 @@ from lyapnet.policy import LookaheadPolicy, SampledPolicy
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.candidates import CALM, Candidate, Start
-from lyapnet.training.initial_networks import kept_of, network_of, take, take_nothing
+from lyapnet.training.initial_networks import network_of, take, take_nothing
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
-from lyapnet.training.pretraining import Examples, examples_of, fit, fit_briefly, misfit, relative_misfit
+from lyapnet.training.pretraining import Examples, examples_of, fit, fit_briefly, looks_ahead, misfit, relative_misfit
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import State
 
@@ -58,7 +58,7 @@ def choose_start(
     if not has_place_for_start(learners):
         return None
     networks = [network_of(learner.V) for learner in learners]
-    problem, kept = learners[0].problem, kept_of(learners[0])
+    problem = learners[0].problem
     x0 = problem.initial_states.sample(STATES, stream(0, START)).to(problem.goal)
     calm = [copy.deepcopy(network.state_dict()) for network in networks]
     trials, expansions = _Trials(learners[0], x0, report, known), dict[str, Expansion]()
@@ -67,15 +67,15 @@ def choose_start(
             trials.leave_out(name, expansion)
             continue
         expansions[name] = expansion
-        take(networks[0], problem, expansion, kept, x0)
+        take(learners[0], expansion, x0)
         trials.roll_out(name)
         networks[0].load_state_dict(calm[0])
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(CALM)
     base = _best([each for each in trials.tried if each.name != CALM or not expansions])
     if expansions:
-        for network in networks:
-            take(network, problem, expansions[base.name], kept, x0)
+        for learner in learners:
+            take(learner, expansions[base.name], x0)
     sought = _worth_seeking(problem, expansions.get(base.name), x0[:FEW], partial(report, f"improving on {base.name}"))
     if sought:
         _fit_to_optima(learners, list(expansions.values()), calm, base, trials)
@@ -153,7 +153,7 @@ def _fit_to_optima(
     if not found:
         trials.leave_out("optima from states of X₀", _why_none(sought))
         return
-    examples = examples_of(problem, optimum, stream(0, START, 4))
+    examples = examples_of(problem, optimum, stream(0, START, 4), looks_ahead(learners[0]))
     name = f"{found} optima from states of X₀"
     trials.note(name, _mended(optimum))
     _take_least_wrong(learners, expansions, calm, optimum, examples, x0)
@@ -191,15 +191,15 @@ def _take_least_wrong(
     An expansion says much near its own path, and away from it, in a task with limits or several ways to the goal, worse
     than nothing.
     """
-    problem, kept, first = learners[0].problem, kept_of(learners[0]), learners[0]
+    problem, first = learners[0].problem, learners[0]
 
     def put(choice: tuple[Expansion | None, float], learner: Learner, own: dict[str, Tensor]) -> None:
-        network, (expansion, level) = network_of(learner.V), choice
-        network.load_state_dict(own)
+        expansion, level = choice
+        network_of(learner.V).load_state_dict(own)
         if expansion is None:
-            take_nothing(network, problem, optimum, kept)
+            take_nothing(learner, optimum)
         else:
-            take(network, problem, expansion, kept, x0, level)
+            take(learner, expansion, x0, level)
 
     choices: list[tuple[Expansion | None, float]] = [(each, 1.0) for each in (*expansions, None)]
     if problem.horizon.stationary:

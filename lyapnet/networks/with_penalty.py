@@ -1,0 +1,61 @@
+"""V where closed loops pay for coming close to what constraints exclude."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.calculus import ValueFunction, gradients
+from lyapnet.constraints import Constraints
+from lyapnet.cost import closeness
+from lyapnet.types import PerState, State, Time
+
+
+class WithPenalty(ValueFunction):
+    """V(t, x) = N(t, x) + Δt w Σ_j max(0, 1 + h_j(x)/m)³: what the state pays in one step, as `PenaltyCost` has it.
+
+    It is steep and known. What is left for a network is what is paid from the next state on, which a law that looks
+    ahead keeps off the constraints, where one step is enough for that: it is smooth there.
+
+    Args:
+        network: N.
+        constraints: h.
+        margin: m, in the unit of h.
+        step: Δt, in s.
+    """
+
+    network: ValueFunction
+    constraints: Constraints
+    margin: float
+    step: float
+    weight: Float[Tensor, ""]  # w, in cost per second
+
+    def __init__(self, network: ValueFunction, constraints: Constraints, margin: float, step: float):
+        super().__init__()
+        self.network, self.margin, self.step = network, margin, step
+        self._constraints = [constraints]  # the task's own, of which V has no part
+        self.register_buffer("weight", torch.tensor(0.0))
+        self.register_load_state_dict_pre_hook(_named_as_network)
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.network(t, x) + self._penalty(t, x)
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V and V_x."""
+        value, slope = self.network.value_and_state_gradient(t, x)
+        return value + self._penalty(t, x), slope + gradients(self._penalty, t, x)[1]
+
+    def curvature(self, t: Time) -> Tensor | None:
+        return self.network.curvature(t)
+
+    def _penalty(self, t: Time, x: State) -> PerState:
+        return self.step * self.weight * closeness(self._constraints[0], self.margin, x) + 0 * t
+
+
+def _named_as_network(module: WithPenalty, state: dict[str, Any], prefix: str, *others: Any) -> None:
+    """Take the weights of a V without penalty, as of a task without constraints, for those of N."""
+    if f"{prefix}weight" not in state:
+        for name in [name for name in state if name.startswith(prefix)]:
+            state[f"{prefix}network.{name.removeprefix(prefix)}"] = state.pop(name)
+        state[f"{prefix}weight"] = module.weight

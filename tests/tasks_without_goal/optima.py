@@ -16,9 +16,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import torch
 
-from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, problem_of
+from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, problem_of, replay
 
 STATES = 64
 SEED = 20  # of the states
@@ -329,23 +328,13 @@ def find(name: str) -> dict[str, Any]:
     }
 
 
-def replay(name: str, states: Any, controls: Any) -> torch.Tensor:
-    """What controls (b, steps, m) from states (b, n) cost by the steps of lyapnet's problem."""
-    problem = problem_of(name)
-    x, J = torch.tensor(states, dtype=torch.float64), torch.zeros(len(states), dtype=torch.float64)
-    with torch.no_grad():
-        for u in torch.tensor(controls, dtype=torch.float64).unbind(1):
-            x, cost = problem.step(x, u)
-            J = J + cost
-        return J + problem.cost.terminal(x)
-
-
 def main(names: Sequence[str]) -> None:
     """Find the optima of some tasks, hold them against lyapnet's steps, and keep them."""
     for name in names or (*WORKING, *KEPT):
         found = find(name)
         J = np.array(found["optima"])
-        difference = np.abs(replay(name, found["states"], found["controls"]).numpy() - J) / np.abs(J).max()
+        again = replay(problem_of(name), found["states"], found["controls"]).J.numpy()
+        difference = np.abs(again - J) / np.abs(J).max()
         print(f"  J* {J.mean():.6g}, from {J.min():.6g} to {J.max():.6g}, spread {J.std():.4g}; "
               f"lyapnet's steps differ by {difference.max():.1e} of it at most", flush=True)  # fmt: skip
         assert difference.max() < AGREES, "Expected the same J from both formulations; correct one of them."

@@ -1,7 +1,8 @@
 """One task without a goal, trained by the default recipe and measured: python -m THIS NAME [--seed S] [--limit SECONDS]
 
 The folder is copied, `lyapnet train --config task.yaml` runs in the copy until it ends or has used its CPU seconds, and
-the controller of best.ckpt is rolled out from the states of optima.json, which no training saw.
+the controller of best.ckpt is rolled out from the states of optima.json, which no training saw. Other folders of tasks
+give their own states and optima.
 """
 
 import argparse
@@ -11,8 +12,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import psutil
 import torch
@@ -20,7 +22,7 @@ import torch
 import lyapnet
 from lyapnet.build import parts_of
 from lyapnet.config import load_config
-from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, inside, optima_of
+from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, inside, optima_of, simulate
 
 LIMIT = 300.0  # CPU seconds
 GRACE = 60.0  # seconds, to keep what was found after the limit
@@ -59,8 +61,21 @@ def train(folder: Path, seed: int, limit: float) -> dict[str, Any]:
     return {"status": status, "cpu": used, "wall": time.monotonic() - started, "stopped": stopped}
 
 
-@torch.no_grad()
-def measure(folder: Path, name: str) -> dict[str, float]:
+class Task(NamedTuple):
+    """A folder with system.py and task.yaml, and what is known of its optima."""
+
+    folder: Path
+    states: Sequence[Sequence[float]]
+    optima: Sequence[float]  # J*
+
+
+def task_of(name: str) -> Task:
+    """A task without a goal."""
+    kept = optima_of(name)
+    return Task(HERE / name, kept["states"], kept["optima"])
+
+
+def measure(folder: Path, task: Task) -> dict[str, float]:
     """Regret, ratio, violation and how far controls exceed their limits, of the newest best.ckpt in a folder.
 
     Raises:
@@ -72,19 +87,9 @@ def measure(folder: Path, name: str) -> dict[str, float]:
     with inside(folder):
         parts = parts_of(load_config(Path("task.yaml"), []))
         controller = lyapnet.load(checkpoints[-1], system=parts.system, cost=parts.cost)
-    problem, kept = controller.problem, optima_of(name)
-    like = problem.initial_states.lower
-    x, optima = torch.tensor(kept["states"]).to(like), torch.tensor(kept["optima"], dtype=torch.float64)
-    J, h, beyond = 0.0, torch.full_like(optima, -torch.inf), torch.zeros_like(optima)
+    problem, optima = controller.problem, torch.tensor(task.optima, dtype=torch.float64)
+    J, h, u = simulate(problem, task.states, lambda k, x: controller.policy(k * problem.horizon.dt, x))
     low, high = problem.controls.limits
-    for k in range(problem.horizon.steps):
-        u = controller.policy(k * problem.horizon.dt, x)
-        beyond = beyond.maximum((low - u).maximum(u - high).amax(-1).double())
-        x, cost = problem.step(x, u)
-        J = J + cost.double()
-        if problem.constraints is not None:
-            h = h.maximum(problem.constraints(x).amax(-1).double())
-    J = J + problem.cost.terminal(x).double()
     return {
         "J": float(J.mean()),
         "regret": float((J - optima).mean() / optima.std(correction=0)),
@@ -92,27 +97,32 @@ def measure(folder: Path, name: str) -> dict[str, float]:
         "ratio": float(J.mean() / optima.mean()) if bool((optima > 0).all()) else torch.nan,
         "h": float(h.max()),
         "violated": float((h > 0).double().mean()),
-        "beyond": float(beyond.max()),
+        "beyond": float((low - u).maximum(u - high).max().clamp_min(0)),
     }
 
 
-def main() -> None:
-    """Train and measure one task, and print what came of it."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("name", choices=(*WORKING, *KEPT))
+def train_and_measure(task: Task, seed: int, limit: float = LIMIT) -> tuple[dict[str, Any], dict[str, float]]:
+    """Train a task in a copy of its folder, print what the terminal showed, and measure what came of it."""
+    with tempfile.TemporaryDirectory(prefix=f"{task.folder.name}_") as place:
+        folder = Path(place)
+        for file in ("system.py", "task.yaml"):
+            shutil.copy(task.folder / file, folder)
+        run = train(folder, seed, limit)
+        print((folder / "train.out").read_text(encoding="utf-8"))
+        return run, measure(folder, task)
+
+
+def main(names: Sequence[str], task_of: Callable[[str], Task], description: str | None) -> None:
+    """Train and measure the task that the command line names, and print what came of it."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("name", choices=names)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=float, default=LIMIT, help="CPU seconds")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory(prefix=f"{given.name}_") as place:
-        folder = Path(place)
-        for file in ("system.py", "task.yaml"):
-            shutil.copy(HERE / given.name / file, folder)
-        run = train(folder, given.seed, given.limit)
-        print((folder / "train.out").read_text(encoding="utf-8"))
-        stopped = f", stopped at the limit of {given.limit:g}" if run["stopped"] else ""
-        print(f"{given.name}, seed {given.seed}: status {run['status']}, {run['cpu']:.0f} CPU s{stopped}, "
-              f"{run['wall']:.0f} s in all")  # fmt: skip
-        found = measure(folder, given.name)
+    run, found = train_and_measure(task_of(given.name), given.seed, given.limit)
+    stopped = f", stopped at the limit of {given.limit:g}" if run["stopped"] else ""
+    print(f"{given.name}, seed {given.seed}: status {run['status']}, {run['cpu']:.0f} CPU s{stopped}, "
+          f"{run['wall']:.0f} s in all")  # fmt: skip
     ratio = f"cost / optimum {found['ratio']:.4f}, " if found["ratio"] == found["ratio"] else ""
     kept = f"largest h {found['h']:.2e}, violated from {found['violated']:.1%} of the states; "
     print(f"regret {found['regret']:.3%} of the spread of J*, {found['largest']:.2%} at most; {ratio}mean J "
@@ -121,4 +131,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main((*WORKING, *KEPT), task_of, __doc__)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lyapnet.contracts import copied
 from lyapnet.cost import PenaltyCost, spread
-from lyapnet.derivatives import Steps, steps_along, with_curvature
+from lyapnet.derivatives import Steps, jacobian, steps_along, with_curvature
 from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem, Response
@@ -247,9 +247,13 @@ def sizes(problem: Problem, cost: PerState) -> PerState:
 
 def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
     """What states pay in one step for being close to constraints, to second order; zero where nothing is relaxed."""
-    if isinstance(problem.cost, PenaltyCost):
-        return problem.cost.in_one_step(x)
-    return torch.zeros_like(x[..., 0]), torch.zeros_like(x), torch.zeros_like(x[..., None] * x[..., None, :])
+    if not isinstance(problem.cost, PenaltyCost):
+        return torch.zeros_like(x[..., 0]), torch.zeros_like(x), torch.zeros_like(x[..., None] * x[..., None, :])
+    with torch.enable_grad():
+        z = x.detach().requires_grad_()
+        value = problem.horizon.dt * problem.cost.penalty(z)
+        gradient = jacobian(value[..., None], z)[..., 0, :]
+        return value.detach(), gradient.detach(), jacobian(gradient, z)
 
 
 def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:

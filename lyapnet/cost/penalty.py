@@ -6,7 +6,6 @@ from torch import Tensor, nn
 
 from lyapnet.cost.base import Cost
 from lyapnet.cost.made_of_another import MadeOfAnother
-from lyapnet.derivatives import jacobian
 from lyapnet.types import PerState, State
 
 
@@ -43,20 +42,13 @@ class PenaltyCost(MadeOfAnother):
         self.register_buffer("weight", torch.tensor(float(weight)), persistent=False)
 
     def state(self, x: State) -> PerState:
-        return self.cost.state(x) + self._penalty(x)
+        return self.cost.state(x) + self.penalty(x)
 
     def terminal(self, x: State) -> PerState:
-        return self.cost.terminal(x) + self.step * self._penalty(x)
+        return self.cost.terminal(x) + self.step * self.penalty(x)
 
-    def in_one_step(self, x: State) -> tuple[PerState, State, Float[Tensor, "*batch n n"]]:
-        """What a state pays in one step for being close to constraints, to second order: value, gradient, Hessian."""
-        with torch.enable_grad():
-            z = x.detach().requires_grad_()
-            value = self.step * self._penalty(z)
-            gradient = jacobian(value[..., None], z)[..., 0, :]
-            return value.detach(), gradient.detach(), jacobian(gradient, z)
-
-    def _penalty(self, x: State) -> PerState:
+    def penalty(self, x: State) -> PerState:
+        """What a state pays per second for being close to constraints."""
         return self.weight * closeness(self.constraints, self.margin, x)
 
     def ignores(self, i: int, n: int) -> bool:

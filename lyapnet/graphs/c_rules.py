@@ -206,6 +206,22 @@ def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
     return whole
 
 
+def _index_put(text: Text, x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> Array:
+    """A copy, to whose entries at known places along one axis others are added, or whose they are."""
+    whole = text.copy(x, text.new(shape_of(x)))
+    (axis, places), *more = [(axis, index) for axis, index in enumerate(indices) if index is not None]
+    if more or not isinstance(places, torch.Tensor) or places.ndim != 1 or places.dtype == torch.bool:
+        raise NotImplementedError
+    values = values if isinstance(values, Array) else text.tables.of(values)
+    shape = (*whole.shape[:axis], len(places), *whole.shape[axis + 1 :])
+    given = values.layout.expand(shape)
+    for k, place in enumerate(places.tolist()):
+        into, part = (Array(name, layout.select(axis, i)) for name, layout, i in
+                      ((whole.name, whole.layout, place), (values.name, given, k)))  # fmt: skip
+        text.each(into.shape, [into, part], "{into} = {0} + {1};" if accumulate else "{into} = {1};", into)
+    return whole
+
+
 def _softmax(text: Text, x: Array, dim: int, half_to_float: bool = False) -> Array:
     raised = RULES["exp"](text, RULES["sub"](text, x, RULES["amax"](text, x, [dim], True)))
     return RULES["div"](text, raised, RULES["sum"](text, raised, [dim], True))
@@ -318,6 +334,7 @@ RULES: dict[str, Callable[..., Any]] = {
     "argmax": _index_of_extreme(">"),
     "gather": _gather,
     "scatter": _scatter,
+    "index_put": _index_put,
     "_softmax": _softmax,
     "constant_pad_nd": _padded,
     "linalg_vector_norm": _norm,

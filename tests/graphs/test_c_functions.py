@@ -23,6 +23,8 @@ FUNCTIONS = OF_CASADI | {
     "places of extremes": lambda x: x.max(-1).indices + x.argmin(-1, keepdim=True) + x.min() + x[0].sum(-1).sum(-1),
     "computed places": lambda x: x.gather(-1, x.argmax(-1, True)) * x,
     "written places": lambda x: torch.zeros_like(x).scatter(-1, x.argmax(-1, True), x[:, :1]),
+    "added at places": lambda x: x.index_add(-1, torch.tensor([2, 0, 2]), x[:, 1:].sin()),
+    "put at places": lambda x: x.index_copy(-1, torch.tensor([2, 0]), x[:, 1:3].sin()),
     "wrapped": lambda x: torch.remainder(x, 0.7) + torch.remainder(x, -0.7) + torch.floor_divide(x, 0.3),
     "nothing": lambda x: torch.cat([x[:, :0], x, x[:, 4:]], -1) + 0.0 * x[:, :0].sum(),
     "singular": lambda x: torch.linalg.det(torch.zeros(3, 3).to(x) * x[0, 0]) + x,

@@ -77,13 +77,14 @@ def singular(error: RuntimeError) -> Missing:
 
 
 def _missing_values(problem: Problem, f: State, g: InputMatrix) -> Missing | None:
+    remedy = NAME_A_GOAL if problem.cost.goal is None else "choose a target at which it is"
+    domain = problem.domain
+    if domain is not None and not torch.equal(domain.nearest(problem.goal), problem.goal):
+        return Missing(f"outside the domain ({domain}) lies {goal_in_words(problem.cost, problem.goal)}", remedy)
     for symbol, value in (("f", f[:, None]), ("g", g)):
         bad = torch.nonzero(~value.isfinite())
         if len(bad):
             row, column = bad[0].tolist()
-            remedy = NAME_A_GOAL
-            if problem.cost.goal is not None:
-                remedy = "choose a target at which it is"
             rate = f"the rate of {problem.system.state_names[row]} has {float(value[row, column])} there"
             return Missing(f"{symbol} is not finite at {goal_in_words(problem.cost, problem.goal)}; {rate}", remedy)
     return None

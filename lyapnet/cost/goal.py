@@ -8,7 +8,7 @@ from lyapnet.cost.base import Cost
 from lyapnet.types import PerState
 
 THIN = 1e-3  # of the mean size of costs, which their spread counts for at the least: X₀ may be a point
-VANISHING = 1e-2  # of what q and φ are in the mean, below which they vanish: the tail of an obstacle may reach a goal
+VANISHING = 1e-2  # of what q and φ are in the median, below which they vanish: the tail of an obstacle may reach a goal
 NEGATIVE = 1e-3  # of the same, below zero: there V is no distance
 
 
@@ -27,7 +27,7 @@ def reason_for_no_goal(cost: Cost, goal: Float[Tensor, " n"], x: Float[Tensor, "
     distance = (x - goal).abs().median(0).values
     for symbol, function in (("q", cost.state), ("φ", cost.terminal)):
         values = function(x).detach()
-        size = float(values.abs().mean())
+        size = float(values.abs().median()) or float(values.abs().mean())
         with torch.enable_grad():
             leaf = goal.detach().clone().requires_grad_()
             value = function(leaf)

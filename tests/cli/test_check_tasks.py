@@ -106,7 +106,7 @@ CHARGE = Own(1, lambda x: -TABLE(x)[..., None] * x, [[1]])
 
 # a system and changes to the task ↦ facts, each with words of what is found, or None where it must not be there
 TASKS = {
-    "logarithm": (LOG, {"lower": 1, "upper": 2}, {"goal": "none: f is not finite at the origin, which stands in"}),
+    "logarithm": (LOG, {"lower": 1, "upper": 2}, {"goal": "where f is defined) lies the origin, which stands in"}),
     "root": (
         ROOT,
         {},
@@ -256,7 +256,7 @@ def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch
     monkeypatch.setattr("lyapnet.training.optima.optimal_cost", lambda problem: None)
     assert main(["check", "task.yaml"]) == 0
     shown, notes = capfd.readouterr()
-    assert "none: f is not finite at the origin" in shown
+    assert "(p > 0, where f and g are defined) lies the origin" in " ".join(shown.split())
     assert "no Riccati solution at the goal, for the reason above" in shown
     assert "training starts from" in shown
     assert all(line.startswith("check: ") for line in notes.splitlines())

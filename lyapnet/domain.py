@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lyapnet.cost import Cost, MadeOfAnother, PenaltyCost
+from lyapnet.cost import Cost, MadeOfAnother, PenaltyCost, SmoothedCost
 from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import ControlMatrix, PerState, State, StatePath
@@ -168,8 +168,8 @@ class DomainCost(MadeOfAnother):
 
 
 def as_written(cost: Cost) -> Cost:
-    """The cost of a task without the prices that keep closed loops off constraints, and in the domain."""
-    while isinstance(cost, PenaltyCost | DomainCost):
+    """The cost of a task without the prices that keep closed loops off constraints and in the domain, not rounded."""
+    while isinstance(cost, PenaltyCost | DomainCost | SmoothedCost):
         cost = cost.cost
     return cost
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import handle_torch_function, has_torch_function_unary
 
 SMALL = 16  # products of entries that are cheaper without the library
 CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
@@ -24,6 +25,8 @@ def norm(v: Tensor, dim: int = -1) -> Tensor:
         v: (…, k, …), in any unit.
         dim: the axis that is summed over, the last one unless said otherwise.
     """
+    if has_torch_function_unary(v):  # a cost that is rounded, say, wants a norm and not what it is computed by
+        return handle_torch_function(norm, (v,), v, dim=dim)
     squared = (v * v).sum(dim)
     away = squared > 0
     # the root of 1 in the place of that of 0, so that its infinite slope is not even computed

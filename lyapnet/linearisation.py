@@ -1,21 +1,26 @@
 """A problem linearised at its goal, or the reason why it cannot be."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from lyapnet.contracts import TO_WRITE
-from lyapnet.cost import goal_in_words
+from lyapnet.cost import Cost, MadeOfAnother, SmoothedCost, goal_in_words
 from lyapnet.derivatives import jacobian
+from lyapnet.domain import as_written
 from lyapnet.errors import one_line
 from lyapnet.expansions import Expansion, in_float64, riccati
 from lyapnet.problem import Problem
-from lyapnet.types import InputMatrix, Matrix, State
+from lyapnet.types import InputMatrix, Matrix, PerState, State
 
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 NAME_A_GOAL = "name target: in the config, or cost.goal, where the task has a goal"
 NEARBY, NEAR = 8, 1e-3  # states around the goal, and how far away they are, in units of X₀
+TRAINED, SOLVED = 3e-3, 1e-4  # ε of a kink, in units of the usual size: V can be learned, optima cost what they do
+USUAL = 256  # states around the goal as far away as X₀, by which the size of a cost is known
+KINK, BENT = 1e-9, 1e-2  # how far from the goal slopes are compared, in units of X₀; by how much they differ at a kink
 
 
 class Missing(NamedTuple):
@@ -68,6 +73,49 @@ def riccati_or_reason(problem: Problem) -> Expansion | Missing:
     return expansion
 
 
+@torch.no_grad()
+def rounded(problem: Problem, share: float = TRAINED) -> Problem:
+    """The problem with a cost that is smooth at the goal, where q or φ has a kink there that can be rounded; else it
+    itself.
+
+    Where closed loops end and stay, V_xx grows without bound towards a kink: neither second derivatives nor solvers
+    that need them lead to an optimum.
+
+    Args:
+        share: of what a root, a norm or an absolute value is around the goal, as far away as X₀: ε.
+    """
+    if smoothed_part(problem.cost) is not None or not problem.has_goal:
+        return problem
+    own = in_float64(problem)
+    written, x = as_written(own.cost), _around(own, USUAL, 1.0)
+    if not _has_kink(own, written, x):
+        return problem
+    cost = SmoothedCost(problem.cost, x, own.goal, share)
+    smooth = not _has_kink(own, SmoothedCost(written, x, own.goal, share), x)
+    return problem.replaced(cost=cost.to(problem.initial_states.lower)) if cost.words and smooth else problem
+
+
+def smoothed_part(cost: Cost) -> SmoothedCost | None:
+    """What rounds the kinks of a cost, where something does."""
+    while isinstance(cost, MadeOfAnother) and not isinstance(cost, SmoothedCost):
+        cost = cost.cost
+    return cost if isinstance(cost, SmoothedCost) else None
+
+
+def _has_kink(problem: Problem, cost: Cost, x: State) -> bool:
+    """Whether q or φ has no finite first and second derivative at the goal, or slopes that jump there."""
+    goal = problem.goal
+    for function in (cost.state, cost.terminal):
+        value, *derivatives = _to_second_order(function, goal)
+        if bool(value.isfinite()) and not all(part.isfinite().all() for part in derivatives):
+            return True
+        bend = function(goal + KINK * (x - goal)) + function(goal - KINK * (x - goal)) - 2 * value
+        size = function(x).abs()
+        if bool((bend.abs() > BENT * KINK * size[size.isfinite()].mean()).any()):
+            return True
+    return False
+
+
 def singular(error: RuntimeError) -> Missing:
     """What an error of torch's linear algebra says to a user."""
     return Missing(
@@ -102,14 +150,19 @@ def _missing_slope(problem: Problem, A: Matrix) -> Missing | None:
 
 def _bent(problem: Problem, by: Tensor) -> Tensor:
     """Which rates have slopes by some states that change near the goal, or all: at the goal a NaN spreads to others."""
-    extent = problem.initial_states.reach_from(problem.goal)
-    away = torch.randn(NEARBY, problem.system.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     with torch.enable_grad():
-        x = (problem.goal + NEAR * away * extent.where(extent > 0, 1)).requires_grad_()
+        x = _around(problem, NEARBY, NEAR).requires_grad_()
         rate = problem.system.dynamics(x, problem.rest.expand(NEARBY, -1))
         slopes = jacobian(rate, x).detach()[..., by]
     bent = (slopes - slopes[0]).abs().amax((0, -1)) > 0
     return bent if bent.any() else torch.ones_like(bent)
+
+
+def _around(problem: Problem, count: int, distance: float) -> State:
+    """States (b, n) around the goal, at a distance in units of X₀."""
+    extent = problem.initial_states.reach_from(problem.goal)
+    away = torch.randn(count, problem.system.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return problem.goal + distance * away * extent.where(extent > 0, 1)
 
 
 def _missing_cost(problem: Problem) -> Missing | None:
@@ -118,12 +171,17 @@ def _missing_cost(problem: Problem) -> Missing | None:
     if not R.isfinite().all() or float(torch.linalg.eigvalsh(R).min()) <= 0:
         return Missing(f"R is not positive definite at the goal: {R.tolist()}", "give every control a weight")
     for symbol, function in (("q", problem.cost.state), ("φ", problem.cost.terminal)):
-        with torch.enable_grad():
-            x = problem.goal.clone().requires_grad_()
-            value = function(x)
-            slope = jacobian(value[None], x)[0]
-            curvature = jacobian(slope, x)
-        for part, what in ((value[None], "value"), (slope, "slope"), (curvature, "second derivative")):
+        orders = _to_second_order(function, problem.goal)
+        for part, what in zip(orders, ("value", "slope", "second derivative"), strict=True):
             if not part.isfinite().all():
                 return Missing(f"{symbol} has no finite {what} at the goal", TO_WRITE)
     return None
+
+
+@torch.enable_grad()
+def _to_second_order(function: Callable[[State], PerState], x: State) -> tuple[Tensor, Tensor, Tensor]:
+    """The value, slope and second derivative of a function at a state."""
+    x = x.detach().clone().requires_grad_()
+    value = function(x)
+    slope = jacobian(value[None], x)[0]
+    return value.detach(), slope.detach(), jacobian(slope, x).detach()

@@ -26,6 +26,7 @@ from lyapnet.controller import Controller
 from lyapnet.cost import Cost
 from lyapnet.devices import require_device
 from lyapnet.errors import CheckpointError, UsageError
+from lyapnet.linearisation import rounded
 from lyapnet.programs import Program
 from lyapnet.sets import ControlSet
 from lyapnet.systems import ControlAffineSystem
@@ -74,7 +75,7 @@ def _controller_of(
 ) -> Controller:
     """The controller of what a checkpoint holds."""
     problem = build_problem(config, parts)
-    V = build_value_function(config, problem, parts.network)
+    V = build_value_function(config, rounded(problem), parts.network)
     load_value_function(V, content, path)
     problem.check_value_function(V)
     after_horizon = from_plain(content[KEY].get(AFTER_HORIZON))

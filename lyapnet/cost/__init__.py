@@ -14,6 +14,7 @@ from lyapnet.cost.made_of_another import (
 )
 from lyapnet.cost.penalty import PenaltyCost, closeness
 from lyapnet.cost.quadratic import QuadraticCost, is_quadratic
+from lyapnet.cost.smoothed import SmoothedCost
 
 COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
 
@@ -27,6 +28,7 @@ __all__ = [
     "PseudoHuberCost",
     "QuadraticCost",
     "RegulatorTail",
+    "SmoothedCost",
     "TargetCost",
     "closeness",
     "goal_in_words",

@@ -27,7 +27,7 @@ from lyapnet.training.build import build_data
 from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
-from lyapnet.training.facts import jump_facts
+from lyapnet.training.facts import jump_facts, kink_facts
 from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
 from lyapnet.training.plan import Plan, plan_run, under_policy
 from lyapnet.training.recovery import Returns
@@ -112,8 +112,9 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
                 f"resuming from step {plan.step} of {config.training.iterations} ({plan.resume_from})", soft_wrap=True
             )
         else:
-            for fact in jump_facts(plan.module.members[0].problem):
-                console.print(f"note: {fact.found}; {fact.advice}.", soft_wrap=True)
+            problem = plan.module.members[0].problem
+            for fact in (*jump_facts(problem), *kink_facts(problem)):
+                console.print(f"note: {'; '.join(filter(None, fact[1:]))}.", soft_wrap=True)
     started = time.perf_counter()
     try:
         if plan.module.penalty is not None and plan.resume_from is None:

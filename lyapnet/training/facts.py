@@ -21,6 +21,7 @@ from lyapnet.linearisation import (
     linearised,
     riccati_or_reason,
     singular,
+    smoothed_part,
 )
 from lyapnet.operating_points import HELD
 from lyapnet.problem import Problem
@@ -59,7 +60,7 @@ def facts_of(
 
     with float64_defaults():  # as the problem is built, so that f computes with the same constants
         exact = in_float64(problem)
-        tell(_task(exact), *jump_facts(exact))
+        tell(_task(exact), *jump_facts(exact), *kink_facts(exact))
         if exact.domain is not None:
             tell(Fact("domain", str(exact.domain)))
         if not exact.has_goal:
@@ -118,6 +119,16 @@ def jump_facts(problem: Problem) -> list[Fact]:
             )
             for jump in jumps(function, low - room, high + room)
         ]  # fmt: skip
+
+
+def kink_facts(problem: Problem) -> list[Fact]:
+    """Which kinks of the cost at the goal are rounded, and how."""
+    part = smoothed_part(problem.cost)
+    if part is None:
+        return []
+    kinked = [symbol for symbol, widths in part.widths.items() if any(widths)]
+    has, it = ("has", "it") if len(kinked) == 1 else ("have", "them")
+    return [Fact("kink", f"{' and '.join(kinked)} {has} a kink at the goal: training rounds {it}, {part.words}")]
 
 
 def _chosen(start: Start | None) -> Iterator[Fact]:

@@ -5,12 +5,14 @@ import importlib.util
 from lyapnet.cost import is_quadratic
 from lyapnet.errors import OracleError, one_line
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.evaluation.oracles.of_rounded import OracleOfRounded
 from lyapnet.evaluation.oracles.riccati import (
     RiccatiOracle,
     RiccatiSolution,
     continuous_riccati,
     discrete_riccati,
 )
+from lyapnet.linearisation import SOLVED, rounded
 from lyapnet.problem import Problem
 from lyapnet.rollout import ADAPTIVE_METHODS
 from lyapnet.systems import is_linear
@@ -36,7 +38,8 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
     task, J_N*, with Euler, and that of the continuous task with any other integrator. Else it is found by direct
     transcription, within the limits of U and h(x) ≤ 0: with the steps of that integrator, rk4 for an adaptive one, and
     u held over each. Rollouts of laws that are not held read them at every stage of a step, and may so cost less, by
-    O(Δt²).
+    O(Δt²). Where the cost has a kink at the goal, the optimum is that of the rounded task, and its controls count for
+    what they cost in the task as it is written.
 
     Args:
         method: of the steps; None: the horizon's.
@@ -68,7 +71,9 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
         )
     from lyapnet.evaluation.oracles.transcription import Transcription  # needs the extra
 
-    return Transcription(problem, "rk4" if method in ADAPTIVE_METHODS else method)
+    steps, smooth = "rk4" if method in ADAPTIVE_METHODS else method, rounded(problem, SOLVED)
+    found = Transcription(smooth, steps)
+    return found if smooth is problem else OracleOfRounded(found, problem, steps)
 
 
 def optimal_cost(problem: Problem, method: str | None = None) -> Oracle | None:

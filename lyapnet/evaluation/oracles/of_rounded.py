@@ -1,0 +1,31 @@
+"""Optima of a task whose cost has a kink at the goal, from those of the same task with the kink rounded."""
+
+import torch
+
+from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.expansions import in_float64, path_under
+from lyapnet.problem import Problem
+from lyapnet.types import ControlPath, State
+
+
+class OracleOfRounded(Oracle):
+    """What the optimal controls of a rounded task cost in the task as it is written.
+
+    That is no less than the optimum, and no more than it but for the rounding: each cost is rounded down, by ε at most
+    for each root, norm and absolute value.
+
+    Args:
+        rounded: the oracle of the rounded task, which finds controls.
+        problem: the task as it is written.
+        method: of the steps.
+    """
+
+    def __init__(self, rounded: Oracle, problem: Problem, method: str):
+        self.rounded, self.problem = rounded, in_float64(problem.in_steps(method=method))
+
+    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+        optima = self.rounded.solve(x0, known, progress)
+        assert optima.u is not None
+        u = optima.u.double().cpu()
+        cost = path_under(self.problem, lambda n, _: u[n], x0.detach().double().cpu()).cost.to(x0)
+        return Optima(cost.masked_fill(torch.isnan(optima.cost), torch.nan), optima.reasons, optima.u)

@@ -1,5 +1,6 @@
 """A problem linearised at its goal, or the reason why it cannot be."""
 
+import copy
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -90,9 +91,19 @@ def rounded(problem: Problem, share: float = TRAINED) -> Problem:
     written, x = as_written(own.cost), _around(own, USUAL, 1.0)
     if not _has_kink(own, written, x):
         return problem
-    cost = SmoothedCost(problem.cost, x, own.goal, share)
-    smooth = not _has_kink(own, SmoothedCost(written, x, own.goal, share), x)
-    return problem.replaced(cost=cost.to(problem.initial_states.lower)) if cost.words and smooth else problem
+    smooth = SmoothedCost(as_written(problem.cost), x, own.goal, share)
+    if not smooth.words or _has_kink(own, SmoothedCost(written, x, own.goal, share), x):
+        return problem
+    return problem.replaced(cost=_with_written(problem.cost, smooth).to(problem.initial_states.lower))
+
+
+def _with_written(cost: Cost, written: Cost) -> Cost:
+    """A cost with another one in the place of what is written; the prices of constraints and of a domain stay."""
+    if cost is as_written(cost) or not isinstance(cost, MadeOfAnother):
+        return written
+    outer = copy.deepcopy(cost)
+    outer.cost = _with_written(cost.cost, written)
+    return outer
 
 
 def smoothed_part(cost: Cost) -> SmoothedCost | None:
@@ -109,9 +120,11 @@ def _has_kink(problem: Problem, cost: Cost, x: State) -> bool:
         value, *derivatives = _to_second_order(function, goal)
         if bool(value.isfinite()) and not all(part.isfinite().all() for part in derivatives):
             return True
-        bend = function(goal + KINK * (x - goal)) + function(goal - KINK * (x - goal)) - 2 * value
+        steps = [distance * (x - goal) for distance in (KINK, KINK / 10)]
+        bend, closer = ((function(goal + step) + function(goal - step) - 2 * value).abs() for step in steps)
         size = function(x).abs()
-        if bool((bend.abs() > BENT * KINK * size[size.isfinite()].mean()).any()):
+        # where slopes jump it falls to a tenth, where they do not to a hundredth
+        if bool(((bend > BENT * KINK * size[size.isfinite()].mean()) & (closer > bend / 30)).any()):
             return True
     return False
 

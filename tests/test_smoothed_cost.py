@@ -9,7 +9,7 @@ from lyapnet.build import Parts
 from lyapnet.config import config_from_plain
 from lyapnet.cost import PenaltyCost, SmoothedCost
 from lyapnet.derivatives import jacobian
-from lyapnet.domain import as_written
+from lyapnet.domain import Border, DomainCost, as_written
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.expansions import Expansion, at_rest, greedy_law, in_float64, optimal_trajectories, path_under
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
@@ -138,6 +138,20 @@ def test_constraints_and_the_record_are_those_of_the_task():
     relaxed = smooth.replaced(constraints=limited.double().constraints).relaxed()
     assert isinstance(relaxed.cost, PenaltyCost)
     assert as_written(relaxed.cost) is problem.cost
+
+
+def test_in_a_domain_a_root_is_rounded_and_the_price_of_leaving_is_not():
+    problem = problem_of(lambda x: torch.sqrt(x[..., 0]) + x[..., 1] ** 2, "initial_states.lower=[0,-1]")
+    problem = problem.within([Border("position", "lower", 0.0, "where q is defined")])
+    for share in (TRAINED, SOLVED):
+        smooth = rounded(problem, share)
+        outer = smooth.cost
+        assert isinstance(outer, DomainCost)
+        assert isinstance(outer.cost, SmoothedCost)
+        assert as_written(outer) is as_written(problem.cost)
+        (width,) = outer.cost.widths["q"]
+        x = torch.rand(20, 2, dtype=torch.float64) + 0.1
+        assert_close(outer.state(x), round_of(x[:, 0], width) + x[:, 1] ** 2, rtol=0, atol=1e-12)
 
 
 def test_traces_are_the_functions():

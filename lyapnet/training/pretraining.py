@@ -25,6 +25,7 @@ from lyapnet.linear_algebra import apply
 from lyapnet.policy import LookaheadPolicy
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
+from lyapnet.sets import ControlSet, Unbounded
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.stages import Report, silent
@@ -166,7 +167,7 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool)
         values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
         W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
-        return answer.x, B, answer.slope, W, problem.controls.minimise_now(W / 2, b - apply(W, about))
+        return answer.x, B, answer.slope, W, _compared(problem).minimise_now(W / 2, b - apply(W, about))
 
     about = problem.rest.to(now).expand(*now.shape[:-1], -1)
     led, B, slope, W, best = responses(about)
@@ -189,16 +190,24 @@ def errors(
     Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
     the second is zero where V asks for the optimal control u*, and convex in V_x, of slope B(u* − u). Without limits it
     is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
-    all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state.
+    all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state, and limits are left out.
 
     Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
     t, x, value, after, about, led, B, slope, W, best, cost, rate = (column[rows] for column in examples)
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = problem.controls.minimise_now(W / 2, b - apply(W, about))
+        u = _compared(problem).minimise_now(W / 2, b - apply(W, about))
     excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
+
+
+def _compared(problem: Problem) -> ControlSet:
+    """The controls among which those of V are compared with the best ones.
+
+    A stationary V is asked whether it falls, wherever u is: its slopes are to be right at the limits of u too.
+    """
+    return Unbounded() if problem.horizon.stationary else problem.controls
 
 
 def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:

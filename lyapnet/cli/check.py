@@ -93,10 +93,9 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     try:
         import torch
 
-        from lyapnet.build import build_problem, default_of, parts_of
+        from lyapnet.build import default_of, parts_of
         from lyapnet.config import load_config
-        from lyapnet.linearisation import rounded
-        from lyapnet.training.build_learner import build_learner
+        from lyapnet.training.build_learner import build_learner, build_problem_to_train
         from lyapnet.training.facts import facts_of
     finally:
         gc.enable()
@@ -104,8 +103,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
     with default_of(resolved):
-        problem = rounded(build_problem(resolved, parts)).relaxed()
-        facts_of(build_learner(resolved, problem, parts), report, known)
+        facts_of(build_learner(resolved, build_problem_to_train(resolved, parts), parts), report, known)
 
 
 def print_fact(console: Console, fact: Any) -> None:

@@ -13,7 +13,7 @@ from lyapnet.networks.icnn import ICNN, PartiallyConvexNetwork
 from lyapnet.networks.ignoring import IgnoringStates, kept_states
 from lyapnet.networks.quadratic import QuadraticForm
 from lyapnet.networks.stationary import StationaryNetwork, Timeless
-from lyapnet.networks.with_penalty import WithPenalty
+from lyapnet.networks.with_penalty import WithPenalty, learned_part
 
 NETWORKS: dict[str, type[ValueFunction]] = {
     "fcn": FCN,
@@ -42,4 +42,5 @@ __all__ = [
     "Timeless",
     "WithPenalty",
     "kept_states",
+    "learned_part",
 ]

@@ -7,7 +7,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.networks.with_penalty import WithPenalty
+from lyapnet.networks.with_penalty import learned_part
 from lyapnet.types import PerState, State, Time
 
 
@@ -47,5 +47,5 @@ class IgnoringStates(ValueFunction):
 
 def kept_states(V: ValueFunction, n: int) -> list[int]:
     """The indices of the states, of n, on which a V depends."""
-    V = V.network if isinstance(V, WithPenalty) else V
+    V = learned_part(V)
     return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(n))

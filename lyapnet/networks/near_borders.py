@@ -10,7 +10,7 @@ from lyapnet.domain import Border
 from lyapnet.types import State
 
 ROOM = 1e-9  # of the spread of a state, up to which it is told apart from its border
-SPREAD = 0.35  # of the deviation of logarithms, which counts as 1
+SPREAD = 0.35  # of how far something spreads along optima, which counts as 1 for an input of a network
 
 
 class NearBorders(nn.Module):

@@ -2,12 +2,11 @@
 
 import lightning as L
 
-from lyapnet.build import Parts, build_problem, parts_of, resolve
+from lyapnet.build import Parts, parts_of, resolve
 from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
 from lyapnet.errors import UsageError
-from lyapnet.linearisation import rounded
 from lyapnet.problem import Problem
-from lyapnet.training.build_learner import build_learner
+from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.modules import EnsembleModule, TrainingModule, ValueModule
 from lyapnet.training.optimizer import OptimizerOptions
@@ -23,7 +22,7 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
         UsageError: as build_problem and its like; or the seeds cannot train as one batch.
     """
     parts = parts_of(config) if parts is None else parts
-    problem, options = rounded(build_problem(config, parts)).relaxed(), _optimizer_options(config.training)
+    problem, options = build_problem_to_train(config, parts), _optimizer_options(config.training)
     if config.seeds == 1:
         one = build_learner(config, problem, parts)
         module = ValueModule(problem, one.V, one.program, one.rollout, one.pointwise, options, config.seed)

@@ -7,15 +7,26 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lyapnet.build import Parts, build_program, build_rollout, build_value_function, entry_per_state
+from lyapnet.build import Parts, build_problem, build_program, build_rollout, build_value_function, entry_per_state
 from lyapnet.config import Config, to_plain
 from lyapnet.errors import UsageError
 from lyapnet.files import read_file
+from lyapnet.linearisation import rounded
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.training.learner import Learner
+
+
+def build_problem_to_train(config: Config, parts: Parts) -> Problem:
+    """The problem that training solves in the place of a config's: without kinks at the goal, with a penalty for
+    constraints.
+
+    Raises:
+        UsageError: as build_problem.
+    """
+    return rounded(build_problem(config, parts)).relaxed()
 
 
 def build_learner(config: Config, problem: Problem, parts: Parts | None = None, label: str = "") -> Learner:

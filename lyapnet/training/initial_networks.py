@@ -8,18 +8,18 @@ from torch import Tensor
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import is_quadratic_about_target
 from lyapnet.expansions import Expansion, Optimum, sizes, without_penalty
-from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, WithPenalty, kept_states
+from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, WithPenalty, kept_states, learned_part
+from lyapnet.networks.near_borders import SPREAD
 from lyapnet.training.learner import Learner
 from lyapnet.training.pretraining import typical
 from lyapnet.types import State
 
-SPREAD = 0.35  # of the distances from the goal along optima, in units of which a network begins without an expansion
 AROUND = 0.25  # of how far optima go: how far beside them a goal may be that they begin or end at
 
 
 def network_of(V: ValueFunction) -> Any:
     """The network that an expansion can be put into, if there is one."""
-    V = V.network if isinstance(V, WithPenalty) else V
+    V = learned_part(V)
     inner = V.network if isinstance(V, IgnoringStates) else V
     return inner if isinstance(inner, ExpansionNetwork | StationaryNetwork) else None
 

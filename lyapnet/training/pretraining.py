@@ -78,6 +78,9 @@ def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator, 
 
     The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
     V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
+
+    Args:
+        ahead: whether the law that is fitted looks at V where its own control leads.
     """
     optimum = _finite(optimum)
     near = _trusted(problem, optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)

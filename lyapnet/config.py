@@ -11,6 +11,7 @@ from typing import Any
 
 from omegaconf import MISSING, OmegaConf
 
+from lyapnet.recipe import STANDARD, completed
 from lyapnet.schema import Names, check_values, checked, differences, option, read_yaml
 from lyapnet.sizes import THREADS, check_sizes
 
@@ -27,26 +28,6 @@ CONTROL_SETS = Names("sets", "CONTROL_SETS")
 SYSTEMS = Names("systems", "SYSTEMS")
 SWITCH = ("auto", "on", "off")
 LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
-
-
-# What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
-# a registered program has the weights that it recommends, and with constraints, where V is steep, the law looks ahead.
-STANDARD: dict[str, Any] = {
-    "program": {"name": "value"},
-    "network": {"name": "expansion"},
-    "rollout": {"policy": "sampled", "choose_policy": True, "gradient": "discrete"},
-    "training": {
-        "iterations": 400,
-        "batch_size": 32,
-        "learning_rate": 0.003,
-        "warmup": 40,
-        "validate_every": 20,
-        "lost_share": 0.5,
-    },
-    "trainer": {"gradient_clip_val": 3},
-    "evaluation": {"validation_states": 512},
-}
-COSTATE_LIMIT = 5  # that of the recipe, for the value and region programs between limits of the controls
 
 
 @dataclass
@@ -146,7 +127,12 @@ class ConstraintsConfig:
         user_class=True,
     )  # fmt: skip
     parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
-    margin: float = option(0.02, "Of h, within which training pays for coming close.", above=0)
+    margin: float | None = option(
+        None,
+        "Of h, within which training pays for coming close; null: 0.02, or where u acts on h at once and "
+        "network.penalty is true, 0.002.",
+        above=0,
+    )
 
 
 @dataclass
@@ -335,7 +321,7 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     Raises:
         UsageError: as load_config.
     """
-    config = checked(Config, _completed(content, overrides), overrides)
+    config = checked(Config, completed(content, overrides, _weights), overrides)
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
@@ -343,46 +329,12 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     return config
 
 
-def _completed(content: Mapping[str, Any], overrides: Sequence[str]) -> Mapping[str, Any]:
-    """The content on top of the standard recipe, where it names no network."""
-    sections = {key: content[key] for key in STANDARD if isinstance(content.get(key), Mapping)}
-    if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
-        return content
-    recipe = dict(STANDARD)
-    if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
-        recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
-        law = _asked("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
-        recipe["network"] = {**STANDARD["network"], "penalty": law == "lookahead"}
-    if recipe["rollout"]["policy"] == "lookahead" or _names(("policy",), "rollout", content, overrides):
-        recipe["rollout"] = {**recipe["rollout"], "choose_policy": False}
-    program, gradient = (
-        _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
-        for part, key in (("program", "name"), ("rollout", "gradient"))
-    )
-    limited = _names(("lower", "upper"), "controls", content, overrides)
-    if program in ("value", "region") and gradient == "discrete" and limited:
-        recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
-    standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}
+def _weights(program: str) -> Mapping[str, Any]:
+    """What a registered program recommends; nothing for one of the user's own."""
     from lyapnet import programs  # loads torch
 
     known = programs.PROGRAMS.get(program)
-    weights = {} if known is None else known.recommended
-    return {**content, **standard, "program": {**weights, **standard["program"]}}
-
-
-def _asked(key: str, given: Any, overrides: Sequence[str]) -> str:
-    """What the command line says last of a key, and else what is given."""
-    return str([given, *(each.partition("=")[2] for each in overrides if each.startswith(f"{key}="))][-1])
-
-
-def _names(keys: Sequence[str], section: str, content: Mapping[str, Any], overrides: Sequence[str]) -> bool:
-    """Whether a file or the command line gives a section one of some keys."""
-    written = content.get(section) or {}
-    if any(written.get(key) not in (None, {}, [], ConstraintsConfig.name) for key in keys):
-        return True
-    given = (each.partition("=") for each in overrides)
-    named = tuple(f"{section}.{key}" for key in keys)
-    return any((key == section or key.startswith(named)) and value not in ("", "{}", "null") for key, _, value in given)
+    return {} if known is None else known.recommended
 
 
 def to_plain(config: Config) -> dict[str, Any]:

@@ -15,11 +15,11 @@ class Constraints(nn.Module, ABC):
     """h(x) ≤ 0, component by component, at every time; where a component is positive, its constraint is violated.
 
     A subclass writes `forward` with torch operations on tensors of any leading shape, smooth where h = 0, and each
-    component in such a unit that `margin` of it is a small step.
+    component in such a unit that its margin is a small step.
     """
 
     names: Sequence[str] = ()  # what each component asks for, in words
-    margin: float = 0.02  # of h, within which training pays for coming close
+    margin: float | Sequence[float] = 0.02  # of h, or of each h_j, within which training pays for coming close
 
     @abstractmethod
     def forward(self, x: State) -> Float[Tensor, "*batch k"]:

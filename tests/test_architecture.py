@@ -18,6 +18,7 @@ LEVELS = (
         "machine",
         "provenance",
         "random_streams",
+        "recipe",
         "shapes",
         "tables",
         "types",

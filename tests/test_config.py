@@ -11,9 +11,10 @@ import yaml
 from omegaconf import MISSING
 
 from lyapnet.build import build_problem
-from lyapnet.config import STANDARD, Config, config_from_plain, load_config, outline, to_plain, to_yaml
+from lyapnet.config import Config, config_from_plain, load_config, outline, to_plain, to_yaml
 from lyapnet.errors import UsageError
 from lyapnet.programs import LyapunovProgram
+from lyapnet.recipe import STANDARD
 from lyapnet.training.build import build_module
 from lyapnet.training.plan import plan_run
 from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects

@@ -113,8 +113,8 @@ def test_what_does_not_fit_is_refused(constraints, message):
 
 
 def test_the_penalty():
-    problem = problem_of(constrained(**SPEED)).relaxed(weight=3.0)
-    cost, m = problem.cost, problem.constraints.margin
+    problem, m = problem_of(constrained(**SPEED, margin=0.02)).relaxed(weight=3.0), 0.02
+    cost = problem.cost
     assert isinstance(cost, PenaltyCost)
     v = torch.tensor([0.0, 0.5 * (1 - 1.01 * m), 0.5 * (1 - m / 2), 0.5, 0.5 * (1 + m), -0.5])
     x = torch.stack([torch.zeros_like(v), v], -1)
@@ -335,3 +335,39 @@ def test_what_constraints_with_parameters_ignore():
             return self.layer(x[..., :1])
 
     assert [Learned().double().ignores(i, 2) for i in range(2)] == [False, True]
+
+
+def margins_of(content, *overrides):
+    return build_problem(config_from_plain({**INTEGRATOR, **content}, overrides)).constraints.margin
+
+
+def test_the_margin_is_small_where_controls_act_on_a_constraint_at_once():
+    disk = {"outside": [{"center": {"position": 2}, "radius": 0.4}]}
+    assert margins_of({"constraints": SPEED}) == [0.002, 0.002]
+    assert margins_of({"constraints": {**SPEED, **disk}}) == [0.002, 0.002, 0.02]
+    at_rest = {"lower": [-1, 0], "upper": [1, 0]}
+    energy = {"inside": [{"center": {"position": 0, "velocity": 0}, "radius": 3}]}
+    assert margins_of({"constraints": energy, "initial_states": at_rest}) == [0.002], "though its slope is zero on X₀"
+    chain = {
+        "system": {"name": "integrator_chain", "parameters": {"length": 3}},
+        "cost": {"Q": [1], "R": [1], "Q_T": [1]},
+        "initial_states": {"lower": [-0.1] * 3, "upper": [0.1] * 3},
+    }
+    for state, margin in (("x1", 0.02), ("x2", 0.02), ("x3", 0.002)):
+        assert margins_of({**chain, "constraints": {"upper": {state: 1}}}) == [margin]
+
+
+def test_the_margin_is_what_is_asked_for_and_wide_for_a_law_that_does_not_look_ahead():
+    assert margins_of({"constraints": SPEED}, "constraints.margin=0.01") == 0.01
+    assert margins_of({"constraints": SPEED}, "rollout.policy=sampled") == 0.02
+
+
+def test_each_constraint_is_paid_for_within_its_own_margin():
+    disk = {"outside": [{"center": {"position": 2}, "radius": 0.4}]}
+    problem = problem_of(constrained(**SPEED, **disk))
+    cost = problem.relaxed(weight=3.0).cost
+    h = problem.constraints
+    x = torch.tensor([[0.0, 0.4995], [1.601, 0.0], [1.601, 0.4995]])
+    each = torch.relu(1 + h(x) / torch.tensor([0.002, 0.002, 0.02])) ** 3
+    assert (each.sum(0) > 0).tolist() == [False, True, True]
+    assert_close(cost.penalty(x), 3 * each.sum(-1), atol=1e-12, rtol=1e-12)

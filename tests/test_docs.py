@@ -13,9 +13,10 @@ from omegaconf import MISSING
 
 from lyapnet.build import REGISTRIES
 from lyapnet.comparison.plan import ComparisonConfig
-from lyapnet.config import STANDARD, Config
+from lyapnet.config import Config
 from lyapnet.networks import NETWORKS
 from lyapnet.programs import PROGRAMS
+from lyapnet.recipe import STANDARD
 from tests.pages import PAGES, README, REPORT, ROOT
 
 WIDTH = 120

@@ -3,14 +3,20 @@
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+
 from lyapnet.build.classes import instance_of, section
 from lyapnet.build.entries import index_of
 from lyapnet.config import ConstraintsConfig
 from lyapnet.constraints import CONSTRAINTS, AllOf, Ball, Constraints, OfFirstStates, StateLimits
+from lyapnet.derivatives import jacobian
 from lyapnet.errors import UsageError
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
 from lyapnet.systems import ControlAffineSystem
+
+NEAR, FAR = 0.002, Constraints.margin  # where u acts on h at once, and where it acts by way of other states
+STATES, ROUNDING = 64, 1e-9  # tried; share of |h_x| |g| up to which h_x g is taken for zero
 
 
 def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constraints | None) -> Constraints | None:
@@ -33,8 +39,29 @@ def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constrai
         if not parts:
             return None
         constraints = parts[0] if len(parts) == 1 else AllOf(parts)
-        constraints.margin = config.margin
+        constraints.margin = FAR if config.margin is None else config.margin
         return constraints
+
+
+@torch.no_grad()
+def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
+    """Of each h_j, NEAR where its relative degree is one, that is where h_x g ≠ 0 at most states; else FAR.
+
+    Where u acts on h_j at once, one step is enough to keep off, and a margin that is small costs less. Where u acts on
+    it by way of other states, as on a position by a force, the law has to see the constraint coming.
+    """
+    box, draws = problem.initial_states, torch.Generator().manual_seed(0)
+    x = box.sample(STATES, draws)
+    size = box.magnitude.where(box.magnitude > 0, 1.0)
+    # states that X₀ fixes are moved, as h may have no slope there
+    x = x + 0.1 * size * (box.lower == box.upper) * torch.randn(x.shape, generator=draws, dtype=x.dtype)
+    with torch.enable_grad():
+        x.requires_grad_()
+        slopes = jacobian(constraints(x), x)
+    g = problem.system.g(x)
+    moved, most = (slopes @ g).abs().amax(-1), (slopes.abs() @ g.abs()).amax(-1)
+    at_once = (moved > ROUNDING * most).double().mean(0) > 0.5
+    return [NEAR if each else FAR for each in at_once.tolist()]
 
 
 def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.build.classes import DTYPES, Parts, float64_defaults, instance_of, section
-from lyapnet.build.constraints import ball_of, build_constraints
+from lyapnet.build.constraints import ball_of, build_constraints, choose_margins
 from lyapnet.build.domain import in_domain
 from lyapnet.build.entries import index_of, repeated, require_length, rows
 from lyapnet.build.family import family_of
@@ -77,6 +77,8 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
         problem.check()
         problem = in_domain(config.domain, problem)
+        if problem.constraints is not None and config.constraints.margin is None and config.network.penalty:
+            problem.constraints.margin = choose_margins(problem, problem.constraints)
         if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
             problem = without_end(problem)
         return problem.to(dtype)

@@ -1,5 +1,7 @@
 """The price of coming close to what constraints exclude, which training pays in their place."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -9,13 +11,13 @@ from lyapnet.cost.made_of_another import MadeOfAnother
 from lyapnet.types import PerState, State
 
 
-def closeness(constraints: nn.Module, margin: float, x: State) -> PerState:
-    """Σ_j max(0, 1 + h_j(x)/m)³: 1 at h = 0 of a single constraint, zero from h = −m on."""
+def closeness(constraints: nn.Module, margin: Tensor, x: State) -> PerState:
+    """Σ_j max(0, 1 + h_j(x)/m_j)³: 1 at h = 0 of a single constraint, zero from h_j = −m_j on."""
     return (torch.relu(1 + constraints(x) / margin) ** 3).sum(-1)
 
 
 class PenaltyCost(MadeOfAnother):
-    """Another cost, and w Σ_j max(0, 1 + h_j(x)/m)³ per second, for constraints h(x) ≤ 0: w at h = 0, zero from −m on.
+    """Another cost, and w Σ_j max(0, 1 + h_j(x)/m_j)³ per second for constraints h(x) ≤ 0: w at h_j = 0, 0 below −m_j.
 
     The last state pays for one step more, for which it would stay. The penalty is twice continuously differentiable, as
     the value function then is. With w large enough for the task the
@@ -24,7 +26,7 @@ class PenaltyCost(MadeOfAnother):
     Args:
         cost: what is paid besides.
         constraints: h, x ↦ (*batch, k).
-        margin: m, in the unit of h.
+        margin: m of all h_j, or m_j of each, in the unit of h.
         weight: w.
         step: Δt, in s.
 
@@ -32,13 +34,21 @@ class PenaltyCost(MadeOfAnother):
     """
 
     constraints: nn.Module
-    margin: float
+    margin: Float[Tensor, "*k"]
     step: float
     weight: Float[Tensor, ""]  # w, in cost per second
 
-    def __init__(self, cost: Cost, constraints: nn.Module, margin: float, weight: float = 0.0, step: float = 0.0):
+    def __init__(
+        self,
+        cost: Cost,
+        constraints: nn.Module,
+        margin: float | Sequence[float],
+        weight: float = 0.0,
+        step: float = 0.0,
+    ):
         super().__init__(cost)
-        self.constraints, self.margin, self.step = constraints, margin, step
+        self.constraints, self.step = constraints, step
+        self.register_buffer("margin", torch.tensor(margin, dtype=torch.float64), persistent=False)
         self.register_buffer("weight", torch.tensor(float(weight)), persistent=False)
 
     def state(self, x: State) -> PerState:

@@ -1,5 +1,6 @@
 """V where closed loops pay for coming close to what constraints exclude."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from lyapnet.types import PerState, State, Time
 
 
 class WithPenalty(ValueFunction):
-    """V(t, x) = N(t, x) + Δt w Σ_j max(0, 1 + h_j(x)/m)³: what the state pays in one step, as `PenaltyCost` has it.
+    """V(t, x) = N(t, x) + Δt w Σ_j max(0, 1 + h_j(x)/m_j)³: what the state pays in one step, as `PenaltyCost` has it.
 
     It is steep and known. What is left for a network is what is paid from the next state on, which a law that looks
     ahead keeps off the constraints, where one step is enough for that: it is smooth there.
@@ -21,19 +22,20 @@ class WithPenalty(ValueFunction):
     Args:
         network: N.
         constraints: h.
-        margin: m, in the unit of h.
+        margin: m of all h_j, or m_j of each, in the unit of h.
         step: Δt, in s.
     """
 
     network: ValueFunction
     constraints: Constraints
-    margin: float
+    margin: Float[Tensor, "*k"]
     step: float
     weight: Float[Tensor, ""]  # w, in cost per second
 
-    def __init__(self, network: ValueFunction, constraints: Constraints, margin: float, step: float):
+    def __init__(self, network: ValueFunction, constraints: Constraints, margin: float | Sequence[float], step: float):
         super().__init__()
-        self.network, self.margin, self.step = network, margin, step
+        self.network, self.step = network, step
+        self.register_buffer("margin", torch.tensor(margin, dtype=torch.float64), persistent=False)
         self._constraints = [constraints]  # the task's own, of which V has no part
         self.register_buffer("weight", torch.tensor(0.0))
         self.register_load_state_dict_pre_hook(_named_as_network)

@@ -75,25 +75,26 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     finite = path.cost[path.cost.isfinite()]
     free = float(finite.mean()) if len(finite) else 0.0
     unit = (float(sizes(exact, finite).mean()) if len(finite) else 0.0) or 1.0
-    tried, worst = list[Relaxation](), list[Tensor]()
+    tried, closest = list[Relaxation](), list[Tensor]()
     for k in range(WEIGHTS):
         weight = unit / problem.horizon.duration * FIRST * FACTOR**k
         cost.weight.fill_(weight)
         report("optima with a penalty, dearer each time", k, 0)
         path = optimal_trajectories(exact, path.x[0], path.u).path
-        worst.append(_worst(exact, path))
-        kept = int((worst[-1] <= -RESERVE * cost.margin).sum())
+        worst = _worst(exact, path)
+        closest.append((worst / cost.margin).amax(-1))
+        kept = int((closest[-1] <= -RESERVE).sum())
         mean = float(path.cost.mean())
         ratio = mean / free if exact.has_goal and free else None
-        tried.append(Relaxation(weight, kept, ratio, STATES, mean - free, weight, float(worst[-1].max())))
-        if kept == STATES or (mean - free > abs(free) + unit and _is_stalled(worst, cost.margin)):
+        tried.append(Relaxation(weight, kept, ratio, STATES, mean - free, weight, float(worst.max())))
+        if kept == STATES or (mean - free > abs(free) + unit and _is_stalled(closest)):
             break
     return max(tried, key=lambda each: each.kept)._replace(largest=tried[-1].weight, worst=tried[-1].worst)
 
 
-def _is_stalled(worst: Sequence[Tensor], margin: float) -> bool:
-    """Whether the greatest h of no trajectory has moved much by the last STALLED weights."""
-    return len(worst) > STALLED and bool(((worst[-1 - STALLED] - worst[-1]).abs() <= MOVED * margin).all())
+def _is_stalled(closest: Sequence[Tensor]) -> bool:
+    """Whether the greatest h of no trajectory, in units of its margin, has moved much by the last STALLED weights."""
+    return len(closest) > STALLED and bool(((closest[-1 - STALLED] - closest[-1]).abs() <= MOVED).all())
 
 
 def _free_optima(problem: Problem, report: Report) -> Path:
@@ -107,6 +108,6 @@ def _free_optima(problem: Problem, report: Report) -> Path:
 
 
 def _worst(problem: Problem, path: Path) -> Tensor:
-    """The greatest h of each of some trajectories, from the first step on."""
+    """The greatest h_j of each of some trajectories from the first step on, (states, k)."""
     assert problem.constraints is not None
-    return problem.constraints.worst(path.x[1:]).amax(0)
+    return problem.constraints(path.x[1:]).amax(0)

@@ -15,7 +15,7 @@ from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
 from lyapnet.systems import ControlAffineSystem
 
-NEAR, FAR = 0.002, Constraints.margin  # where u acts on h at once, and where it acts by way of other states
+NEAR, FAR = 0.002, 0.02  # where u acts on h at once, and where it acts by way of other states
 STATES, ROUNDING = 64, 1e-9  # tried; share of |h_x| |g| up to which h_x g is taken for zero
 
 

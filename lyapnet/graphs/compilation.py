@@ -58,11 +58,6 @@ class Scan(nn.Module):
         return list(scan(body, x0, (t, dt))[1])
 
 
-def is_on_disk(module: nn.Module, arguments: Sequence[Tensor]) -> bool:
-    """Whether the function of a traced module was compiled before for arguments like these."""
-    return file_of(module, arguments).is_file()
-
-
 def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
     """The function of a traced module for arguments like these, from disk, or compiled now.
 

@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.func import functional_call
 
 from lyapnet.errors import LyapnetError, UntraceableError, one_line
-from lyapnet.graphs.compilation import Scan, compilation_errors, compiled, is_on_disk
+from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.tracing import batched, cut, trace
 from lyapnet.horizon import TABLEAUX
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -92,28 +92,23 @@ class DiscreteAdjoint:
         return [p for p in self.loop.parameters() if p.requires_grad]
 
     def compile(self, x0: State, theta: Sequence[Tensor] | None = None) -> None:
-        """Compile the work for batches like x₀, or take it from disk.
-
-        Rollouts of other batches, where no gradient is asked for, then run in slices of that size.
+        """Have batches like x₀ run as machine code, and others, where no gradient is asked for, in slices of that size.
 
         Raises:
             UntraceableError: the loop cannot be traced.
-            CompilationError: there is no compiler, or it failed.
+            CompilationError: as TracedRoutines.compiled.
         """
-        work = self._work(x0, self.trained() if theta is None else theta)
-        with compilation_errors():
-            integrate, linearise, product = (compiled(*piece) for piece in work.pieces())
-        self._compiled = x0.detach()
-        self._routines[self._key(x0)] = Routines(integrate, linearise, product, work.block)
+        if self._compiled is None or self._key(self._compiled) != self._key(x0):
+            self._routines[self._key(x0)] = self._work(x0, self.trained() if theta is None else theta).compiled()
+            self._compiled = x0.detach()
 
-    def is_on_disk(self, x0: State, theta: Sequence[Tensor] | None = None) -> bool:
-        """Whether `compile` would find everything on disk.
+    def require_trace(self, x0: State, theta: Sequence[Tensor]) -> None:
+        """Hold that the loop can be traced for batches like x₀.
 
         Raises:
-            UntraceableError: the loop cannot be traced.
+            UntraceableError: it cannot.
         """
-        work = self._work(x0, self.trained() if theta is None else theta)
-        return all(is_on_disk(*piece) for piece in work.pieces())
+        self._work(x0, theta)
 
     def routines(self, x0: State, theta: Sequence[Tensor]) -> Routines:
         """The work for batches like x₀: compiled, else traced, else as written."""

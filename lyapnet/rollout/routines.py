@@ -7,7 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule
 
-from lyapnet.graphs.compilation import Scan
+from lyapnet.errors import CompilationError
+from lyapnet.graphs.compilation import Scan, compilation_errors, compiled
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
 from lyapnet.types import ControlPath, StagePath, ValuePath
 
 
@@ -46,6 +48,29 @@ class TracedRoutines(NamedTuple):
     def routines(self) -> Routines:
         """The graphs, replayed operation by operation."""
         return Routines(self._scan().loop, self.linearise, self.product, self.block)
+
+    def compiled(self) -> Routines:
+        """The graphs as machine code: on a CPU run by lyapnet's own kernel, on a GPU compiled for this task.
+
+        Raises:
+            CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
+        """
+        if self.path_arguments[-1].device.type == "cpu":
+            return self._by_kernel()
+        with compilation_errors():
+            integrate, linearise, product = (compiled(*piece) for piece in self.pieces())
+        return Routines(integrate, linearise, product, self.block)
+
+    def _by_kernel(self) -> Routines:
+        try:
+            integrate = ScanKernel(self.prepare, self.step, self.path_arguments)
+            linearise = NumberKernel(self.linearise, self.block_arguments[:-1])
+            with torch.no_grad():
+                intermediate = self.linearise(*self.block_arguments[:-1])[2:]
+            product = NumberKernel(self.product, [*self.block_arguments, *intermediate])
+        except NotImplementedError as error:
+            raise CompilationError(f"Expected operations that the kernel has, got {error}") from error
+        return Routines(integrate, linearise, product, self.block)
 
     def pieces(self) -> list[tuple[nn.Module, list[Tensor]]]:
         """What there is to compile, and for which arguments."""

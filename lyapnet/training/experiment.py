@@ -4,7 +4,7 @@ import shlex
 import statistics
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -119,14 +119,11 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
     try:
         if plan.module.penalty is not None and plan.resume_from is None:
             _relax(plan, console, trainer.is_global_zero)
-        with _compiling_beside_start(plan, trainer):
-            start = _choose_start(plan, console, trainer.is_global_zero) if _seeks_start(plan) else None
-            looks_ahead = start is not None and start.should_look_ahead and config.rollout.choose_policy
-            if not looks_ahead:
-                trainer = _train(plan, trainer, console, start)
-        if looks_ahead:
+        start = _choose_start(plan, trainer, console) if _seeks_start(plan) else None
+        if start is not None and start.should_look_ahead and config.rollout.choose_policy:
             plan = _looking_ahead(plan, console, trainer.is_global_zero)
-            trainer = _train(plan, build_trainer(plan, console), console, start)
+            trainer = build_trainer(plan, console)
+        trainer = _train(plan, trainer, console, start)
     except Interrupted as stop:
         hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
         raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
@@ -153,14 +150,6 @@ def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None
             trainer = build_trainer(plan, console)
 
 
-def _compiling_beside_start(plan: Plan, trainer: L.Trainer) -> AbstractContextManager[None]:
-    """Compiles in another process, where there is a start to seek meanwhile."""
-    callbacks: list[Any] = trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
-    compiling = [callback for callback in callbacks if isinstance(callback, Compilation)]
-    seeks = _seeks_start(plan) and has_place_for_start(list(plan.module.members)) and trainer.is_global_zero
-    return compiling[0].ahead(plan.module) if compiling and seeks else nullcontext()
-
-
 def _seeks_start(plan: Plan) -> bool:
     return plan.resume_from is None and plan.run.finetuned_from is None
 
@@ -179,8 +168,12 @@ def _relax(plan: Plan, console: Console, told: bool) -> None:
         console.print(str(relaxation), soft_wrap=True)
 
 
-def _choose_start(plan: Plan, console: Console, told: bool) -> Start | None:
+def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | None:
     """Put what is known of V into the networks that have a place for it, and say what was chosen."""
+    told, callbacks = trainer.is_global_zero, trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
+    if has_place_for_start(list(plan.module.members)):
+        for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
+            compilation.before_start(trainer, plan.module)
     with Stages(console, "start") if told else nullcontext(silent) as report:
         start = kept_or_chosen(list(plan.module.members), report)
     if told and start is not None:

@@ -55,11 +55,7 @@ class TrainingModule(L.LightningModule):
 
     @abstractmethod
     def compile_for(self, batch_size: int) -> None:
-        """Compile the closed loop and its gradient for training batches of this size; see DiscreteAdjoint.compile."""
-
-    @abstractmethod
-    def compiled_before(self, batch_size: int) -> bool:
-        """Whether `compile_for` would find everything on disk."""
+        """Have training batches of this size run as machine code; see DiscreteAdjoint.compile."""
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
         """One evaluation of each member's program on its initial states."""
@@ -273,10 +269,6 @@ class ValueModule(TrainingModule):
         if self.rollout.discrete is not None:
             self.rollout.discrete.compile(self._any_batch(batch_size))
 
-    def compiled_before(self, batch_size: int) -> bool:
-        discrete = self.rollout.discrete
-        return discrete is not None and discrete.is_on_disk(self._any_batch(batch_size))
-
     def _any_batch(self, batch_size: int) -> Tensor:
         return self.problem.initial_states.center.expand(batch_size, -1).contiguous()
 
@@ -318,9 +310,6 @@ class EnsembleModule(TrainingModule):
     def compile_for(self, batch_size: int) -> None:
         self._discrete(0).compile(self._any_batch(batch_size), self._weights())
 
-    def compiled_before(self, batch_size: int) -> bool:
-        return self._discrete(0).is_on_disk(self._any_batch(batch_size), self._weights())
-
     def configure_gradient_clipping(
         self,
         optimizer: torch.optim.Optimizer,
@@ -360,7 +349,7 @@ class EnsembleModule(TrainingModule):
                         f"{remedy}."
                     )
         try:
-            self.compiled_before(batch_size)
+            self._discrete(0).require_trace(self._any_batch(batch_size), self._weights())
         except CompilationError as error:
             raise UsageError(f"{error}, for seeds={len(self.members)}; {remedy}.") from error
 

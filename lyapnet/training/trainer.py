@@ -9,7 +9,7 @@ from lyapnet.config import configs_of_seeds
 from lyapnet.training.certified_share import CertifiedShare
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.checkpoints import Checkpoints, KeptStart
-from lyapnet.training.compilation import Compilation, earns_compilation
+from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.dashboard import Dashboard
 from lyapnet.training.figure_logger import FigureLogger
@@ -73,5 +73,4 @@ def _compilation(plan: Plan, stages: Stages) -> list[Compilation]:
     goes_on = plan.resume_from is not None
     if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
         return []
-    wanted = goes_on or options.compile == "on" or earns_compilation(plan.config)
-    return [Compilation(stages, plan.config.training.batch_size, wanted, plan.run.note)]
+    return [Compilation(stages, plan.config.training.batch_size, plan.run.note)]

@@ -1,12 +1,8 @@
 """Bounds of one function on many boxes by machine code: a program on forms, run by compiled C++."""
 
 import ctypes
-import hashlib
 import logging
 import multiprocessing
-import platform
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -16,16 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lyapnet.errors import CompilationError, one_line
-from lyapnet.files import digest_of_file, write_atomically
+from lyapnet.errors import CompilationError
 from lyapnet.graphs.bound_kernel.program import Entry, Program, Support
 from lyapnet.graphs.bound_kernel.writing import written
-from lyapnet.graphs.compilation import cache_folder, has_compiler, require_own
+from lyapnet.graphs.libraries import library_of
 from lyapnet.graphs.taylor import TaylorForm
 from lyapnet.types import Corners
 
-SOURCES = [Path(__file__).with_name(name) for name in ("functions.h", "forms.h", "program.cpp")]
-FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("functions.h", "forms.h", "program.cpp"))
 MOST_AXES = 16  # as in forms.h
 
 
@@ -103,51 +97,12 @@ def has_library() -> bool:
 
 @cache
 def library() -> ctypes.CDLL:
-    """The compiled C++, from disk, or compiled now: one file for each machine.
+    """The compiled C++ of bounds.
 
     Raises:
-        CompilationError: there is no compiler, or it fails; or the cache is not the user's own.
+        CompilationError: as library_of.
     """
-    path, folder = file_of_library(), cache_folder()
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    require_own(folder)
-    digest = path.with_suffix(".sha256")
-    if path.is_file():
-        require_own(path)
-        if digest.is_file() and digest.read_text(encoding="ascii") == digest_of_file(path):
-            return ctypes.CDLL(str(path))
-        logging.getLogger(__name__).warning("note: compiling again what is in %s: got another digest.", path)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".new_") as draft:
-        file = Path(draft) / path.name
-        _compile(file)
-        write_atomically(digest, digest_of_file(file).encode())
-        file.replace(path)
-    return ctypes.CDLL(str(path))
-
-
-def _compile(file: Path) -> None:
-    from torch._inductor.cpp_builder import get_cpp_compiler
-
-    if not has_compiler():
-        raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
-    command = [get_cpp_compiler(), *FLAGS, str(SOURCES[-1]), "-o", str(file)]
-    try:
-        subprocess.run(command, check=True, capture_output=True, text=True)
-    except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        raise CompilationError(f"Expected bounds to compile, got {one_line(RuntimeError(said))[:200]}") from error
-    file.chmod(0o600)
-
-
-def file_of_library() -> Path:
-    """Where the machine code is kept: by its source, how it is compiled, and the instructions of the CPU."""
-    parts = [
-        platform.machine(),
-        sorted(torch.cpu.get_capabilities().items()),
-        FLAGS,
-        *(p.read_bytes() for p in SOURCES),
-    ]
-    return cache_folder() / f"bounds_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
+    return library_of("bounds", SOURCES)
 
 
 def elementary(which: int, points: Tensor) -> Tensor:

@@ -1,0 +1,664 @@
+// Runs flat programs on tensors of numbers. An instruction is a row of integers: its operation, its length, and for each
+// operand a buffer, an offset and strides, in numbers. lyapnet/graphs/number_kernel/program.py writes them.
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <utility>
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
+
+namespace {
+
+#ifdef __AVX512F__
+constexpr int BYTES = 64;
+#else
+constexpr int BYTES = 32;
+#endif
+
+typedef int64_t Integer;
+
+template <class T>
+struct Of;
+template <>
+struct Of<double> {
+    typedef double V __attribute__((vector_size(BYTES)));
+    typedef int64_t M __attribute__((vector_size(BYTES)));
+    static constexpr int LANES = BYTES / 8;
+};
+template <>
+struct Of<float> {
+    typedef float V __attribute__((vector_size(BYTES)));
+    typedef int32_t M __attribute__((vector_size(BYTES)));
+    static constexpr int LANES = BYTES / 4;
+};
+
+#define VECTOR typedef typename Of<T>::V V; [[maybe_unused]] constexpr int LANES = Of<T>::LANES
+
+// --- Loading and storing the first `count` lanes of a vector ---
+
+template <class T>
+inline typename Of<T>::V load(const T *from) {
+    typename Of<T>::V x;
+    std::memcpy(&x, from, BYTES);
+    return x;
+}
+
+template <class T>
+inline void store(T *to, typename Of<T>::V x) { std::memcpy(to, &x, BYTES); }
+
+template <class T>
+inline typename Of<T>::V load_some(const T *from, int count) {
+#ifdef __AVX512F__
+    if constexpr (sizeof(T) == 8)
+        return (typename Of<T>::V)_mm512_maskz_loadu_pd((1u << count) - 1, from);
+    else
+        return (typename Of<T>::V)_mm512_maskz_loadu_ps((1u << count) - 1, from);
+#else
+    typename Of<T>::V x = {};
+    for (int i = 0; i < count; i++) x[i] = from[i];
+    return x;
+#endif
+}
+
+template <class T>
+inline void store_some(T *to, typename Of<T>::V x, int count) {
+#ifdef __AVX512F__
+    if constexpr (sizeof(T) == 8)
+        _mm512_mask_storeu_pd(to, (1u << count) - 1, (__m512d)x);
+    else
+        _mm512_mask_storeu_ps(to, (1u << count) - 1, (__m512)x);
+#else
+    for (int i = 0; i < count; i++) to[i] = x[i];
+#endif
+}
+
+template <class T>
+inline typename Of<T>::V gathered(const T *from, Integer stride, int count) {
+    if (stride == 1) return count == Of<T>::LANES ? load(from) : load_some(from, count);
+    typename Of<T>::V x = {};
+    if (stride == 0) return x + *from;
+    for (int i = 0; i < count; i++) x[i] = from[i * stride];
+    return x;
+}
+
+template <class T>
+inline void scattered(T *to, Integer stride, typename Of<T>::V x, int count) {
+    if (stride == 1) {
+        if (count == Of<T>::LANES)
+            store(to, x);
+        else
+            store_some(to, x, count);
+    } else
+        for (int i = 0; i < count; i++) to[i * stride] = x[i];
+}
+
+template <class V>
+inline auto total(V x) {
+    auto sum = x[0];
+    for (unsigned i = 1; i < sizeof(V) / sizeof(x[0]); i++) sum += x[i];
+    return sum;
+}
+
+// --- Operations on the numbers of a vector; truths are 1 and 0 ---
+
+template <class T, class V, double (*F)(double)>
+V each(V x) {
+    for (int i = 0; i < Of<T>::LANES; i++) x[i] = F(x[i]);
+    return x;
+}
+
+template <class T, class V>
+inline V absolute(V x) { return x < 0 ? -x : x; }
+
+// eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2, by the series of eʳ
+inline Of<double>::V exponential(Of<double>::V x) {
+    typedef Of<double>::V V;
+    typedef Of<double>::M M;
+    const double LOG2_HIGH = 6.93147180369123816490e-01, LOG2_LOW = 1.90821492927058770002e-10, SHIFT = 0x1.8p52;
+    const V low = V{} - 708, high = V{} + 709;
+    const V inside = x < low ? low : (x > high ? high : x);
+    const V shifted = inside * 1.4426950408889634 + SHIFT, k = shifted - SHIFT;
+    const V r = (inside - k * LOG2_HIGH) - k * LOG2_LOW;
+    V tail = V{} + 1 / 6227020800.0;
+    const double over[] = {479001600, 39916800, 3628800, 362880, 40320, 5040, 720, 120, 24, 6, 2};
+    for (double factorial : over) tail = tail * r + 1 / factorial;
+    const V p = r + r * r * tail, scale = (V)(((M)shifted + 1023) << 52);  // the low bits of `shifted` are k
+    const V y = scale + scale * p;
+    return x > high ? V{} + INFINITY : (x < low ? V{} : (x != x ? x : y));
+}
+
+inline Of<float>::V exponential(Of<float>::V x) {
+    typedef Of<float>::V V;
+    typedef Of<float>::M M;
+    const float LOG2_HIGH = 6.93145752e-1f, LOG2_LOW = 1.42860677e-6f, SHIFT = 0x1.8p23f;
+    const V low = V{} - 87, high = V{} + 88;
+    const V inside = x < low ? low : (x > high ? high : x);
+    const V shifted = inside * 1.44269504f + SHIFT, k = shifted - SHIFT;
+    const V r = (inside - k * LOG2_HIGH) - k * LOG2_LOW;
+    V tail = V{} + 1 / 5040.0f;
+    const float over[] = {720, 120, 24, 6, 2};
+    for (float factorial : over) tail = tail * r + 1 / factorial;
+    const V p = r + r * r * tail, scale = (V)(((M)shifted + 127) << 23);
+    const V y = scale + scale * p;
+    return x > high ? V{} + INFINITY : (x < low ? V{} : (x != x ? x : y));
+}
+
+#define UNARY(NAME, VALUE)                          \
+    template <class T>                              \
+    struct NAME {                                   \
+        typedef typename Of<T>::V V;                \
+        static V of(V x) { return VALUE; }          \
+    };
+#define BINARY(NAME, VALUE)                         \
+    template <class T>                              \
+    struct NAME {                                   \
+        typedef typename Of<T>::V V;                \
+        static V of(V x, V y) { return VALUE; }     \
+    };
+#define ONE (V{} + 1)
+#define ZERO (V{})
+#define LIBRARY(F) (each<T, V, F>(x))
+
+UNARY(Copy, x)
+UNARY(Negative, -x)
+UNARY(Absolute, (absolute<T, V>(x)))
+UNARY(Reciprocal, 1 / x)
+UNARY(Square, x *x)
+UNARY(Cube, x *x *x)
+UNARY(Root, LIBRARY(std::sqrt))
+UNARY(InverseRoot, 1 / LIBRARY(std::sqrt))
+UNARY(Exp, exponential(x))
+UNARY(Exp2, LIBRARY(std::exp2))
+UNARY(Expm1, LIBRARY(std::expm1))
+UNARY(Log, LIBRARY(std::log))
+UNARY(Log1p, LIBRARY(std::log1p))
+UNARY(Log2, LIBRARY(std::log2))
+UNARY(Log10, LIBRARY(std::log10))
+UNARY(Sin, LIBRARY(std::sin))
+UNARY(Cos, LIBRARY(std::cos))
+UNARY(Tan, LIBRARY(std::tan))
+UNARY(Asin, LIBRARY(std::asin))
+UNARY(Acos, LIBRARY(std::acos))
+UNARY(Atan, LIBRARY(std::atan))
+UNARY(Sinh, LIBRARY(std::sinh))
+UNARY(Cosh, LIBRARY(std::cosh))
+UNARY(Asinh, LIBRARY(std::asinh))
+UNARY(Acosh, LIBRARY(std::acosh))
+UNARY(Atanh, LIBRARY(std::atanh))
+UNARY(Erf, LIBRARY(std::erf))
+UNARY(Floor, LIBRARY(std::floor))
+UNARY(Ceil, LIBRARY(std::ceil))
+UNARY(Round, LIBRARY(std::nearbyint))
+UNARY(Truncate, LIBRARY(std::trunc))
+UNARY(Relu, x > 0 ? x : (x != x ? x : ZERO))
+UNARY(Sign, x > 0 ? ONE : (x < 0 ? -ONE : ZERO))
+UNARY(Not, x == 0 ? ONE : ZERO)
+UNARY(IsNan, x != x ? ONE : ZERO)
+UNARY(Truth, x != 0 ? ONE : ZERO)
+
+template <class T>
+struct Sigmoid {
+    typedef typename Of<T>::V V;
+    static V of(V x) {
+        const V u = exponential(-absolute<T, V>(x)), large = 1 / (1 + u);
+        return x < 0 ? u * large : (x != x ? x : large);
+    }
+};
+
+template <class T>
+struct Tanh {  // by the exponential away from 0, where that loses no digits, else by the C library
+    typedef typename Of<T>::V V;
+    static V of(V x) {
+        const V size = absolute<T, V>(x), u = exponential(-2 * size), t = (1 - u) / (1 + u);
+        V y = x < 0 ? -t : t;
+        for (int i = 0; i < Of<T>::LANES; i++)
+            if (!(size[i] > T(0.25))) y[i] = std::tanh(x[i]);
+        return y;
+    }
+};
+
+BINARY(Sum, x + y)
+BINARY(Difference, x - y)
+BINARY(Product, x *y)
+BINARY(Quotient, x / y)
+BINARY(Larger, x != x ? x : (y != y ? y : (x > y ? x : y)))
+BINARY(Smaller, x != x ? x : (y != y ? y : (x < y ? x : y)))
+BINARY(Less, x < y ? ONE : ZERO)
+BINARY(LessOrEqual, x <= y ? ONE : ZERO)
+BINARY(Equal, x == y ? ONE : ZERO)
+BINARY(Unequal, x != y ? ONE : ZERO)
+BINARY(SigmoidSlope, x *(y * (1 - y)))  // of a costate x and σ = y
+BINARY(TanhSlope, x *(1 - y * y))
+
+template <class T>
+struct Power {
+    typedef typename Of<T>::V V;
+    static V of(V x, V y) {
+        for (int i = 0; i < Of<T>::LANES; i++) x[i] = std::pow(x[i], y[i]);
+        return x;
+    }
+};
+
+template <class T>
+struct Atan2 {
+    typedef typename Of<T>::V V;
+    static V of(V x, V y) {
+        for (int i = 0; i < Of<T>::LANES; i++) x[i] = std::atan2(x[i], y[i]);
+        return x;
+    }
+};
+
+template <class T>
+struct Remainder {  // with the sign of y, as torch has it
+    typedef typename Of<T>::V V;
+    static V of(V x, V y) {
+        for (int i = 0; i < Of<T>::LANES; i++) {
+            const T r = std::fmod(x[i], y[i]);
+            x[i] = r != 0 && (r < 0) != (y[i] < 0) ? r + y[i] : r;
+        }
+        return x;
+    }
+};
+
+template <class T>
+struct Where {
+    typedef typename Of<T>::V V;
+    static V of(V condition, V x, V y) { return condition != 0 ? x : y; }
+};
+
+template <class T>
+struct ProductAndSum {
+    typedef typename Of<T>::V V;
+    static V of(V x, V y, V z) { return x + y * z; }
+};
+
+// --- Instructions ---
+
+constexpr int MOST_RANK = 8;
+
+template <class T>
+struct Operand {
+    T *at;
+    const Integer *strides;
+};
+
+template <class T>
+struct Machine {
+    T **buffers;
+    const Integer *tables;  // positions, one after the other
+
+    Operand<T> operand(const Integer *&row, int rank) const {
+        Operand<T> found{buffers[row[0]] + row[1], row + 2};
+        row += 2 + rank;
+        return found;
+    }
+};
+
+// Calls visit(pointers) for each row of a shape, the last axis being left to it
+template <class T, int OPERANDS, class Visit>
+inline void for_each_row(int rank, const Integer *shape, Operand<T> (&operands)[OPERANDS], Visit visit) {
+    T *at[OPERANDS];
+    for (int k = 0; k < OPERANDS; k++) at[k] = operands[k].at;
+    Integer index[MOST_RANK] = {};
+    while (true) {
+        visit(at);
+        int axis = rank - 2;
+        for (; axis >= 0; axis--) {
+            for (int k = 0; k < OPERANDS; k++) at[k] += operands[k].strides[axis];
+            if (++index[axis] < shape[axis]) break;
+            for (int k = 0; k < OPERANDS; k++) at[k] -= operands[k].strides[axis] * shape[axis];
+            index[axis] = 0;
+        }
+        if (axis < 0) return;
+    }
+}
+
+template <class T, class F, size_t... I>
+inline typename Of<T>::V applied(T **at, const Integer *strides, Integer i, int count, std::index_sequence<I...>) {
+    return F::of(gathered<T>(at[I + 1] + i * strides[I + 1], strides[I + 1], count)...);
+}
+
+template <class T, class F, size_t... I>
+inline typename Of<T>::V applied_in_line(T **at, Integer i, std::index_sequence<I...>) {
+    return F::of(load<T>(at[I + 1] + i)...);
+}
+
+// out = F(inputs), number by number
+template <class T, class F, int INPUTS>
+void elementwise(const Machine<T> &machine, const Integer *row) {
+    VECTOR;
+    const int rank = *row++;
+    const Integer *shape = row;
+    row += rank;
+    Operand<T> operands[INPUTS + 1];
+    Integer strides[INPUTS + 1];
+    bool in_line = true;
+    for (int k = 0; k <= INPUTS; k++) {
+        operands[k] = machine.operand(row, rank);
+        strides[k] = operands[k].strides[rank - 1];
+        in_line = in_line && strides[k] == 1;
+    }
+    const Integer n = shape[rank - 1];
+    constexpr auto inputs = std::make_index_sequence<INPUTS>();
+    for_each_row<T, INPUTS + 1>(rank, shape, operands, [&](T **at) {
+        Integer i = 0;
+        if (in_line)
+            for (; i + LANES <= n; i += LANES) store(at[0] + i, applied_in_line<T, F>(at, i, inputs));
+        for (; i < n; i += LANES) {
+            const int count = std::min<Integer>(LANES, n - i);
+            scattered(at[0] + i * strides[0], strides[0], applied<T, F>(at, strides, i, count, inputs), count);
+        }
+    });
+}
+
+// out = F(out, input) over a shape in which strides of out are 0 along the axes that are reduced
+template <class T, class F>
+void reduction(const Machine<T> &machine, const Integer *row) {
+    VECTOR;
+    const int rank = *row++;
+    const Integer *shape = row;
+    row += rank;
+    Operand<T> operands[2] = {machine.operand(row, rank), {}};
+    operands[1] = machine.operand(row, rank);
+    const Integer n = shape[rank - 1], to = operands[0].strides[rank - 1], from = operands[1].strides[rank - 1];
+    for_each_row<T, 2>(rank, shape, operands, [&](T **at) {
+        if (to == 0) {
+            Integer i = 0;
+            T y = *at[0];
+            if (n >= LANES) {
+                V many = gathered<T>(at[1], from, LANES);
+                for (i = LANES; i + LANES <= n; i += LANES)
+                    many = F::of(many, gathered<T>(at[1] + i * from, from, LANES));
+                for (int lane = 0; lane < LANES; lane++) y = F::of(V{} + y, V{} + many[lane])[0];
+            }
+            for (; i < n; i++) y = F::of(V{} + y, V{} + at[1][i * from])[0];
+            *at[0] = y;
+        } else
+            for (Integer i = 0; i < n; i += LANES) {
+                const int count = std::min<Integer>(LANES, n - i);
+                const V y = F::of(gathered<T>(at[0] + i * to, to, count), gathered<T>(at[1] + i * from, from, count));
+                scattered(at[0] + i * to, to, y, count);
+            }
+    });
+}
+
+// out = where the largest or the least of an input is along the last axis, the first one of several; nan before all
+template <class T, bool LARGEST>
+void extreme(const Machine<T> &machine, const Integer *row) {
+    const int rank = *row++;
+    const Integer *shape = row;
+    row += rank;
+    Operand<T> operands[2] = {machine.operand(row, rank), {}};
+    operands[1] = machine.operand(row, rank);
+    const Integer n = shape[rank - 1], stride = operands[1].strides[rank - 1];
+    for_each_row<T, 2>(rank, shape, operands, [&](T **at) {
+        Integer best = 0;
+        T value = at[1][0];
+        for (Integer i = 1; i < n && value == value; i++) {
+            const T other = at[1][i * stride];
+            if ((LARGEST ? other > value : other < value) || other != other) best = i, value = other;
+        }
+        *at[0] = best;
+    });
+}
+
+// out = input[index], or out[index] = input, along an axis of what is indexed, which has stride 0 there
+template <class T, bool INTO>
+void indexed(const Machine<T> &machine, const Integer *row) {
+    const Integer size = row[0], stride = row[1];
+    const int rank = row[2];
+    const Integer *shape = row + 3;
+    row += 3 + rank;
+    Operand<T> operands[3] = {machine.operand(row, rank), {}, {}};
+    operands[1] = machine.operand(row, rank);
+    operands[2] = machine.operand(row, rank);
+    for_each_row<T, 3>(rank, shape, operands, [&](T **at) {
+        for (Integer i = 0; i < shape[rank - 1]; i++) {
+            const Integer index = at[2][i * operands[2].strides[rank - 1]];
+            T *to = at[0] + i * operands[0].strides[rank - 1];
+            const T *from = at[1] + i * operands[1].strides[rank - 1];
+            const bool inside = index >= 0 && index < size;
+            if (INTO && inside) to[index * stride] = *from;
+            if (!INTO) *to = inside ? from[index * stride] : T(NAN);
+        }
+    });
+}
+
+// out[to] = input[from], or out[to] += input[from], at tabled positions
+template <class T, bool ADD>
+void moved(const Machine<T> &machine, const Integer *row) {
+    const Integer count = row[0], *to = machine.tables + row[1], *from = machine.tables + row[2];
+    T *out = machine.buffers[row[3]] + row[4];
+    const T *input = machine.buffers[row[5]] + row[6];
+    for (Integer i = 0; i < count; i++) {
+        if (ADD)
+            out[to[i]] += input[from[i]];
+        else
+            out[to[i]] = input[from[i]];
+    }
+}
+
+constexpr int COLUMNS = 2;  // vectors of a panel of packed columns
+
+// Panels of B (K, N): COLUMNS vectors of columns of all rows, filled up with zeros
+template <class T>
+void packed(const Machine<T> &machine, const Integer *row) {
+    const Integer K = row[0], N = row[1], k_stride = row[4], n_stride = row[5];
+    const T *B = machine.buffers[row[2]] + row[3];
+    T *out = machine.buffers[row[6]] + row[7];
+    constexpr int WIDTH = COLUMNS * Of<T>::LANES;
+    for (Integer first = 0; first < N; first += WIDTH) {
+        const Integer width = std::min<Integer>(WIDTH, N - first);
+        for (Integer k = 0; k < K; k++, out += WIDTH) {
+            const T *from = B + k * k_stride + first * n_stride;
+            for (Integer j = 0; j < width; j++) out[j] = from[j * n_stride];
+            for (Integer j = width; j < WIDTH; j++) out[j] = 0;
+        }
+    }
+}
+
+template <class T, int ROWS>
+inline void tile(Integer K, const T *A, Integer m_stride, Integer k_stride, const T *panel, T *out, Integer out_stride,
+                 Integer width, bool add) {
+    VECTOR;
+    V sums[ROWS][COLUMNS] = {};
+    for (Integer k = 0; k < K; k++) {
+        V b[COLUMNS];
+        for (int j = 0; j < COLUMNS; j++) b[j] = load(panel + (k * COLUMNS + j) * LANES);
+        for (int i = 0; i < ROWS; i++) {
+            const V a = V{} + A[i * m_stride + k * k_stride];
+            for (int j = 0; j < COLUMNS; j++) sums[i][j] += a * b[j];
+        }
+    }
+    for (int i = 0; i < ROWS; i++)
+        for (int j = 0; j < COLUMNS; j++) {
+            const int count = std::min<Integer>(LANES, width - j * LANES);
+            if (count <= 0) break;
+            T *to = out + i * out_stride + j * LANES;
+            const V y = add ? sums[i][j] + load_some(to, count) : sums[i][j];
+            store_some(to, y, count);
+        }
+}
+
+// out (M, N) = A (M, K) B (K, N), or out += A B, for packed B; rows of out are in line
+template <class T>
+void product_with_packed(const Machine<T> &machine, const Integer *row) {
+    VECTOR;
+    const Integer M = row[0], N = row[1], K = row[2];
+    const bool add = row[3];
+    T *out = machine.buffers[row[4]] + row[5];
+    const Integer out_stride = row[6];
+    const T *A = machine.buffers[row[7]] + row[8];
+    const Integer m_stride = row[9], k_stride = row[10];
+    const T *B = machine.buffers[row[11]] + row[12];
+    constexpr int WIDTH = COLUMNS * LANES;
+    for (Integer first = 0; first < N; first += WIDTH, B += K * WIDTH) {
+        const Integer width = std::min<Integer>(WIDTH, N - first);
+        Integer m = 0;
+        for (; m + 8 <= M; m += 8)
+            tile<T, 8>(K, A + m * m_stride, m_stride, k_stride, B, out + m * out_stride + first, out_stride, width, add);
+        for (; m + 4 <= M; m += 4)
+            tile<T, 4>(K, A + m * m_stride, m_stride, k_stride, B, out + m * out_stride + first, out_stride, width, add);
+        for (; m < M; m++)
+            tile<T, 1>(K, A + m * m_stride, m_stride, k_stride, B, out + m * out_stride + first, out_stride, width, add);
+    }
+}
+
+// The same for batches of small matrices, as they are
+template <class T>
+void products(const Machine<T> &machine, const Integer *row) {
+    VECTOR;
+    const Integer batch = row[0], M = row[1], N = row[2], K = row[3];
+    const bool add = row[4];
+    const Integer *o = row + 5, *a = row + 10, *b = row + 15;  // each: buffer, offset, strides of batch, rows, columns
+    for (Integer each = 0; each < batch; each++) {
+        T *out = machine.buffers[o[0]] + o[1] + each * o[2];
+        const T *A = machine.buffers[a[0]] + a[1] + each * a[2], *B = machine.buffers[b[0]] + b[1] + each * b[2];
+        for (Integer m = 0; m < M; m++) {
+            if (K >= LANES && a[4] == 1 && b[3] == 1) {  // both in line along the sum
+                for (Integer n = 0; n < N; n++) {
+                    V sums = {};
+                    for (Integer k = 0; k < K; k += LANES) {
+                        const int count = std::min<Integer>(LANES, K - k);
+                        sums += load_some(A + m * a[3] + k, count) * load_some(B + n * b[4] + k, count);
+                    }
+                    T &to = out[m * o[3] + n * o[4]];
+                    to = total(sums) + (add ? to : 0);
+                }
+            } else if (b[4] == 1 && o[4] == 1 && N > 1) {
+                for (Integer n = 0; n < N; n += LANES) {
+                    const int count = std::min<Integer>(LANES, N - n);
+                    T *to = out + m * o[3] + n;
+                    V sums = {};
+                    if (add) sums = load_some(to, count);
+                    for (Integer k = 0; k < K; k++)
+                        sums += (V{} + A[m * a[3] + k * a[4]]) * load_some(B + k * b[3] + n, count);
+                    store_some(to, sums, count);
+                }
+            } else {
+                for (Integer n = 0; n < N; n++) {
+                    T sum = 0;
+                    for (Integer k = 0; k < K; k++) sum += A[m * a[3] + k * a[4]] * B[k * b[3] + n * b[4]];
+                    T &to = out[m * o[3] + n * o[4]];
+                    to = sum + (add ? to : 0);
+                }
+            }
+        }
+    }
+}
+
+template <class T>
+using Instruction = void (*)(const Machine<T> &, const Integer *);
+
+// In the order of OPERATIONS in program.py
+template <class T>
+const Instruction<T> INSTRUCTIONS[] = {
+    elementwise<T, Copy<T>, 1>,
+    elementwise<T, Negative<T>, 1>,
+    elementwise<T, Absolute<T>, 1>,
+    elementwise<T, Reciprocal<T>, 1>,
+    elementwise<T, Square<T>, 1>,
+    elementwise<T, Cube<T>, 1>,
+    elementwise<T, Root<T>, 1>,
+    elementwise<T, InverseRoot<T>, 1>,
+    elementwise<T, Exp<T>, 1>,
+    elementwise<T, Exp2<T>, 1>,
+    elementwise<T, Expm1<T>, 1>,
+    elementwise<T, Log<T>, 1>,
+    elementwise<T, Log1p<T>, 1>,
+    elementwise<T, Log2<T>, 1>,
+    elementwise<T, Log10<T>, 1>,
+    elementwise<T, Sin<T>, 1>,
+    elementwise<T, Cos<T>, 1>,
+    elementwise<T, Tan<T>, 1>,
+    elementwise<T, Asin<T>, 1>,
+    elementwise<T, Acos<T>, 1>,
+    elementwise<T, Atan<T>, 1>,
+    elementwise<T, Sinh<T>, 1>,
+    elementwise<T, Cosh<T>, 1>,
+    elementwise<T, Asinh<T>, 1>,
+    elementwise<T, Acosh<T>, 1>,
+    elementwise<T, Atanh<T>, 1>,
+    elementwise<T, Erf<T>, 1>,
+    elementwise<T, Floor<T>, 1>,
+    elementwise<T, Ceil<T>, 1>,
+    elementwise<T, Round<T>, 1>,
+    elementwise<T, Truncate<T>, 1>,
+    elementwise<T, Relu<T>, 1>,
+    elementwise<T, Sign<T>, 1>,
+    elementwise<T, Not<T>, 1>,
+    elementwise<T, IsNan<T>, 1>,
+    elementwise<T, Truth<T>, 1>,
+    elementwise<T, Sigmoid<T>, 1>,
+    elementwise<T, Tanh<T>, 1>,
+    elementwise<T, Sum<T>, 2>,
+    elementwise<T, Difference<T>, 2>,
+    elementwise<T, Product<T>, 2>,
+    elementwise<T, Quotient<T>, 2>,
+    elementwise<T, Larger<T>, 2>,
+    elementwise<T, Smaller<T>, 2>,
+    elementwise<T, Less<T>, 2>,
+    elementwise<T, LessOrEqual<T>, 2>,
+    elementwise<T, Equal<T>, 2>,
+    elementwise<T, Unequal<T>, 2>,
+    elementwise<T, SigmoidSlope<T>, 2>,
+    elementwise<T, TanhSlope<T>, 2>,
+    elementwise<T, Power<T>, 2>,
+    elementwise<T, Atan2<T>, 2>,
+    elementwise<T, Remainder<T>, 2>,
+    elementwise<T, Where<T>, 3>,
+    elementwise<T, ProductAndSum<T>, 3>,
+    reduction<T, Sum<T>>,
+    reduction<T, Larger<T>>,
+    reduction<T, Smaller<T>>,
+    extreme<T, true>,
+    extreme<T, false>,
+    indexed<T, false>,
+    indexed<T, true>,
+    moved<T, false>,
+    moved<T, true>,
+    packed<T>,
+    product_with_packed<T>,
+    products<T>,
+};
+
+template <class T>
+void run(const Integer *code, Integer words, const Integer *tables, T **buffers) {
+    const Machine<T> machine{buffers, tables};
+    for (const Integer *row = code; row < code + words; row += row[1]) INSTRUCTIONS<T>[row[0]](machine, row + 2);
+}
+
+// `first` once, then `every` for each step. After a step the buffers in `advances` (buffer, numbers) move on, and the
+// next step reads in `input` what this one has written into `result`.
+template <class T>
+void scan(const Integer *first, Integer first_words, const Integer *every, Integer words, const Integer *tables,
+          T **buffers, Integer steps, const Integer *advances, Integer moving, Integer input, Integer result, T *spare) {
+    run<T>(first, first_words, tables, buffers);
+    for (Integer step = 0; step < steps; step++) {
+        run<T>(every, words, tables, buffers);
+        for (Integer k = 0; k < moving; k++) buffers[advances[2 * k]] += advances[2 * k + 1];
+        T *read = buffers[input];
+        buffers[input] = buffers[result];
+        buffers[result] = step == 0 ? spare : read;  // the first input is the caller's
+    }
+}
+
+}  // namespace
+
+#define EXPORTED(NAME, T)                                                                                             \
+    extern "C" void lyapnet_run_##NAME(const Integer *code, Integer words, const Integer *tables, T **buffers) {      \
+        run<T>(code, words, tables, buffers);                                                                         \
+    }                                                                                                                 \
+    extern "C" int lyapnet_width_##NAME() { return COLUMNS * Of<T>::LANES; }                                          \
+    extern "C" void lyapnet_scan_##NAME(const Integer *first, Integer first_words, const Integer *every,              \
+                                        Integer words, const Integer *tables, T **buffers, Integer steps,             \
+                                        const Integer *advances, Integer moving, Integer input, Integer result,       \
+                                        T *spare) {                                                                   \
+        scan<T>(first, first_words, every, words, tables, buffers, steps, advances, moving, input, result, spare);    \
+    }
+
+EXPORTED(float64, double)
+EXPORTED(float32, float)

@@ -1,0 +1,293 @@
+"""Flat programs on tensors: instructions of integers, the memory that they work in, and what is shared by all steps."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+# in the order of INSTRUCTIONS in program.cpp
+OPERATIONS = {
+    name: code
+    for code, name in enumerate(
+        (
+            "copy",
+            "negative",
+            "absolute",
+            "reciprocal",
+            "square",
+            "cube",
+            "root",
+            "inverse_root",
+            "exp",
+            "exp2",
+            "expm1",
+            "log",
+            "log1p",
+            "log2",
+            "log10",
+            "sin",
+            "cos",
+            "tan",
+            "asin",
+            "acos",
+            "atan",
+            "sinh",
+            "cosh",
+            "asinh",
+            "acosh",
+            "atanh",
+            "erf",
+            "floor",
+            "ceil",
+            "round",
+            "truncate",
+            "relu",
+            "sign",
+            "not",
+            "is_nan",
+            "truth",
+            "sigmoid",
+            "tanh",
+            "sum",
+            "difference",
+            "product",
+            "quotient",
+            "larger",
+            "smaller",
+            "less",
+            "less_or_equal",
+            "equal",
+            "unequal",
+            "sigmoid_slope",
+            "tanh_slope",
+            "power",
+            "atan2",
+            "remainder",
+            "where",
+            "product_and_sum",
+            "reduce_sum",
+            "reduce_larger",
+            "reduce_smaller",
+            "index_of_largest",
+            "index_of_least",
+            "take_at_index",
+            "put_at_index",
+            "move",
+            "add_moved",
+            "pack",
+            "product_with_packed",
+            "products",
+        )
+    )
+}
+MOST_RANK = 8  # as in program.cpp
+LINE = 64  # bytes of a line of the cache, at which buffers begin
+
+
+class Place(NamedTuple):
+    """Where the numbers of a tensor are."""
+
+    buffer: int
+    offset: int
+    strides: tuple[int, ...]
+
+
+class Instruction(NamedTuple):
+    """A row of a program."""
+
+    row: list[int]
+    reads: tuple[int, ...]  # buffers
+    writes: int
+
+
+@dataclass
+class Buffer:
+    """Memory of a program: of its caller, a constant, or a part of the arena."""
+
+    numbers: int
+    varies: bool  # from step to step
+    constant: Tensor | None = None
+    given: bool = False  # by the caller, at each call
+
+
+class Program:
+    """A program that is being written: its buffers, and instructions in their order.
+
+    Args:
+        dtype: of all numbers; truths are 1 and 0.
+    """
+
+    def __init__(self, dtype: torch.dtype):
+        self.dtype = dtype
+        self.buffers: list[Buffer] = []
+        self.shared: list[Instruction] = []  # done once
+        self.repeated: list[Instruction] = []  # done at every step
+        self.tables: list[np.ndarray] = []
+        self._positions = 0
+        self._packed = dict[Place, int]()
+
+    def new_buffer(self, numbers: int, varies: bool, constant: Tensor | None = None, given: bool = False) -> int:
+        """The index of memory for some numbers."""
+        self.buffers.append(Buffer(numbers, varies, constant, given))
+        return len(self.buffers) - 1
+
+    def table(self, positions: Tensor) -> int:
+        """Where a table of positions begins among the tables."""
+        self.tables.append(positions.flatten().numpy().astype(np.int64))
+        self._positions += positions.numel()
+        return self._positions - positions.numel()
+
+    def elementwise(self, operation: str, shape: Sequence[int], out: Place, inputs: Sequence[Place]) -> None:
+        """out = operation(inputs), number by number, over a shape; strides are 0 where an operand is repeated."""
+        if 0 in shape:
+            return
+        places = [out, *inputs]
+        sizes, strides = _merged(shape, [place.strides for place in places])
+        row = [len(sizes), *sizes]
+        for place, own in zip(places, strides, strict=True):
+            row += [place.buffer, place.offset, *own]
+        self._append(operation, row, [place.buffer for place in inputs], out.buffer)
+
+    def reduce(self, operation: str, shape: Sequence[int], out: Place, given: Place) -> None:
+        """out = operation(out, given) over a shape, along whose axes out has stride 0 where it is reduced."""
+        if 0 in shape:
+            return
+        sizes, (of, to) = _merged(shape, [given.strides, out.strides])
+        row = [len(sizes), *sizes, out.buffer, out.offset, *to, given.buffer, given.offset, *of]
+        self._append(operation, row, [out.buffer, given.buffer], out.buffer)
+
+    def find_extreme(self, operation: str, shape: Sequence[int], axis: int, out: Place, given: Place) -> None:
+        """out = the index of the largest or the least of `given` along an axis, along which out has stride 0."""
+        if 0 in shape:
+            return
+        others = [k for k in range(len(shape)) if k != axis]
+        sizes, strides = _merged([shape[k] for k in others], [[p.strides[k] for k in others] for p in (out, given)])
+        row = [len(sizes) + 1, *sizes, shape[axis]]
+        for place, own in zip((out, given), strides, strict=True):
+            row += [place.buffer, place.offset, *own, place.strides[axis]]
+        self._append(operation, row, [given.buffer], out.buffer)
+
+    def index(
+        self, shape: Sequence[int], axis: int, size: int, out: Place, given: Place, index: Place, into: bool = False
+    ) -> None:
+        """out = given[index], or out[index] = given, along an axis of some size, over the shape of the index."""
+        if 0 in shape:
+            return
+        places = [out, given, index]
+        stride = places[0 if into else 1].strides[axis]
+        strides = [list(place.strides) for place in places]
+        strides[0 if into else 1][axis] = 0
+        sizes, strides = _merged(shape, strides)
+        row = [size, stride, len(sizes), *sizes]
+        for place, own in zip(places, strides, strict=True):
+            row += [place.buffer, place.offset, *own]
+        reads = [given.buffer, index.buffer, *([out.buffer] if into else [])]
+        self._append("put_at_index" if into else "take_at_index", row, reads, out.buffer)
+
+    def move(self, out: Place, to: Tensor, given: Place, source: Tensor, add: bool = False) -> None:
+        """out[to] = given[source], or out[to] += given[source], at positions in numbers from where each begins."""
+        row = [to.numel(), self.table(to), self.table(source), out.buffer, out.offset, given.buffer, given.offset]
+        reads = [given.buffer, *([out.buffer] if add else [])]
+        self._append("add_moved" if add else "move", row, reads, out.buffer)
+
+    def multiply(self, shape: tuple[int, int, int], places: Sequence[Place], add: bool, width: int) -> None:
+        """out (M, N) = A (M, K) B (K, N), or out += A B.
+
+        Args:
+            shape: (M, N, K).
+            places: of out, A and B.
+            width: numbers in a row of a panel of packed columns.
+        """
+        (M, N, K), (out, A, B) = shape, places
+        if 0 in (M, N):
+            return
+        if width // 4 > N or out.strides[1] != 1:
+            self.multiply_batch(1, shape, [place._replace(strides=(0, *place.strides)) for place in places], add)
+            return
+        if B not in self._packed:
+            packed = self.new_buffer(-(-N // width) * width * K, self.buffers[B.buffer].varies)
+            self._append("pack", [K, N, B.buffer, B.offset, *B.strides, packed, 0], [B.buffer], packed)
+            self._packed[B] = packed
+        packed = self._packed[B]
+        row = [M, N, K, int(add), out.buffer, out.offset, out.strides[0], A.buffer, A.offset, *A.strides, packed, 0]
+        reads = [A.buffer, packed, *([out.buffer] if add else [])]
+        self._append("product_with_packed", row, reads, out.buffer)
+
+    def multiply_batch(self, batch: int, shape: tuple[int, int, int], places: Sequence[Place], add: bool) -> None:
+        """The same for a batch of small matrices, along the first axis of each."""
+        row, (out, A, B) = [batch, *shape, int(add)], places
+        for place in places:
+            row += [place.buffer, place.offset, *place.strides]
+        reads = [A.buffer, B.buffer, *([out.buffer] if add else [])]
+        self._append("products", row, reads, out.buffer)
+
+    def _append(self, operation: str, row: list[int], reads: Sequence[int], writes: int) -> None:
+        self.buffers[writes].varies |= any(self.buffers[each].varies for each in reads)
+        part = self.repeated if self.buffers[writes].varies else self.shared
+        part.append(Instruction([OPERATIONS[operation], len(row) + 2, *row], tuple(reads), writes))
+
+    def without_unread(self, results: Iterable[int]) -> None:
+        """Leave out instructions that write what no later one reads, and no result is."""
+        read = set(results)
+        for part in (self.repeated, self.shared):
+            kept = []
+            for instruction in reversed(part):
+                if instruction.writes in read:
+                    kept.append(instruction)
+                    read.update(instruction.reads)
+            part[:] = reversed(kept)
+
+    def laid_out(self) -> tuple[list[int], int]:
+        """(where each buffer of the arena begins, −1 for others; numbers in the arena).
+
+        Buffers whose last reader has been share their memory with later ones; what is written once and read at every
+        step keeps its own.
+        """
+        rows = [*self.shared, *self.repeated]
+        ends = dict[int, int]()
+        begins = dict[int, int]()
+        for k, instruction in enumerate(rows):
+            for buffer in (*instruction.reads, instruction.writes):
+                begins.setdefault(buffer, k)
+                ends[buffer] = k
+        for buffer, k in begins.items():
+            if k < len(self.shared) <= ends[buffer]:
+                ends[buffer] = len(rows)
+        offsets, arena = [-1] * len(self.buffers), 0
+        line = LINE // torch.finfo(self.dtype).bits * 8
+        alive: list[tuple[int, int, int]] = []  # (offset, numbers, end)
+        own = [b for b in begins if self.buffers[b].constant is None and not self.buffers[b].given]
+        for buffer in sorted(own, key=lambda b: begins[b]):
+            size = -(-self.buffers[buffer].numbers // line) * line + line  # a vector may reach beyond the last number
+            alive = sorted(each for each in alive if each[2] >= begins[buffer])
+            offset = 0
+            for start, numbers, _ in alive:
+                if start - offset >= size:
+                    break
+                offset = max(offset, start + numbers)
+            offsets[buffer] = offset
+            alive.append((offset, size, ends[buffer]))
+            arena = max(arena, offset + size)
+        return offsets, arena
+
+
+def _merged(shape: Sequence[int], strides: Sequence[Sequence[int]]) -> tuple[list[int], list[list[int]]]:
+    """A shape and its operands' strides with as few axes as possible, that of the shortest strides last.
+
+    Axes are in the order of the first operand's strides.
+    """
+    axes = [(n, *each) for n, *each in zip(shape, *strides, strict=True) if n != 1]
+    axes.sort(key=lambda axis: axis[1:], reverse=True)
+    merged: list[tuple[int, ...]] = []
+    for axis in axes:
+        if merged and all(a == b * axis[0] for a, b in zip(merged[-1][1:], axis[1:], strict=True)):
+            merged[-1] = (merged[-1][0] * axis[0], *axis[1:])
+        else:
+            merged.append(axis)
+    merged = merged or [(1, *[0] * len(strides))]
+    if len(merged) > MOST_RANK:
+        raise NotImplementedError(f"a tensor of more than {MOST_RANK} axes")
+    return [axis[0] for axis in merged], [[axis[k + 1] for axis in merged] for k in range(len(strides))]

@@ -1,0 +1,359 @@
+"""What each of torch's operators is in a program on tensors: (writer, result, *arguments) writes instructions."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+
+from lyapnet.graphs.number_kernel.program import Place
+from lyapnet.graphs.number_kernel.writing import Number, Writer
+
+UNARY = {
+    "abs": "absolute", "acos": "acos", "acosh": "acosh", "asin": "asin", "asinh": "asinh", "atan": "atan",
+    "atanh": "atanh", "ceil": "ceil", "clone": "copy", "cos": "cos", "cosh": "cosh", "erf": "erf", "exp": "exp",
+    "exp2": "exp2", "expm1": "expm1", "floor": "floor", "isnan": "is_nan", "lift_fresh_copy": "copy", "log": "log",
+    "log10": "log10", "log1p": "log1p", "log2": "log2", "neg": "negative", "reciprocal": "reciprocal", "relu": "relu",
+    "round": "round", "rsqrt": "inverse_root", "sigmoid": "sigmoid", "sign": "sign", "sgn": "sign", "sin": "sin",
+    "sinh": "sinh", "sqrt": "root", "square": "square", "tan": "tan", "tanh": "tanh", "trunc": "truncate",
+    "logical_not": "not", "bitwise_not": "not", "_to_copy": "copy", "contiguous": "copy",
+}  # fmt: skip
+BINARY = {
+    "atan2": "atan2", "bitwise_and": "product", "bitwise_or": "larger", "bitwise_xor": "unequal", "eq": "equal",
+    "le": "less_or_equal", "lt": "less", "maximum": "larger", "minimum": "smaller", "mul": "product", "ne": "unequal",
+    "remainder": "remainder", "sigmoid_backward": "sigmoid_slope", "tanh_backward": "tanh_slope",
+}  # fmt: skip
+SWAPPED = {"ge": "less_or_equal", "gt": "less"}
+POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "root", -0.5: "inverse_root"}
+
+
+def _unary(operation: str) -> Callable[..., None]:
+    def write(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
+        if operation == "copy" and out.dtype != x.dtype and not out.is_floating_point():
+            return writer.elementwise("truth" if out.dtype == torch.bool else "truncate", out, x)
+        return writer.elementwise(operation, out, x)
+
+    return write
+
+
+def _binary(operation: str) -> Callable[..., None]:
+    return lambda writer, out, x, y: writer.elementwise(operation, out, x, y)
+
+
+def _swapped(operation: str) -> Callable[..., None]:
+    return lambda writer, out, x, y: writer.elementwise(operation, out, y, x)
+
+
+def _add(writer: Writer, out: Tensor, x: Number, y: Number, alpha: float = 1) -> None:
+    if out.dtype == torch.bool:
+        raise NotImplementedError("a sum of truths")
+    if alpha == 1:
+        writer.elementwise("sum", out, x, y)
+    else:
+        writer.elementwise("product_and_sum", out, x, alpha, y)
+
+
+def _subtract(writer: Writer, out: Tensor, x: Number, y: Number, alpha: float = 1) -> None:
+    if alpha == 1:
+        writer.elementwise("difference", out, x, y)
+    else:
+        writer.elementwise("product_and_sum", out, x, -alpha, y)
+
+
+def _subtract_from(writer: Writer, out: Tensor, x: Number, y: Number, alpha: float = 1) -> None:
+    _subtract(writer, out, y, x, alpha)
+
+
+def _divide(writer: Writer, out: Tensor, x: Number, y: Number, rounding_mode: str | None = None) -> None:
+    writer.elementwise("quotient", out, x, y)
+    if rounding_mode is not None:
+        writer.elementwise({"floor": "floor", "trunc": "truncate"}[rounding_mode], out, out)
+
+
+def _power(writer: Writer, out: Tensor, x: Number, exponent: Number) -> None:
+    if not isinstance(exponent, Tensor) and exponent in POWERS:
+        writer.elementwise(POWERS[exponent], out, x)
+    else:
+        writer.elementwise("power", out, x, exponent)
+
+
+def _clamp(writer: Writer, out: Tensor, x: Tensor, least: Number | None = None, most: Number | None = None) -> None:
+    if least is not None:
+        writer.elementwise("larger", out, x, least)
+        x = out
+    writer.elementwise("copy", out, x) if most is None else writer.elementwise("smaller", out, x, most)
+
+
+def _threshold_backward(writer: Writer, out: Tensor, costate: Tensor, x: Tensor, threshold: float) -> None:
+    below = writer.new_tensor(x)
+    writer.elementwise("less_or_equal", below, x, threshold)
+    writer.elementwise("where", out, below, 0, costate)
+
+
+def _where(writer: Writer, out: Tensor, condition: Tensor, x: Number, y: Number) -> None:
+    writer.elementwise("where", out, condition, x, y)
+
+
+def _masked_fill(writer: Writer, out: Tensor, x: Tensor, mask: Tensor, value: Number) -> None:
+    writer.elementwise("where", out, mask, value, x)
+
+
+def _logical(operation: str) -> Callable[..., None]:
+    def write(writer: Writer, out: Tensor, x: Tensor, y: Tensor) -> None:
+        if x.dtype != torch.bool or y.dtype != torch.bool:
+            raise NotImplementedError("truths of numbers")
+        writer.elementwise(operation, out, x, y)
+
+    return write
+
+
+def _fill(writer: Writer, out: Tensor, x: Tensor, value: Number) -> None:
+    writer.elementwise("copy", out, value)
+
+
+def _reduction(operation: str, start: float) -> Callable[..., None]:
+    def write(
+        writer: Writer, out: Tensor, x: Tensor, dim: Any = None, keepdim: bool = False, dtype: Any = None
+    ) -> None:
+        every = range(x.ndim) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
+        axes = sorted(axis % max(x.ndim, 1) for axis in every)
+        spread = out
+        if not keepdim:
+            for axis in axes:
+                spread = spread.unsqueeze(axis)
+        if x.ndim == 0:
+            return writer.elementwise("copy", out, x)
+        writer.elementwise("copy", out, start)
+        place = writer.place(spread)
+        strides = tuple(0 if k in axes else stride for k, stride in enumerate(place.strides))
+        return writer.program.reduce(operation, x.shape, Place(place.buffer, place.offset, strides), writer.place(x))
+
+    return write
+
+
+def _index_of_extreme(operation: str) -> Callable[..., None]:
+    def write(writer: Writer, out: Tensor, x: Tensor, dim: int | None = None, keepdim: bool = False) -> None:
+        if dim is None or x.ndim == 0:
+            raise NotImplementedError("the index of an extreme of all entries")
+        place, axis = writer.place(out if keepdim else out.unsqueeze(dim)), dim % x.ndim
+        strides = tuple(0 if k == axis else stride for k, stride in enumerate(place.strides))
+        writer.program.find_extreme(operation, x.shape, axis, place._replace(strides=strides), writer.place(x))
+
+    return write
+
+
+def _extreme(reduced: str, start: float, index: str) -> Callable[..., None]:
+    """max and min, of all or along an axis with their index."""
+
+    def write(writer: Writer, out: Any, x: Tensor, dim: int | None = None, keepdim: bool = False) -> None:
+        if dim is None:
+            return _reduction(reduced, start)(writer, out, x)
+        _reduction(reduced, start)(writer, out[0], x, dim, keepdim)
+        return _index_of_extreme(index)(writer, out[1], x, dim, keepdim)
+
+    return write
+
+
+def _gather(writer: Writer, out: Tensor, x: Tensor, dim: int, index: Tensor, sparse_grad: bool = False) -> None:
+    axis = dim % x.ndim
+    given, at = writer.place(x), writer.place(index)
+    writer.program.index(index.shape, axis, x.shape[axis], writer.place(out), given, at)
+
+
+def _scatter(writer: Writer, out: Tensor, x: Tensor, dim: int, index: Tensor, values: Number) -> None:
+    axis = dim % x.ndim
+    writer.elementwise("copy", out, x)
+    if isinstance(values, Tensor):
+        values = values[tuple(slice(size) for size in index.shape)]
+    given, at = writer.place(values, index.shape), writer.place(index)
+    writer.program.index(index.shape, axis, x.shape[axis], writer.place(out), given, at, into=True)
+
+
+def _truth_of(extreme: str) -> Callable[..., None]:
+    """any and all, as the largest and the least of truths."""
+
+    def write(writer: Writer, out: Tensor, x: Tensor, dim: Any = None, keepdim: bool = False) -> None:
+        truths = x if x.dtype == torch.bool else writer.new_tensor(x)
+        if truths is not x:
+            writer.elementwise("truth", truths, x)
+        RULES[extreme](writer, out, truths, dim, keepdim)
+
+    return write
+
+
+def _mean(writer: Writer, out: Tensor, x: Tensor, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> None:
+    RULES["sum"](writer, out, x, dim, keepdim)
+    writer.elementwise("product", out, out, out.numel() / x.numel())
+
+
+def _matrix_product(writer: Writer, out: Tensor, A: Tensor, B: Tensor, add: bool = False) -> None:
+    shape = (A.shape[-2], B.shape[-1], A.shape[-1])
+    places = [writer.place(each) for each in (out, A, B)]
+    if out.ndim == 2:
+        writer.program.multiply(shape, places, add, writer.width)
+    elif len(out):
+        writer.program.multiply_batch(len(out), shape, places, add)
+
+
+def _matrix_and_vector(writer: Writer, out: Tensor, A: Tensor, x: Tensor) -> None:
+    _matrix_product(writer, out.unsqueeze(-1), A, x.unsqueeze(-1))
+
+
+def _add_matrix_product(
+    writer: Writer, out: Tensor, x: Tensor, A: Tensor, B: Tensor, beta: float = 1, alpha: float = 1
+) -> None:
+    if (beta, alpha) != (1, 1):
+        raise NotImplementedError("weights in a matrix product")
+    writer.elementwise("copy", out, x)
+    _matrix_product(writer, out, A, B, add=True)
+
+
+def _concatenate(writer: Writer, out: Tensor, parts: Sequence[Tensor], dim: int = 0) -> None:
+    first = 0
+    for part in parts:
+        if part.ndim == out.ndim:  # torch lets an empty vector pass
+            writer.elementwise("copy", out.narrow(dim, first, part.shape[dim]), part)
+            first += part.shape[dim]
+
+
+def _stack(writer: Writer, out: Tensor, parts: Sequence[Tensor], dim: int = 0) -> None:
+    for k, part in enumerate(parts):
+        writer.elementwise("copy", out.select(dim, k), part)
+
+
+def _select_backward(writer: Writer, out: Tensor, costate: Tensor, sizes: Any, dim: int, index: int) -> None:
+    writer.elementwise("copy", out, 0)
+    writer.elementwise("copy", out.select(dim, index), costate)
+
+
+def _slice_backward(
+    writer: Writer, out: Tensor, costate: Tensor, sizes: Any, dim: int, start: int, end: int, step: int
+) -> None:
+    writer.elementwise("copy", out, 0)
+    writer.elementwise("copy", torch.ops.aten.slice.Tensor(out, dim, start, end, step), costate)
+
+
+def _select_scatter(writer: Writer, out: Tensor, x: Tensor, part: Tensor, dim: int, index: int) -> None:
+    writer.elementwise("copy", out, x)
+    writer.elementwise("copy", out.select(dim, index), part)
+
+
+def _slice_scatter(
+    writer: Writer,
+    out: Tensor,
+    x: Tensor,
+    part: Tensor,
+    dim: int = 0,
+    start: Any = None,
+    end: Any = None,
+    step: int = 1,
+) -> None:
+    writer.elementwise("copy", out, x)
+    writer.elementwise("copy", torch.ops.aten.slice.Tensor(out, dim, start, end, step), part)
+
+
+def _positions(x: Tensor) -> Tensor:
+    """Where each entry of a tensor is, in numbers from its first."""
+    positions = torch.zeros((), dtype=torch.int64)
+    for axis, (size, stride) in enumerate(zip(x.shape, x.stride(), strict=True)):
+        shape = [1] * x.ndim
+        shape[axis] = size
+        positions = positions + (torch.arange(size) * stride).reshape(shape)
+    return positions
+
+
+def _require_constant(writer: Writer, *given: Any) -> None:
+    for each in tree_leaves(given):
+        if isinstance(each, Tensor) and writer.is_written(each):
+            raise NotImplementedError("places that depend on arguments")
+
+
+def _arranged(target: Any) -> Callable[..., None]:
+    """What puts entries of its first argument into other places, and zeros beside them."""
+
+    def write(writer: Writer, out: Tensor, x: Tensor, *options: Any, **named: Any) -> None:
+        _require_constant(writer, options, named)
+        source = target(_positions(x).reshape(x.shape) + 1, *options, **named).flatten()
+        to, there = _positions(out).flatten(), source > 0
+        if not there.all():
+            writer.elementwise("copy", out, 0)
+        writer.program.move(writer.place(out), to[there], writer.place(x), source[there] - 1)
+
+    return write
+
+
+def _index_put(
+    writer: Writer, out: Tensor, x: Tensor, indices: Sequence[Tensor | None], values: Tensor, accumulate: bool = False
+) -> None:
+    _require_constant(writer, indices)
+    _put(writer, out, x, torch.ops.aten.index.Tensor(_positions(out).reshape(out.shape), indices), values, accumulate)
+
+
+def _index_add(writer: Writer, out: Tensor, x: Tensor, dim: int, index: Tensor, source: Tensor, alpha: Any = 1) -> None:
+    _require_constant(writer, index)
+    if alpha != 1:
+        raise NotImplementedError("index_add with a weight")
+    _put(writer, out, x, _positions(out).reshape(out.shape).index_select(dim, index), source, add=True)
+
+
+def _put(writer: Writer, out: Tensor, x: Tensor, to: Tensor, values: Tensor, add: bool) -> None:
+    writer.elementwise("copy", out, x)
+    values = values.expand(to.shape)
+    place = writer.place(values)
+    source = _positions(values).expand(to.shape)
+    writer.program.move(writer.place(out), to.flatten(), place, source.flatten(), add)
+
+
+ARRANGED = {
+    "index": torch.ops.aten.index.Tensor, "index_select": torch.ops.aten.index_select.default,
+    "flip": torch.ops.aten.flip.default, "roll": torch.ops.aten.roll.default,
+    "repeat": torch.ops.aten.repeat.default, "tril": torch.ops.aten.tril.default, "triu": torch.ops.aten.triu.default,
+}  # fmt: skip
+
+RULES: dict[str, Callable[..., None]] = {
+    **{name: _unary(operation) for name, operation in UNARY.items()},
+    **{name: _binary(operation) for name, operation in BINARY.items()},
+    **{name: _swapped(operation) for name, operation in SWAPPED.items()},
+    **{name: _arranged(target) for name, target in ARRANGED.items()},
+    "add": _add,
+    "sub": _subtract,
+    "rsub": _subtract_from,
+    "div": _divide,
+    "pow": _power,
+    "clamp": _clamp,
+    "clamp_min": _clamp,
+    "clamp_max": lambda writer, out, x, most: _clamp(writer, out, x, None, most),
+    "threshold_backward": _threshold_backward,
+    "where": _where,
+    "masked_fill": _masked_fill,
+    "logical_and": _logical("product"),
+    "logical_or": _logical("larger"),
+    "logical_xor": _logical("unequal"),
+    "fill": _fill,
+    "sum": _reduction("reduce_sum", 0.0),
+    "amax": _reduction("reduce_larger", -torch.inf),
+    "amin": _reduction("reduce_smaller", torch.inf),
+    "max": _extreme("reduce_larger", -torch.inf, "index_of_largest"),
+    "min": _extreme("reduce_smaller", torch.inf, "index_of_least"),
+    "argmax": _index_of_extreme("index_of_largest"),
+    "argmin": _index_of_extreme("index_of_least"),
+    "gather": _gather,
+    "scatter": _scatter,
+    "any": _truth_of("amax"),
+    "all": _truth_of("amin"),
+    "mean": _mean,
+    "mm": _matrix_product,
+    "bmm": _matrix_product,
+    "mv": _matrix_and_vector,
+    "addmm": _add_matrix_product,
+    "baddbmm": _add_matrix_product,
+    "cat": _concatenate,
+    "stack": _stack,
+    "select_backward": _select_backward,
+    "slice_backward": _slice_backward,
+    "select_scatter": _select_scatter,
+    "slice_scatter": _slice_scatter,
+    "index_put": _index_put,
+    "index_add": _index_add,
+}

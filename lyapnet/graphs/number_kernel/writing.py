@@ -1,0 +1,143 @@
+"""Traced graphs written as programs on tensors, node by node.
+
+Each node is run by torch once, on example arguments: what its result shares memory with is a view of that, and needs no
+instruction; how its result lies in memory is how the program keeps it.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._decomp import decomposition_table
+from torch.fx import GraphModule, Node
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.fx.node import map_arg
+from torch.utils._pytree import tree_leaves, tree_map_only
+
+from lyapnet.graphs.number_kernel.program import Place, Program
+from lyapnet.graphs.tracing import SHAPED, name_of
+
+Number = Tensor | float
+
+
+class Writer:
+    """Writes graphs into one program.
+
+    Args:
+        program: to write into.
+        width: numbers in a row of a panel of packed columns.
+        rules: by the names of operators, what writes (writer, result, *arguments).
+    """
+
+    def __init__(self, program: Program, width: int, rules: Mapping[str, Callable[..., None]]):
+        self.program, self.width, self.rules = program, width, rules
+        self._buffers = dict[int, int]()  # by the address of a tensor's memory
+        self._constants = dict[Any, int]()
+        self._kept: list[Any] = []  # whose addresses are not to be taken by others
+
+    def argument(self, example: Tensor, varies: bool) -> int:
+        """The buffer of an argument of numbers or truths, which lies in memory as the example does."""
+        return self._new_buffer(example, varies, given=True)
+
+    def write(self, graph: GraphModule, arguments: Sequence[Any]) -> list[Tensor]:
+        """The results of a graph, as torch computes them of the arguments, whose operations are written.
+
+        Raises:
+            NotImplementedError: an operation has no rule, or arguments that its rule does not cover.
+        """
+        values, given = dict[Node, Any](), iter(arguments)
+        for node in graph.graph.nodes:
+            if node.op == "placeholder":
+                values[node] = next(given)
+            elif node.op == "get_attr":
+                values[node] = getattr(graph, node.target).detach()
+            elif node.op == "output":
+                self._kept.append(values)
+                results = map_arg(node.args[0], values.__getitem__)
+                return list(results) if isinstance(results, list | tuple) else [results]
+            else:
+                inputs, keywords = map_arg((node.args, node.kwargs), values.__getitem__)
+                values[node] = self._result(node.target, inputs, keywords)
+        raise AssertionError("a graph ends with its output")
+
+    def _result(self, target: Any, inputs: Any, keywords: Any) -> Any:
+        result = target(*inputs, **keywords)
+        sources = [each for each in tree_leaves((inputs, keywords)) if isinstance(each, Tensor)]
+        known = [each for each in sources if self.is_written(each)]
+        if not known or name_of(target) in SHAPED:
+            return result
+        made = [each for each in tree_leaves(result) if isinstance(each, Tensor)]
+        if all(self.is_written(each) or not each.numel() for each in made):
+            return result
+        rule = self.rules.get(name_of(target))
+        if rule is None:
+            return self._in_simpler_operators(target, inputs, keywords)
+        for out in made:
+            self._new_buffer(out, any(self.varies(each) for each in known))
+        rule(self, made[0] if len(made) == 1 else made, *inputs, **keywords)
+        return result
+
+    def _in_simpler_operators(self, target: Any, inputs: Any, keywords: Any) -> Any:
+        simpler = decomposition_table.get(target)
+        if simpler is None:
+            raise NotImplementedError(str(target))
+        tensors = [each for each in tree_leaves((inputs, keywords)) if isinstance(each, Tensor)]
+
+        def function(*replaced: Tensor) -> Any:
+            by_place = iter(replaced)
+            put = tree_map_only(Tensor, lambda _: next(by_place), (inputs, keywords))
+            return simpler(*put[0], **put[1])
+
+        graph = make_fx(function)(*tensors)
+        results = self.write(graph, tensors)
+        return results[0] if len(results) == 1 else results
+
+    # --- For rules ---
+
+    def is_written(self, tensor: Tensor) -> bool:
+        """Whether a tensor depends on arguments, or is a part of one; else it is a constant."""
+        return tensor.untyped_storage().data_ptr() in self._buffers and tensor.numel() > 0
+
+    def varies(self, tensor: Tensor) -> bool:
+        return self.program.buffers[self._buffers[tensor.untyped_storage().data_ptr()]].varies
+
+    def place(self, value: Number, shape: Sequence[int] | None = None) -> Place:
+        """Where a tensor is, or a number that is in the program; repeated to a shape."""
+        if not isinstance(value, Tensor):
+            value = torch.tensor(float(value), dtype=self.program.dtype)
+            buffer = self._constant(("number", float(value)), value)
+        elif self.is_written(value):
+            buffer = self._buffers[value.untyped_storage().data_ptr()]
+        else:
+            whole = torch.empty(0, dtype=value.dtype).set_(value.untyped_storage())
+            buffer = self._constant((whole.data_ptr(), len(whole)), whole)
+        repeated = value if shape is None else value.expand(tuple(shape))
+        return Place(buffer, int(value.storage_offset()), repeated.stride())
+
+    def new_tensor(self, like: Tensor, shape: Sequence[int] | None = None) -> Tensor:
+        """A tensor for what a rule keeps in between."""
+        made = torch.zeros(tuple(like.shape if shape is None else shape), dtype=self.program.dtype)
+        self._new_buffer(made, self.varies(like))
+        return made
+
+    def elementwise(self, operation: str, out: Tensor, *inputs: Number) -> None:
+        """out = operation(inputs), repeated to its shape."""
+        places = [self.place(each, out.shape) for each in inputs]
+        self.program.elementwise(operation, out.shape, self.place(out), places)
+
+    def _new_buffer(self, tensor: Tensor, varies: bool, given: bool = False) -> int:
+        if tensor.dtype not in (self.program.dtype, torch.bool, torch.int64):
+            raise NotImplementedError(f"numbers of {tensor.dtype} that depend on arguments")
+        self._kept.append(tensor)
+        numbers = tensor.untyped_storage().nbytes() // tensor.itemsize
+        buffer = self.program.new_buffer(numbers, varies, given=given)
+        self._buffers[tensor.untyped_storage().data_ptr()] = buffer
+        return buffer
+
+    def _constant(self, key: Any, whole: Tensor) -> int:
+        if key not in self._constants:
+            self._kept.append(whole)
+            copy = whole.to(self.program.dtype).clone().contiguous()
+            self._constants[key] = self.program.new_buffer(copy.numel(), False, constant=copy)
+        return self._constants[key]

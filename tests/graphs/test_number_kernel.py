@@ -1,0 +1,257 @@
+"""Programs on numbers: each rule against torch, on tensors as they lie in memory; scans; what is refused."""
+
+import re
+
+import pytest
+import torch
+from torch import nn
+from torch.testing import assert_close
+
+import lyapnet
+from lyapnet.calculus import ValueFunction
+from lyapnet.config import config_from_plain
+from lyapnet.graphs.compilation import Scan, has_compiler
+from lyapnet.graphs.number_kernel import rules
+from lyapnet.graphs.number_kernel.kernel import SOURCE, NumberKernel, ScanKernel
+from lyapnet.graphs.number_kernel.program import OPERATIONS
+from lyapnet.graphs.tracing import trace
+from lyapnet.networks import FCN, NETWORKS
+from tests.configs import objects
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+
+OPERATORS = {
+    "sums": lambda x, y: (x + y, x - 2 * y, torch.add(x, y, alpha=3), 1.5 - x, x + 1, x.mT - y.mT),
+    "products": lambda x, y: (x * y, x / (2 + y**2), 2 * x, x.reciprocal(), -x),
+    "divisions": lambda x, y: (torch.div(x, y, rounding_mode="floor"), torch.div(x, y, rounding_mode="trunc"), x % y),
+    "powers": lambda x, y: (x**2, x**3, x.abs() ** 0.5, (x**2 + 1) ** -0.5, (x**2 + 1) ** y, x**1, x**-1, x**4),
+    "exponentials": lambda x, y: (x.exp(), x.expm1(), x.exp2(), (100 * x).exp(), torch.softmax(x, -1)),
+    "logarithms": lambda x, y: ((1 + x**2).log(), (x**2).log1p(), (1 + x**2).log2(), (1 + x**2).log10()),
+    "waves": lambda x, y: (x.sin(), x.cos(), x.tan(), torch.atan2(x, y), x.atan(), (x / 9).asin(), (x / 9).acos()),
+    "hyperbolic": lambda x, y: (x.tanh(), x.sinh(), x.cosh(), x.asinh(), (1 + x**2).acosh(), (x / 9).atanh()),
+    "activations": lambda x, y: (
+        x.sigmoid(), x.relu(), nn.functional.softplus(x), nn.functional.elu(x), nn.functional.silu(x),
+        nn.functional.gelu(x), nn.functional.leaky_relu(x), (50 * x).sigmoid(), (1e-4 * x).tanh(), x.erf(),
+    ),
+    "roots": lambda x, y: ((x**2).sqrt(), (1 + x**2).rsqrt(), x.abs(), x.sign(), x.sgn()),
+    "rounding": lambda x, y: (x.floor(), x.ceil(), x.round(), x.trunc()),
+    "limits": lambda x, y: (
+        x.clamp(-0.5, 0.7), x.clamp(min=0.1), x.clamp(max=0.1), torch.clamp(x, -y.abs(), y.abs()),
+        torch.maximum(x, y), torch.minimum(x, y),
+    ),
+    "truths": lambda x, y: (
+        (x > y).to(x.dtype), (x >= y) * x, (x < 0.3) & (y < 0), (x <= y) | (y > 0), ~(x == y), x != y,
+        torch.where(x > y, x, 0.0), x.masked_fill(x > 0, 7.0), (x > 0).any(-1), (x > -1).all(0), x.isnan(),
+        torch.logical_not(x > 0), torch.logical_xor(x > 0, y > 0), (x > 0).sum(-1).to(x.dtype),
+    ),
+    "reductions": lambda x, y: (
+        x.sum(), x.sum(0), x.sum(-1, keepdim=True), x.mean(-2), x.amax(-1), x.amin(0), x.max(), x.min(),
+        x.mT.sum(-1), x[..., ::2].sum(-1), torch.linalg.vector_norm(x, dim=-1), x.expand(3, *x.shape).sum((0, 2)),
+    ),
+    "extremes": lambda x, y: (
+        x.max(-1).values, x.min(0).values, x.argmax(-1).to(x.dtype), x.min(-1, keepdim=True).indices == 2,
+        x.gather(-1, y.argmin(-1, keepdim=True)), x.gather(0, y.argmax(0, keepdim=True)),
+        x.scatter(-1, y.argmax(-1, keepdim=True), y[:, :1]), x.scatter(0, y.argmin(0, keepdim=True), 3.0),
+    ),
+    "matrices": lambda x, y: (
+        x @ y.mT, x.mT @ y, x @ y[0], torch.addmm(x[:, :5], x, y[:, :7].mT[:, :5]), x[:1] @ y.mT, x @ y[:1].mT,
+        torch.bmm(x.reshape(5, 1, 7), y.reshape(5, 7, 1)), x[:, :3] @ torch.ones(3, 40, dtype=x.dtype),
+        torch.baddbmm(x.reshape(5, 1, 7), x[:, :2].reshape(5, 1, 2), y.reshape(5, 7, 1)[:, :2] * y.reshape(5, 1, 7)),
+        torch.einsum("bi,bj->bij", x, y), x @ torch.zeros(7, 3, dtype=x.dtype),
+    ),
+    "shapes": lambda x, y: (
+        torch.cat([x, y.mT.mT], -1), torch.stack([x, y], 1), x.reshape(7, 5), x.mT.reshape(35), x.flip(0),
+        x[:, [3, 1, 1]], x.roll(2, -1), x.repeat(2, 1), x.tril(), x[::2, 1:4].clone(), x.unsqueeze(1).expand(5, 2, 7),
+        x.index_select(0, torch.tensor([4, 0])), x.unfold(-1, 3, 2), x.permute(1, 0)[None],
+    ),
+    "assignments": lambda x, y: (
+        torch.zeros_like(x).index_put((torch.tensor([1, 3]),), y[:2]), x.select_scatter(y[0], 0, 2),
+        x.slice_scatter(y[:2], 0, 1, 5, 2), x.index_add(0, torch.tensor([1, 1, 4]), y[:3]),
+        x.index_put((torch.tensor([1, 1]),), y[:2], accumulate=True), x.index_fill(-1, torch.tensor([0]), 2.0),
+    ),
+    "mixed": lambda x, y: ((x @ y.mT).tanh().sum(-1, keepdim=True) * x.mT[:5, :5].mean() + y[:, :1],),
+}  # fmt: skip
+
+
+def pair(dtype=torch.float64):
+    generator = torch.Generator().manual_seed(0)
+    x, y = (torch.randn(5, 7, generator=generator, dtype=torch.float64).to(dtype) for _ in range(2))
+    return x, y
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", OPERATORS)
+def test_operators_compute_what_torch_computes(name, dtype):
+    def function(x, y):
+        results = OPERATORS[name](x, y)
+        return tuple(r.to(x.dtype) for r in results)
+
+    graph = trace(function, pair(dtype))
+    kernel = NumberKernel(graph, pair(dtype))
+    others = [
+        torch.linspace(-3, 2, 35, dtype=dtype).reshape(5, 7),
+        torch.linspace(1, -1, 35, dtype=dtype).reshape(5, 7),
+    ]
+    for given in (pair(dtype), [1 + each for each in others], [each.mT.contiguous().mT for each in others]):
+        rough = dtype == torch.float32
+        for found, expected in zip(kernel(*given), function(*given), strict=True):
+            assert_close(found, expected, rtol=2e-5 if rough else 1e-12, atol=1e-5 if rough else 1e-12, equal_nan=True)
+
+
+def test_not_a_number_is_passed_on():
+    x = torch.tensor([[torch.nan, 1.0, -torch.inf, torch.inf, -1.0, 0.0, 2.0]] * 5, dtype=torch.float64)
+    for name in ("sums", "limits", "activations", "exponentials", "reductions", "rounding"):
+        graph = trace(OPERATORS[name], pair())
+        for found, expected in zip(NumberKernel(graph, pair())(x, pair()[1]), graph(x, pair()[1]), strict=True):
+            assert_close(found, expected, rtol=1e-9, atol=1e-12, equal_nan=True, msg=name)
+
+
+def test_slopes_compute_what_torch_computes():
+    def function(x, y):
+        with torch.enable_grad():
+            z = x.detach().requires_grad_()
+            value = (z.tanh() @ y.mT).sigmoid().sum(-1) + z.relu().max(-1).values + z[:, 2] * z[:, [0, 1]].sum(-1)
+            (slope,) = torch.autograd.grad(value.sum(), z, create_graph=True)
+            (bend,) = torch.autograd.grad((slope * y).sum(), z)
+        return value.detach(), slope.detach(), bend
+
+    kernel = NumberKernel(trace(function, pair()), pair())
+    x, y = 0.3 - pair()[0], 2 * pair()[1]
+    for found, expected in zip(kernel(x, y), function(x, y), strict=True):
+        assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_each_operation_has_its_place_in_the_kernel():
+    listed = re.search(r"INSTRUCTIONS\[\] = \{(.*?)\n\};", SOURCE.read_text(), re.S)
+    assert listed is not None
+    names = [line.strip().rstrip(",") for line in listed[1].strip().splitlines()]
+    assert len(names) == len(OPERATIONS)
+    spoken = {"inverse_root": "InverseRoot", "tanh_slope": "TanhSlope", "less_or_equal": "LessOrEqual"}
+    for name, camel in spoken.items():
+        assert camel in names[OPERATIONS[name]]
+
+
+def test_a_rule_that_is_wrong_is_found(monkeypatch):
+    monkeypatch.setitem(rules.RULES, "add", rules.RULES["mul"])
+    with pytest.raises(NotImplementedError, match="another result than torch's"):
+        NumberKernel(trace(lambda x, y: (x + y,), pair()), pair())
+
+
+def test_what_has_no_rule_is_named():
+    with pytest.raises(NotImplementedError, match=r"aten\.sort"):
+        NumberKernel(trace(lambda x, y: (x.sort(-1).values,), pair()), pair())
+
+
+def test_places_that_depend_on_arguments_are_refused():
+    with pytest.raises(NotImplementedError, match="places that depend on arguments"):
+        NumberKernel(trace(lambda x, y: (x.mT[y.argmax(-1)],), pair()), pair())
+
+
+def test_integers_are_held_to_what_they_were():
+    places = torch.tensor([2, 0])
+    kernel = NumberKernel(trace(lambda i, x, y: (x[:, i] * y[:, :2],), (places, *pair())), (places, *pair()))
+    x, y = pair()
+    assert_close(kernel(places, x, y)[0], x[:, places] * y[:, :2])
+    with pytest.raises(ValueError, match="int64 as it was traced"):
+        kernel(places + 1, x, y)
+
+
+def test_memory_is_shared_by_what_is_not_alive_at_once():
+    def function(x, y):
+        for k in range(40):
+            x = torch.sin(x + k) @ y.mT @ y / 50
+        return (x,)
+
+    graph = trace(function, pair())
+    kernel = NumberKernel(graph, pair())
+    assert len(kernel._program._arena) < 40 * 35
+    assert_close(kernel(*pair())[0], function(*pair())[0], rtol=1e-9, atol=1e-9)
+
+
+def scan_of(steps=6):
+    """W, x ↦ x + Δt tanh(2W x) step by step, with what all steps share: the graphs, and arguments."""
+    generator = torch.Generator().manual_seed(1)
+    W, x0 = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in ((3, 3), (4, 3)))
+    t, dt = torch.arange(steps).double(), torch.linspace(0.1, 0.3, steps).double()
+    prepare = trace(lambda W: ((2 * W).mT, W.sum()), (W,))
+
+    def step(W, t, dt, x, double, total):
+        return x + dt * torch.tanh(x @ double), x * total, torch.stack([x.sum(-1) * t, x[:, 0]], -1)
+
+    return prepare, trace(step, (W, t[0], dt[0], x0, *prepare(W))), [W, t, dt, x0]
+
+
+def test_a_scan_computes_what_its_loop_does():
+    prepare, step, arguments = scan_of()
+    kernel = ScanKernel(prepare, step, arguments)
+    W, t, dt, x0 = arguments
+    for given in (arguments, [W / 3, t + 1, dt / 2, 1 - x0]):
+        for found, expected in zip(kernel(*given), Scan(prepare, step, 1).loop(*given), strict=True):
+            assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    assert len(kernel._program._code[0]) > 0, "what all steps share is computed once"
+    one = ScanKernel(*scan_of(1))
+    assert_close(one(*scan_of(1)[2])[0], Scan(*scan_of(1)[:2], 1).loop(*scan_of(1)[2])[0])
+
+
+TASK = {
+    "experiment": "closed_loop",
+    "system": {"name": "pendulum"},
+    "cost": {"Q": [1, 0.1], "R": [0.1], "Q_T": [5, 1]},
+    "controls": {"lower": -2, "upper": 2},
+    "initial_states": {"lower": [-1, -1], "upper": [1, 1]},
+    "horizon": {"steps": 30, "dt": 0.05},
+    "program": {"name": "value"},
+    "network": {"name": "fcn", "hidden": [8, 8]},
+    "rollout": {"gradient": "discrete"},
+    "training": {"iterations": 1, "batch_size": 3},
+    "evaluation": {"validation_states": 2, "test_states": 2, "animate": False},
+}
+
+
+def rollout_of(*overrides):
+    problem, _, _, rollout = objects(config_from_plain(TASK, overrides))
+    return rollout, problem
+
+
+def gradient_of(rollout, x0):
+    rollout.zero_grad()
+    trajectory = rollout(x0)
+    (trajectory.cost.mean() + trajectory.value[0].mean()).backward()
+    return [p.grad.clone() for p in rollout.parameters() if p.grad is not None]
+
+
+@pytest.mark.parametrize("law", ["sampled", "hjb", "lookahead"])
+def test_closed_loops_and_their_gradient(law):
+    rollout, problem = rollout_of(f"rollout.policy={law}")
+    x0 = problem.initial_states.sample(12)
+    others = problem.initial_states.sample(31)
+    written, plain = gradient_of(rollout, x0), rollout(others)
+    assert rollout.discrete is not None
+    rollout.discrete.compile(x0)
+    again = gradient_of(rollout, x0)
+    scale = max(float(g.abs().max()) for g in written)
+    assert max(float((a - b).abs().max()) for a, b in zip(again, written, strict=True)) < 1e-8 * scale
+    with torch.no_grad():
+        assert_close(rollout(others).x, plain.x, rtol=1e-9, atol=1e-9)
+        for parameter in rollout.parameters():
+            parameter.mul_(1.1)
+        assert float((rollout(others).x - plain.x).abs().max()) > 1e-6, "the twin: weights are read at each call"
+
+
+class Sorting(FCN):
+    """A network with an operation that the kernel does not have."""
+
+    def forward(self, t, x):
+        return super().forward(t, x.sort(-1).values)
+
+    value_and_state_gradient = ValueFunction.value_and_state_gradient
+
+
+def test_a_run_whose_loop_has_an_operation_without_a_rule_says_which_and_goes_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(NETWORKS, "fcn", Sorting)
+    monkeypatch.setattr("lyapnet.training.figure_logger.figures_of", lambda learner: {})
+    run = lyapnet.train({**TASK, "logs": str(tmp_path)})
+    said = capsys.readouterr().out
+    assert said.count("Expected operations that the kernel has, got aten.sort.default; running without") == 1
+    assert run.best.is_file()
+    assert run.compiled is False

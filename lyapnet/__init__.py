@@ -12,7 +12,7 @@ except PackageNotFoundError:  # a source tree that was never installed
 if TYPE_CHECKING:
     from lyapnet.calculus import ValueFunction
     from lyapnet.constraints import AllOf, Ball, Constraints, StateLimits
-    from lyapnet.controller import Controller
+    from lyapnet.controller import ArrayTrajectory, Controller
     from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
     from lyapnet.errors import LyapnetError
     from lyapnet.horizon import Horizon
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "calculus": ["ValueFunction"],
     "constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
-    "controller": ["Controller"],
+    "controller": ["ArrayTrajectory", "Controller"],
     "cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
     "errors": ["LyapnetError"],
     "interpolation": ["Table"],
@@ -55,6 +55,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
 __all__ = [
     "SYSTEMS",
     "AllOf",
+    "ArrayTrajectory",
     "Ball",
     "Box",
     "Constraints",

@@ -3,7 +3,7 @@
 import inspect
 import logging
 from collections.abc import Callable, Mapping
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -38,6 +38,31 @@ def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str
         return {}
     bound.apply_defaults()
     return dict(bound.arguments)
+
+
+class ArrayTrajectory(NamedTuple):
+    """A batch of closed-loop trajectories as NumPy arrays, with the fields of a Trajectory."""
+
+    t: np.ndarray  # (N + 1,)
+    x: np.ndarray  # (N + 1, *batch, n)
+    u: np.ndarray  # (N, *batch, m)
+    running_cost: np.ndarray  # (N + 1, *batch): ∫ℓ up to t_n
+    terminal_cost: np.ndarray  # (*batch,): φ(x_N)
+    value: np.ndarray  # (N + 1, *batch): V(t_n, x_n)
+
+    def require_value(self) -> np.ndarray:
+        """V along the trajectory."""
+        return self.value
+
+    @property
+    def cost(self) -> Any:  # an array, or of a single state a number of NumPy's
+        """J_N = running cost plus terminal cost, (*batch,)."""
+        return self.running_cost[-1] + self.terminal_cost
+
+    @property
+    def step_cost(self) -> np.ndarray:
+        """∫ℓ over each step, (N, *batch)."""
+        return self.running_cost[1:] - self.running_cost[:-1]
 
 
 class Controller:
@@ -231,8 +256,12 @@ class Controller:
         """
         return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, self._parts)
 
-    def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Trajectory:
-        """The closed loop from x₀ (*batch, n); a Trajectory of what x₀ is, tensors or arrays.
+    @overload
+    def rollout(self, x0: Tensor, steps: int | None = None, **parameters: float) -> Trajectory: ...
+    @overload
+    def rollout(self, x0: ArrayLike, steps: int | None = None, **parameters: float) -> ArrayTrajectory: ...
+    def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Any:
+        """The closed loop from x₀ (*batch, n): a Trajectory of tensors, an ArrayTrajectory of arrays and lists.
 
         Args:
             steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state; after
@@ -253,7 +282,7 @@ class Controller:
                 trajectory = self._cut(trajectory, steps)
             elif steps is not None and steps > self.horizon.steps:
                 trajectory = self._prolonged(trajectory, steps - self.horizon.steps)
-        return Trajectory(*(_like(x0, field) for field in trajectory))
+        return trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_like(x0, field) for field in trajectory))
 
     def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
         """The first steps of a trajectory."""

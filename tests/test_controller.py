@@ -126,7 +126,7 @@ def test_batch_equals_loop(controller):
 
 
 def fields(trajectory):
-    return [*trajectory, trajectory.cost, trajectory.step_cost]
+    return [*trajectory, trajectory.require_value(), trajectory.cost, trajectory.step_cost]
 
 
 def test_tensors_in_tensors_out(controller):
@@ -152,6 +152,8 @@ def test_arrays_and_lists_in_arrays_out(x, controller):
         (controller.policy(np.array(0.05), x), controller.policy(0.05, tensor)),
         *zip(fields(controller.rollout(x)), fields(controller.rollout(tensor)), strict=True),
     ]
+    assert isinstance(controller.rollout(x), lyapnet.ArrayTrajectory)
+    assert isinstance(controller.rollout(tensor), lyapnet.Trajectory)
     for array, expected in pairs:
         assert isinstance(array, np.ndarray | np.generic)
         np.testing.assert_allclose(array, expected.numpy(), rtol=1e-6)

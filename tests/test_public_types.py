@@ -92,7 +92,8 @@ folder: Path = run.folder
 controller = lyapnet.load(run.best, system=Pendulum(0.5), beyond="hold")
 u: np.ndarray = controller.policy(0.0, [0.8, -0.3])
 value: Tensor = controller.value(0.0, torch.zeros(2))
-trajectory: lyapnet.Trajectory = controller.rollout([0.8, -0.3], steps=50)
+angles: np.ndarray = controller.rollout([0.8, -0.3], steps=50).x[..., 0]
+trajectory: lyapnet.Trajectory = controller.rollout(torch.tensor([0.8, -0.3]), steps=50)
 paid: Tensor = controller.closed_loop.cost.running(trajectory.x[:-1], trajectory.u)
 """
 WRONG = SCRIPT.replace("dt=0.01", 'dt="0.01"')

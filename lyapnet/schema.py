@@ -77,14 +77,21 @@ def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
             f"Expected a config file, got {str(path)!r} ({error.strerror or error}); see conf/."
         ) from error
     except (yaml.YAMLError, UnicodeDecodeError, OmegaConfBaseException, ValueError, RecursionError) as error:
-        reason = one_line(error)
-        raise UsageError(f"Expected YAML in {str(path)!r}, got {reason}; correct the file.") from error
+        raise UsageError(f"Expected YAML in {str(path)!r}, got {_yaml_reason(error)}; correct the file.") from error
     sections = [f.name for f in dataclasses.fields(schema)]
     if not isinstance(content, Mapping) or not any(name in content for name in sections):
         raise UsageError(
             f"Expected a config in {str(path)!r}, got none of its keys ({', '.join(sections)}); see conf/."
         )
     return {str(key): value for key, value in content.items()}
+
+
+def _yaml_reason(error: Exception) -> str:
+    """What is wrong with a text that is no YAML, and its line, once."""
+    if not isinstance(error, yaml.MarkedYAMLError) or error.problem is None or error.problem_mark is None:
+        return one_line(error)
+    mark, context = error.problem_mark, f" {error.context}" if error.context else ""
+    return f"in line {mark.line + 1}, column {mark.column + 1}: {one_line(f'{error.problem}{context}')}"
 
 
 Schema = TypeVar("Schema")

@@ -52,6 +52,21 @@ def is_refused(outcome, *named):
     assert not made_a_folder, "refused only after the folder of the run was made"
 
 
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("horizon: {steps: 5\ncost: 3", "column 5: did not find expected ',' or '}' while parsing a flow mapping"),
+        ("horizon: 3\n cost: 3", "column 6: mapping values are not allowed in this context"),
+    ],
+)
+def test_what_is_no_yaml_is_said_with_its_line_once(text, reason, tmp_path):
+    path = tmp_path / "broken.yaml"
+    path.write_text(text)
+    with pytest.raises(UsageError) as raised:
+        load_config(path)
+    assert str(raised.value) == f"Expected YAML in {str(path)!r}, got in line 2, {reason}; correct the file."
+
+
 @pytest.fixture
 def plain():
     return yaml.safe_load(PLAIN)

@@ -473,3 +473,16 @@ def test_what_is_not_malformed_is_accepted(tmp_path, capsys):
         got = answer(Malformed(["train", "--config", "experiment.yaml"], given, ""), tmp_path / section, capsys)
         assert (got.status, got.lines) == (0, [])
         assert "logs/small/version_0/evaluation.json" in got.left
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("trian", "Expected a command of lyapnet, got 'trian'; did you mean 'train', 'trim'?"),
+        ("qqq", "Expected a command of lyapnet, got 'qqq'; see lyapnet --help."),
+        ("zoo -x", "Expected options of lyapnet zoo, got: No such option: -x; see lyapnet zoo --help."),
+    ],
+)
+def test_a_command_line_that_is_misspelt_is_told_so(line, said, capsys):
+    assert main(line.split()) == 2
+    assert capsys.readouterr().err == f"error: {said}\n"

@@ -4,6 +4,7 @@ A command imports what it needs when it runs: help and misspelt options are answ
 """
 
 import os
+import re
 import signal
 import sys
 from contextlib import suppress
@@ -92,10 +93,10 @@ def _explain(error: Any) -> tuple[str, int]:
     if isinstance(error, typer.TyperException):
         context = getattr(error, "ctx", None)
         command, got = getattr(context, "command_path", "lyapnet"), " ".join(error.format_message().split())
-        return (
-            f"error: Expected options as {command} --help has them, got: {got.rstrip('.')}; see there.",
-            error.exit_code,
-        )
+        if unknown := re.fullmatch(r"No such command ('.*?')\.(?: Did you mean (.*)\?)?", got):
+            hint = f"did you mean {unknown[2]}?" if unknown[2] else f"see {command} --help."
+            return f"error: Expected a command of {command}, got {unknown[1]}; {hint}", error.exit_code
+        return f"error: Expected options of {command}, got: {got.rstrip('.')}; see {command} --help.", error.exit_code
     if isinstance(error, SystemExit):
         return f"error: Expected code of your own that returns, got {raised(error)}; take that out.", 1
     if isinstance(error, OSError):

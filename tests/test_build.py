@@ -9,6 +9,7 @@ import yaml
 from torch.testing import assert_close
 
 from lyapnet.build import resolve
+from lyapnet.build.named_parts import python_of
 from lyapnet.certification.preconditions import over_time
 from lyapnet.config import config_from_plain, load_config, to_plain
 from lyapnet.contracts import copied
@@ -319,3 +320,16 @@ def test_a_limit_on_one_side_means_the_same_to_the_law_its_bounds_and_the_oracle
 def test_bounds_without_meaning_are_refused(override, reason):
     with pytest.raises(UsageError, match=f"Expected .*{reason}"):
         untrained("double_integrator", override)
+
+
+def test_parts_of_the_users_own_as_python():
+    changes = {
+        "system": {"name": "hangar:Drone", "parameters": {"mass": 0.5, "names": ["a"]}},
+        "network": {"name": "hangar.nets:Small"},
+        "program": {"name": "hangar:Program", "constraint": 2, "parameters": {"power": 3}},
+    }
+    config = config_from_plain({**yaml.safe_load(PLAIN), **changes})
+    assert python_of(config, "system") == "hangar.Drone(mass=0.5, names=['a'])"
+    assert python_of(config, "network") == "hangar.nets.Small"
+    assert python_of(config, "program").startswith("hangar.Program(")
+    assert {"constraint=2.0", "power=3)"} <= {*python_of(config, "program").partition("(")[2].split(", ")}

@@ -192,7 +192,7 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
     assert "\n".join(shown) in report
 
 
-def test_a_system_of_your_own(workplace, monkeypatch):
+def test_a_system_of_your_own(workplace, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (40, 20))
     (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
@@ -209,6 +209,10 @@ def test_a_system_of_your_own(workplace, monkeypatch):
         path = "logs/pendulum/version_0/checkpoints/best.ckpt"
         controller = lyapnet.load(path, system=Pendulum(0.5))
         assert controller.policy(0.0, [0.3, 0.0]).shape == (1,)
+        names: dict = {}
+        (use,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("use ")]
+        exec(use.removeprefix("use ").strip(), names)  # the line that the training ends with
+        assert names["controller"].system.length == 0.5
         assert main(["evaluate", path, "--system", "pendulum:Pendulum", "--samples", "3"]) == 0
         assert main(["evaluate", path, "--samples", "3"]) == 2  # the system has to be passed
         compared = {job.method for job in jobs_of(load_comparison("compare_pendulum.yaml"))}

@@ -127,9 +127,7 @@ def build_program(config: Config) -> Program:
     Raises:
         UsageError: an option that the program does not have, or values that contradict each other.
     """
-    given = vars(config.program)
-    options = {key: value for key, value in given.items() if key not in ("name", "parameters") and value is not None}
-    cls = class_of(config, "program")
+    options, cls = program_options(config), class_of(config, "program")
     for name in options.keys() - inspect.signature(cls).parameters.keys():
         raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
     check_parameters(cls, config.program.name, config.program.parameters, "program")
@@ -137,6 +135,12 @@ def build_program(config: Config) -> Program:
         program = cls(**options, **config.program.parameters)
         program.check_terminal(exact=config.network.terminal == "exact")
         return program
+
+
+def program_options(config: Config) -> dict[str, Any]:
+    """The weights and further keys that a config gives its program, but for `parameters`."""
+    given = vars(config.program)
+    return {key: value for key, value in given.items() if key not in ("name", "parameters") and value is not None}
 
 
 def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:

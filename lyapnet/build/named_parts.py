@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from lyapnet.build.classes import Parts, class_of, instance_of, own_parts
-from lyapnet.build.learner import build_program
+from lyapnet.build.learner import build_program, program_options
 from lyapnet.build.problem import build_cost, build_system, refuse_two_sets
 from lyapnet.config import Config
 
@@ -34,3 +34,13 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
         "program": lambda: build_program(config),
     }
     return Parts(**{part: builders[part]() for part in names})
+
+
+def python_of(config: Config, part: str) -> str:
+    """The Python expression for a part of the user's own that a config names, its module being imported."""
+    options = getattr(config, part)
+    name = options.name.replace(":", ".")
+    if part == "network":  # lyapnet.load takes its class
+        return name
+    given = {**(program_options(config) if part == "program" else {}), **options.parameters}
+    return f"{name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"

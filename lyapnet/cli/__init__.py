@@ -71,7 +71,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _stop(number: int, frame: Any) -> None:
-    raise Interrupted(f"{signal.Signals(number).name}: stopped at once; what was saved before is kept.", 130)
+    raise Interrupted(f"{signal.Signals(number).name}: stopped at once.", 130)
 
 
 def _is_closed_output(error: BaseException) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 from rich.console import Console
 
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.errors import UsageError
+from lyapnet.errors import Interrupted, UsageError
 
 
 def train(
@@ -28,15 +29,17 @@ def train(
 
     outline(config, overrides or [])  # what is misspelt is refused before torch is imported
     console = Console(highlight=False, markup=False)
-    program = ["python", "train.py"] if Path("train.py").is_file() else ["lyapnet", "train"]
-    command = shlex.join([*program, "--config", str(config), *(overrides or [])])
-    with stages_of("train") as report:
-        report(f"importing torch and Lightning for {config}")
-        from lyapnet.training.experiment import fit  # takes seconds
-        from lyapnet.training.plan import plan_run
+    command = shlex.join([*_program(sys.argv[0]), "--config", str(config), *(overrides or [])])
+    try:
+        with stages_of("train") as report:
+            report(f"importing torch and Lightning for {config}")
+            from lyapnet.training.experiment import fit  # takes seconds
+            from lyapnet.training.plan import plan_run
 
-        report("checking f, g, the cost and V")
-        plan = plan_run(load_config(config, overrides or []), resume, finetune)
+            report("checking f, g, the cost and V")
+            plan = plan_run(load_config(config, overrides or []), resume, finetune)
+    except Interrupted as stop:
+        raise Interrupted(f"{stop} The training had not begun.", stop.exit_status) from None
     if plan.finished:
         console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
         return
@@ -45,8 +48,15 @@ def train(
         _print_result(console, plan, result, command)
 
 
+def _program(script: str) -> list[str]:
+    """What was typed in the place of `lyapnet train`, from the name of the script that runs."""
+    typed = {"train.py": ["python", script], "__main__.py": ["python", "-m", "lyapnet", "train"]}
+    return typed.get(Path(script).name, ["lyapnet", "train"])
+
+
 def _print_result(console: Console, plan: Any, result: dict[str, Any], command: str) -> None:
     from lyapnet.build import own_parts
+    from lyapnet.build.named_parts import python_of
     from lyapnet.evaluation.tables import evaluation_table, table_over_seeds
 
     title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
@@ -56,8 +66,10 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
     best, own = members[0].best, own_parts(plan.config)
     quoted = shlex.quote(str(best))
     options = "".join(f" --{part} {shlex.quote(name)}" for part, name in own.items())
-    kind = "statistical" if plan.module.members[0].problem.has_goal else "tube"
-    arguments = "".join(f", {part}=…" for part in own)
+    kind = _claim(plan.config) if plan.module.members[0].problem.has_goal else "tube"
+    modules = ", ".join(["lyapnet", *dict.fromkeys(name.partition(":")[0] for name in own.values())])
+    arguments = "".join(f", {part}={python_of(plan.config, part)}" for part in own)
+    path = json.dumps(str(best), ensure_ascii=False)
     for what, shown in (
         ("run", plan.run.folder),
         ("watch", shlex.join(["tensorboard", "--logdir", str(plan.config.logs)])),
@@ -66,6 +78,11 @@ def _print_result(console: Console, plan: Any, result: dict[str, Any], command: 
         ("certify", f"lyapnet certify {kind} {quoted}{options}"),
         ("export", f"lyapnet export {quoted}{options} --to c --out law"),
         ("fine-tune", f"{command} --finetune {quoted}"),
-        ("use", f"lyapnet.load({json.dumps(str(best), ensure_ascii=False)}{arguments})"),
+        ("use", f"import {modules}; controller = lyapnet.load({path}{arguments})"),
     ):
         console.print(f"{what:<10}{shown}", soft_wrap=True)
+
+
+def _claim(config: Any) -> str:
+    """The kind of claim that a training was made for: V that is trained on all of a set D as a bound can be proved."""
+    return "sound" if config.pointwise.region and config.program.name == "lyapunov" else "statistical"

@@ -112,7 +112,7 @@ class Checkpoints(Checkpoint):
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         if not self._begun:  # while it compiles, or seeks an optimum: there is nothing yet to be saved
-            raise Interrupted(f"{signal.Signals(number).name} before the first step: the run is as it was.", 130)
+            raise Interrupted(f"{signal.Signals(number).name} before the first step.", 130)
         if self._signal is not None:  # the second time, the user means now
             raise Interrupted("Stopped at once; the last checkpoint is from before this step.", exit_status=130)
         self._signal = number

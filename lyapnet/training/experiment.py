@@ -1,6 +1,5 @@
 """One experiment, from its config to the evaluation of what it trained."""
 
-import shlex
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -65,10 +64,11 @@ def train(
     """
     if isinstance(config, str | Path):
         resolved = load_config(config, overrides)
-        again = shlex.join(["python", "train.py", "--config", str(config), *overrides, "--resume", "last"])
+        changes = f", {[*overrides]!r}" if overrides else ""
+        again = f"lyapnet.train({str(config)!r}{changes}, resume='last')"
     else:
         content = to_plain(config) if isinstance(config, Config) else config
-        resolved, again = config_from_plain(content, overrides), 'lyapnet.train(…, resume="last")'
+        resolved, again = config_from_plain(content, overrides), "lyapnet.train(…, resume='last')"
     with default_of(resolved):
         plan = plan_run(resolved, resume, None if finetune is None else Path(finetune), parts)
         if not plan.finished:
@@ -83,13 +83,15 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
         again: the command that resumes the run.
 
     Raises:
-        Interrupted: Ctrl-C or SIGTERM, after saving.
+        Interrupted: Ctrl-C or SIGTERM, after saving; says how to go on.
         DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
         LyapnetError: a file of the run cannot be read or written.
     """
     with plan.lock or nullcontext(), quiet_writers():
         try:
-            return _fit(plan, console, again)
+            return _fit(plan, console)
+        except Interrupted as stop:
+            raise Interrupted(f"{stop} Continue with: {again}", stop.exit_status) from None
         except Exception as error:
             if plan.run.exists:
                 raise
@@ -99,7 +101,7 @@ def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
             ) from error
 
 
-def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
+def _fit(plan: Plan, console: Console) -> dict[str, Any]:
     config, run = plan.config, plan.run
     trainer = build_trainer(plan, console)
     if trainer.is_global_zero:
@@ -124,9 +126,6 @@ def _fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
             plan = _looking_ahead(plan, console, trainer.is_global_zero)
             trainer = build_trainer(plan, console)
         trainer = _train(plan, trainer, console, start)
-    except Interrupted as stop:
-        hint = f" Continue with: {again}" if stop.exit_status == 0 else ""
-        raise Interrupted(f"{stop}{hint}", stop.exit_status) from None
     except DivergenceError as error:
         kept = f" Kept: {run.last}." if run.last.exists() else ""
         raise DivergenceError(f"{error}{kept}") from error

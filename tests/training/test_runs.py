@@ -1,6 +1,5 @@
 """Training as a user meets it: killed, interrupted, resumed, fine-tuned, failed, and what it shows meanwhile."""
 
-import ast
 import csv
 import ctypes
 import errno
@@ -48,6 +47,7 @@ from lyapnet.training.runs import new_run
 from tests.runs import (
     MEASURED_TIME,
     SMALL,
+    TINY,
     Desk,
     both,
     checkpoint,
@@ -134,7 +134,7 @@ def test_run_tells_where_it_is_and_what_comes_next(reference):
     for text in (f"step {STEPS}/{STEPS}", "cost / optimum", "logs/small/version_0", "tensorboard --logdir logs"):
         assert text in output
     assert "resuming" not in output
-    for command in ("lyapnet evaluate", "--finetune", 'lyapnet.load("'):
+    for command in ("lyapnet evaluate", "--finetune", 'import lyapnet; controller = lyapnet.load("'):
         assert command in output
 
 
@@ -147,7 +147,16 @@ def test_the_commands_that_come_next_can_be_pasted(tmp_path, monkeypatch, capsys
     assert shlex.split(shown["certify"]) == ["lyapnet", "certify", "statistical", str(best)]
     assert shlex.split(shown["export"])[:3] == ["lyapnet", "export", str(best)]
     assert shlex.split(shown["fine-tune"])[-2:] == ["--finetune", str(best)]
-    assert ast.literal_eval(shown["use"].removeprefix("lyapnet.load")) == str(best)
+    names: dict = {}
+    exec(shown["use"], names)
+    assert names["controller"].horizon.steps == 8
+
+
+def test_the_claim_that_comes_next_is_that_which_v_was_trained_for(tmp_path, capsys):
+    changes = {"pointwise": {"weight": 1, "points": 8, "region": [2.0, 2.0]}, "logs": str(tmp_path / "logs")}
+    Desk(tmp_path, **changes)
+    assert main(["train", "--config", str(tmp_path / "experiment.yaml"), *TINY]) == 0
+    assert "certify   lyapnet certify sound " in capsys.readouterr().out
 
 
 def test_folder_of_a_run(reference):
@@ -335,6 +344,36 @@ def test_interrupted_a_run_saves_and_goes_on_to_the_same_end(number, desk, refer
     seconds = list(values(desk.run, "training_seconds").values())
     assert seconds == sorted(seconds), "what the interrupted process took counts"
     assert seconds[-1] > seconds[0] == 0
+
+
+@pytest.mark.parametrize("script", ["lyapnet", "train.py"])
+def test_stopped_while_its_start_is_sought_a_run_says_how_to_go_on(script, tmp_path, monkeypatch, capsys):
+    def stops(*_):
+        signal.raise_signal(signal.SIGINT)
+
+    Desk(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [script])
+    with monkeypatch.context() as patch:
+        patch.setattr("lyapnet.training.experiment.kept_or_chosen", stops)
+        assert main(["train", "--config", "experiment.yaml", *TINY]) == 130
+    said, command, again = capsys.readouterr().err.splitlines()[-1].partition(" Continue with: ")
+    assert said == "SIGINT: stopped at once."
+    assert command
+    typed = ["python", "train.py"] if script == "train.py" else ["lyapnet", "train"]
+    assert shlex.split(again) == [*typed, "--config", "experiment.yaml", *TINY, "--resume", "last"]
+    assert main(["train", *shlex.split(again)[2:]]) == 0
+    assert "training starts anew from step 0" in capsys.readouterr().out
+    assert [path.name for path in (tmp_path / "logs/small").iterdir()] == ["version_0"]
+
+
+def test_stopped_before_it_has_a_folder_a_training_says_that_it_had_not_begun(tmp_path, monkeypatch, capsys):
+    Desk(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lyapnet.training.plan.plan_run", lambda *_: signal.raise_signal(signal.SIGINT))
+    assert main(["train", "--config", "experiment.yaml"]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "SIGINT: stopped at once. The training had not begun."
+    assert not (tmp_path / "logs").exists()
 
 
 @pytest.mark.parametrize("moved", [False, True])

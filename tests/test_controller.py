@@ -217,7 +217,7 @@ def test_evaluation_has_the_designed_keys(controller):
     errors, corner = result.pop("terminal_errors"), result.pop("worst_corner")
     assert corner.keys() == {"count", "x0", "cost", "value"}
     assert errors.keys() == {"position (m)", "velocity (m/s)"}
-    assert result["optimum_of"] == "steps of 0.01 s (euler), u held"
+    assert result["optimum_of"] == "steps of 0.01 s (euler) with u held"
     assert result["after_T"] in LAWS
     numbers = [value for key, value in result.items() if key not in ("optimum_of", "after_T")]
     assert all(isinstance(value, int | float) for value in (*numbers, *errors.values()))

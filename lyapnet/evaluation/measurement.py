@@ -184,7 +184,7 @@ def evaluation(
     except OracleError as reason:
         return Evaluation(first, paper, [str(reason)] * samples, *further)
     exact = isinstance(oracle, RiccatiOracle) and controller.method != "euler"
-    about = "continuous time" if exact else f"steps of {problem.horizon.dt:g} s ({controller.method}), u held"
+    about = "continuous time" if exact else f"steps of {problem.horizon.dt:g} s ({controller.method}) with u held"
     return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, *further, about)
 
 

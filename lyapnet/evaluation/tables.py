@@ -95,14 +95,14 @@ def _entry(key: str, value: float | None) -> str:
 
 
 def _caption(results: list[dict[str, Any]]) -> Text | None:
-    """What the optimum is of, and why some is missing."""
+    """What the optimum is of, and why some is missing: a sentence for each."""
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
-        notes = {f"optimum: of {about}": None, **notes}
+        notes = {f"The optimum is that of {about}": None, **notes}
     if any((result.get("held_cost_ratio") or 1) < 1 for result in results):
-        notes["continuous time below 1: the steps overstate what is paid"] = None
-    notes |= {f"after T: {result['after_T']}": None for result in results if "after_T" in result}
-    caption = "; ".join(note.rstrip(".") for note in notes)
+        notes["A plant in continuous time may pay less than that optimum: the steps overstate the cost"] = None
+    notes |= {f"After T follows the law {result['after_T']}": None for result in results if "after_T" in result}
+    caption = " ".join(f"{note.rstrip('.')}." for note in notes)
     return Text(caption) if notes else None  # Text: a plain string's [oracle] would be read as markup
 
 

@@ -21,6 +21,7 @@ class Candidate(NamedTuple):
     seconds: float  # from when starts began to be sought until it was rolled out
     missing: Missing | None = None  # why there is nothing to try
     note: str = ""  # what was done to have it
+    kept: bool = False  # by an earlier search, whose seconds these are
 
 
 class Start(NamedTuple):
@@ -59,7 +60,8 @@ class Start(NamedTuple):
         finite = "" if self.chosen.finite == 1 else f", {format_cost(self.chosen)} of X₀"
         tried = sum(each.missing is None for each in self.candidates)
         said = f"start: {self.chosen.name}, the cheapest of {tried}{finite}" + (others and f" ({others})")
-        return "; ".join([said, *(f"{each.name}: {each.note}" for each in self.candidates if each.note)])
+        earlier = ["found by an earlier search"] if self.chosen.kept else []
+        return "; ".join([said, *(f"{each.name}: {each.note}" for each in self.candidates if each.note), *earlier])
 
     def _beside(self, other: Candidate) -> str:
         """What is said of a candidate that was not chosen: a ratio, as other states than these are told costs of."""

@@ -32,7 +32,7 @@ from lyapnet.training.fact import Fact, listed
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import REMEDY, SMALLER
+from lyapnet.training.start import REMEDY, SMALLER, STATES
 from lyapnet.training.start_cache import kept_or_chosen
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
@@ -155,8 +155,10 @@ def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:
         if any(reason in fact.found for fact in told):
             return Fact("start", f"{found}, for the reason above")
         return Fact("start", f"{found}: {reason}", remedy)
-    cost = f"mean cost {candidate.cost:.5g}" if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
-    return Fact("start", f"from {candidate.name}: {cost}, known after {_seconds(candidate.seconds)} s")
+    mean = f"mean cost from {STATES} states of X₀ {candidate.cost:.5g}"
+    cost = mean if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
+    earlier = " of an earlier search" if candidate.kept else ""
+    return Fact("start", f"from {candidate.name}: {cost}, known after {_seconds(candidate.seconds)} s{earlier}")
 
 
 def _task(problem: Problem) -> Fact:

@@ -9,6 +9,7 @@ from lightning.pytorch.callbacks import ProgressBar
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column
 
+from lyapnet.evaluation.states import StateTable
 from lyapnet.training.curves import members_of
 from lyapnet.training.stages import Stages
 
@@ -90,8 +91,8 @@ class TrainingProgress(ProgressBar):
         members = members_of(pl_module)
         tables = [member.validation for member in members]
         if not self._named:
-            self._named, states = True, sum(len(table.cost) for table in tables if table is not None)
-            self._console.print(f"below: means over {states} validation states, the same at every step", soft_wrap=True)
+            self._named = True
+            self._console.print(about_means([table for table in tables if table is not None]), soft_wrap=True)
         summaries = [table.summary() for table in tables if table is not None]
         measures = [f"{name} {text}" for name, key, form in VALIDATED if (text := mean_and_range(summaries, key, form))]
         shares = [float(member.region_share) for member in members if member.region_share is not None]
@@ -110,6 +111,16 @@ class TrainingProgress(ProgressBar):
             self._progress.stop()
             self._progress = None
         self._stages.__exit__()
+
+
+def about_means(tables: Sequence[StateTable]) -> str:
+    """Over which states the means of validations are."""
+    states = sum(len(table.cost) for table in tables)
+    optima = [table.optimal_cost for table in tables if table.optimal_cost is not None]
+    known = sum(int(optimum.isfinite().sum()) for optimum in optima)
+    measure = "cost/optimum" if tables[0].has_goal else "regret"
+    fewer = f"; {measure} over the {known} of them whose optimum is known" if 0 < known < states else ""
+    return f"below: means over {states} validation states, the same at every step{fewer}"
 
 
 def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:

@@ -111,7 +111,7 @@ def _plain(start: Start) -> dict[str, Any]:
 
 def _start_from(plain: dict[str, Any]) -> Start:
     candidates = [
-        Candidate(name, cost, finite, seconds, missing and Missing(*missing), note)
+        Candidate(name, cost, finite, seconds, missing and Missing(*missing), note, kept=True)
         for name, cost, finite, seconds, missing, note in plain["candidates"]
     ]
     return Start(candidates[plain["chosen"]], candidates, *plain["rest"])
@@ -123,7 +123,7 @@ def kept_or_chosen(
     """`choose_start`, or what it chose before for the same task, networks and law."""
     if not has_place_for_start(learners):
         return None
-    report("the start of an earlier search")
+    report("looking for the start of an earlier search")
     cache = StartCache(learners)
     start = cache.read()
     if start is not None:

@@ -65,6 +65,7 @@ def test_a_rise_is_in_the_summary_and_the_table():
     lines = shown.getvalue().splitlines()
     rows = [line for line in lines if line.startswith("│")]
     assert all(row.split("│")[1].strip() for row in rows), "no row is broken at 80 columns"
+    assert "The optimum is that of steps of 0.05 s (euler) with u held." in " ".join(shown.getvalue().split())
     for label in ("in continuous time, u held for Δt: cost / optimum", "LQR, without training", "largest rise of V"):
         assert label in shown.getvalue()
 

@@ -16,6 +16,7 @@ from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import CheckpointError, DivergenceError, UsageError
+from lyapnet.evaluation.states import StateTable
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.rollout.discrete_adjoint import DiscreteAdjoint
 from lyapnet.sets import Box
@@ -24,7 +25,7 @@ from lyapnet.training import figure_logger
 from lyapnet.training.build import build_module
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.modules import ValueModule
-from lyapnet.training.progress import mean_and_range
+from lyapnet.training.progress import about_means, mean_and_range
 from tests.problems import problem_of
 from tests.runs import MEASURED_TIME, SMALL, Desk, differences, logged, values, without_figures
 
@@ -228,6 +229,19 @@ def test_a_measure_over_seeds():
     assert mean_and_range(summaries, "cost", ".2f") == "2.50 (1.00 – 4.00)"
     assert mean_and_range(summaries[:1], "cost", ".2f") == "1.00"
     assert mean_and_range(summaries, "ratio", ".2f") == ""
+
+
+def test_a_measure_that_fewer_states_have_says_how_many():
+    def table(optima, has_goal=True):
+        x, one = torch.ones(4, 2), torch.ones(4)
+        optimum = torch.tensor(optima)
+        return StateTable(x, one, one, optimum, one, one, one > 0, one > 0, one, x, one, has_goal=has_goal)
+
+    some, every = [1.0, 1.0, math.nan, math.nan], [1.0] * 4
+    said = "below: means over 8 validation states, the same at every step"
+    assert about_means([table(every)] * 2) == said
+    assert about_means([table(some)] * 2) == f"{said}; cost/optimum over the 4 of them whose optimum is known"
+    assert "; regret over the 2 of them" in about_means([table(some, has_goal=False)])
 
 
 # Interrupted, diverged, refused

@@ -11,6 +11,7 @@ from lyapnet.loading import load
 from lyapnet.training import start_cache
 from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints
+from lyapnet.training.facts import facts_of
 from lyapnet.training.start_cache import StartCache, kept_or_chosen
 
 TASK = {
@@ -48,10 +49,20 @@ def begun(*overrides):
 def test_the_same_task_begins_at_once_where_it_began(sought):
     (first, start), (again, kept) = begun(), begun()
     assert len(sought) == 1
-    assert str(kept) == str(start)
+    assert str(kept) == f"{start}; found by an earlier search"
     assert kept.as_json() == start.as_json()
     for one, other in zip(first[0].V.state_dict().values(), again[0].V.state_dict().values(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_facts_say_that_their_seconds_are_those_of_an_earlier_search():
+    def found():
+        (learner,) = build_module(config_from_plain(TASK)).members
+        return [fact.found for fact in facts_of(learner) if "known after" in fact.found]
+
+    first, again = found(), found()
+    assert sorted(again) == sorted(f"{line} of an earlier search" for line in first)
+    assert all("mean cost from 64 states of X₀ " in line for line in first)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,9 @@ import yaml
 
 import lyapnet
 from lyapnet.cli import main
+from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.training.experiment import train
+from tests.problems import untrained
 
 SEEN = set()
 
@@ -54,7 +56,7 @@ def test_commands_have_the_type_of_their_precision(tmp_path, capsys, plain_defau
     SEEN.clear()
     run = train(task)
     assert SEEN - also == {torch.float64}, "the build and its checks are in float64"
-    for command in (["check", str(task), "--json"], ["trim", str(task), "--json"],
+    for command in (["train", "--config", str(task)], ["check", str(task), "--json"], ["trim", str(task), "--json"],
                     ["evaluate", str(run.best), "--system", TASK["system"]["name"], "--json"]):  # fmt: skip
         SEEN.clear()
         assert main(command) == 0
@@ -64,3 +66,10 @@ def test_commands_have_the_type_of_their_precision(tmp_path, capsys, plain_defau
     facts = {fact["fact"]: fact["found"] for line in told.splitlines() if line.startswith('{"experiment"')
              for fact in json.loads(line).get("facts", [])}  # fmt: skip
     assert facts["goal"].startswith("(0.37), an equilibrium at u = (0.081")
+
+
+def test_optima_of_many_free_controls_need_no_default(plain_default):
+    pytest.importorskip("casadi")
+    problem = untrained("quadrotor", "horizon.steps=4").problem
+    optima = oracle_of(problem).solve(problem.initial_states.sample(1))
+    assert optima.cost.isfinite().all()

@@ -33,17 +33,21 @@ def train(
     try:
         with stages_of("train") as report:
             report(f"importing torch and Lightning for {config}")
-            from lyapnet.training.experiment import fit  # takes seconds
+            from lyapnet.build import default_of  # takes seconds
+            from lyapnet.training.experiment import fit
             from lyapnet.training.plan import plan_run
 
             report("checking f, g, the cost and V")
-            plan = plan_run(load_config(config, overrides or []), resume, finetune)
+            resolved = load_config(config, overrides or [])
+            with default_of(resolved):
+                plan = plan_run(resolved, resume, finetune)
     except Interrupted as stop:
         raise Interrupted(f"{stop} The training had not begun.", stop.exit_status) from None
     if plan.finished:
         console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
         return
-    result = fit(plan, console, f"{command} --resume last")
+    with default_of(resolved):
+        result = fit(plan, console, f"{command} --resume last")
     if result:
         _print_result(console, plan, result, command)
 

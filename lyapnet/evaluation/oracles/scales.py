@@ -60,7 +60,7 @@ class Scales:
     def _limits(self) -> tuple[torch.Tensor, torch.Tensor]:
         limits = self.problem.controls.limits
         assert limits is not None
-        return limits
+        return limits[0].double(), limits[1].double()  # those of Unbounded have torch's default type
 
     def _of_controls(self, u: torch.Tensor) -> np.ndarray:
         """The width of U, or how far tried controls go where it has none."""

@@ -24,6 +24,8 @@ from lyapnet.sets import Box
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import State, Value
 
+MOST_NAMED = 4  # states beside those of a slice whose numbers fit into a line
+
 
 class Slice(NamedTuple):
     """A grid in X₀ over its widest components, the others at the centre."""
@@ -96,7 +98,10 @@ def _draw_plane_region(
         shading="nearest", rasterized=True,
     )  # fmt: skip
     contour = axes.contour(first, second, numpy_of(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
-    axes.clabel(contour, fontsize=7, fmt="%.3g")
+    axes.clabel(
+        contour, list(contour.levels)[::2], fontsize=7, fmt="%.3g"
+    )  # where X₀ is narrow, those of neighbours collide
+    axes.use_sticky_edges = False  # the sides of X₀ keep a margin from the frame
     i, j = region.axes
     corners = _spread(region)
     paths = numpy_of(trajectory.x[:, corners])
@@ -112,7 +117,7 @@ def _draw_plane_region(
     )
     axes.set_xlabel(system.state_labels[i])
     axes.set_ylabel(system.state_labels[j])
-    axes.set_title(_others_at_center(system, initial_states, region.axes), fontsize=7, loc="right", y=-0.16, color=GREY)
+    axes.set_title(_others_at_center(system, initial_states, region.axes), fontsize=7, loc="right", y=-0.2, color=GREY)
     handles: list[Artist] = [
         outline,
         Patch(color=levels[1], label="holds"),
@@ -270,8 +275,10 @@ def optimality(table: StateTable) -> Figure:
 
 
 def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Sequence[int]) -> str:
-    center = initial_states.center.tolist()
-    return ", ".join(f"{system.state_names[i]} = {center[i]:.3g}" for i in range(system.n) if i not in axes)
+    center, others = initial_states.center.tolist(), [i for i in range(system.n) if i not in axes]
+    if len(others) > MOST_NAMED:
+        return "the other states at the centre of X₀"
+    return ", ".join(f"{system.state_names[i]} = {center[i]:.3g}" for i in others)
 
 
 def _spread(region: Slice) -> list[int]:

@@ -150,6 +150,15 @@ function marks() {
   const through = facts.states.every((_, k) => [i, j].includes(k) || between(chosen.x, k));
   const ends = (k) => (k === TIME ? [0, 0] : [lower[k], upper[k]]);
   const [[left, right], [bottom, top]] = [ends(i), ends(j)];
+  if (through && i !== TIME) { // the map pales outside of X0
+    const [across, up] = [axis(i), axis(j)];
+    found.push({
+      x: [across.low, across.high, across.high, across.low, across.low, left, left, right, right, left, across.low],
+      y: [up.low, up.low, up.high, up.high, up.low, bottom, top, top, bottom, bottom, up.low],
+      mode: "lines", line: { width: 0 }, fill: "toself", fillcolor: "rgba(255,255,255,0.5)", hoverinfo: "skip",
+      showlegend: false,
+    });
+  }
   found.push({
     x: [left, right, right, left, left], y: [bottom, bottom, top, top, bottom], mode: "lines", hoverinfo: "skip",
     name: through ? "X₀" : "X₀, projected", line: { color: "#000000", width: 2, dash: through ? "solid" : "dot" },

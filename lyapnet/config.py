@@ -194,9 +194,7 @@ class RolloutConfig:
     )
     method: str = option("euler", "The integrator.", choices=METHODS)
     gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
-    compile: str = option(
-        "auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH
-    )
+    compile: str = option("auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH)
     costate_limit: float | None = option(
         None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", at_least=1
     )

@@ -176,7 +176,7 @@ def test_known_controls_that_cost_less_than_every_minimum_refute_it():
     path, J = oracle.rollout(x0, zero)
     worse = {tuple(x.tolist()): Candidate(path[1:, i].numpy(), zero[:, i].numpy(), float(J[i]))
              for i, x in enumerate(x0)}  # fmt: skip
-    oracle.minimise = lambda x, start: worse[tuple(x.tolist())]
+    oracle.minimise = lambda x, start, briefly: worse[tuple(x.tolist())]
     assert oracle.solve(x0, known=best.u).failures == 2
     assert "known controls cost less" in oracle.solve(x0, known=best.u).reasons[0]
 
@@ -184,7 +184,7 @@ def test_known_controls_that_cost_less_than_every_minimum_refute_it():
 def test_minima_spread_to_the_states_around():
     """Two basins, costs 1 and 2; only the first state has a start in the better one."""
 
-    def minimise(x0, start):
+    def minimise(x0, start, briefly):
         basin = float(start.u[0, 0])
         return Candidate(start.x, start.u, 1 + basin)
 
@@ -200,7 +200,7 @@ def test_minima_spread_to_the_states_around():
 def test_the_first_failures_in_a_row_spare_the_others(solvable):
     tried = []
 
-    def minimise(x0, start):
+    def minimise(x0, start, briefly):
         tried.append(int(x0[0]))
         return Candidate(start.x, start.u, 1.0) if x0[0] == solvable else "none"
 

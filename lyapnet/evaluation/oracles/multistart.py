@@ -34,19 +34,20 @@ class MultiStart:
     """The best candidate of each initial state, improved start by start.
 
     Which local minimum a start leads to is luck, but the least cost is continuous in x₀: what was found from one state
-    is tried from the states around it, and from theirs, as long as that improves any.
+    is the first start of those after it that are near, and is tried from the states around it, and from theirs, as long
+    as that improves any.
 
     Args:
         x0: (b, n).
         best: what is known already, one entry for each state.
-        minimise: (x₀, start) ↦ the local minimum, or why there is none.
+        minimise: (x₀, start, briefly) ↦ the local minimum, or why there is none; briefly where one is known already.
     """
 
     def __init__(
         self,
         x0: np.ndarray,
         best: Sequence[Candidate | None],
-        minimise: Callable[[np.ndarray, Candidate], Candidate | str],
+        minimise: Callable[[np.ndarray, Candidate, bool], Candidate | str],
     ):
         self.x0, self.best, self.minimise = x0, list(best), minimise
         self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
@@ -59,7 +60,9 @@ class MultiStart:
             if failures == HOPELESS:
                 self.reasons[i] = self.reasons[i] or f"{last}, from {HOPELESS} states in a row; this one was not tried"
                 continue
-            began = time.monotonic()
+            began, solved = time.monotonic(), [j for j in starts if j < i and self.best[j] is not None]
+            if solved:  # the optimum of the nearest of them, from where IPOPT most often has the shortest way
+                self._try(i, self.best[solved[int(self._distances(i)[solved].argmin())]])
             for start in own:
                 self._try(i, start)
                 if time.monotonic() - began > SECONDS:
@@ -82,7 +85,7 @@ class MultiStart:
         """Whether a start improves a state's best."""
         if start is None:
             return False
-        end = self.minimise(self.x0[i], start)
+        end = self.minimise(self.x0[i], start, self.best[i] is not None)
         if isinstance(end, str):
             self.reasons[i] = end
             return False
@@ -91,9 +94,13 @@ class MultiStart:
             self.best[i] = end
         return improved
 
-    def _nearest(self, i: int) -> list[int]:
-        """The nearest other states, nearest first, each component measured against its spread in the batch."""
+    def _distances(self, i: int) -> np.ndarray:
+        """Squared distances from a state to all, each component measured against its spread in the batch."""
         spread = np.ptp(self.x0, axis=0)
-        distance = (((self.x0 - self.x0[i]) / np.where(spread > 0, spread, 1)) ** 2).sum(1)
+        return (((self.x0 - self.x0[i]) / np.where(spread > 0, spread, 1)) ** 2).sum(1)
+
+    def _nearest(self, i: int) -> list[int]:
+        """The nearest other states, nearest first."""
+        distance = self._distances(i)
         distance[i] = np.inf
         return [int(j) for j in np.argsort(distance, kind="stable")[: min(NEIGHBOURS, len(distance) - 1)]]

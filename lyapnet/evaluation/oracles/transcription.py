@@ -31,6 +31,7 @@ BESIDE = 1e-8  # of the extents: how far from x₀ a path may begin, for a cost 
 INVALID = "IPOPT: Invalid_Number_Detected"
 WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
+BRIEF = 150  # iterations of further starts, where one has led to a minimum
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
 
 
@@ -68,7 +69,10 @@ class Transcription(Oracle):
         limits = self.problem.controls.limits
         domain = self.problem.domain
         bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
-        self._solver = _solver(self.task, horizon.steps, iterations, bounded)
+        # two that differ in their iterations alone, as CasADi has no such parameter
+        self._solver, self._brief_solver = (
+            _solver(self.task, horizon.steps, most, bounded) for most in (iterations, min(iterations, BRIEF))
+        )
         self._scales = Scales(self.problem)
         assert limits is not None  # oracle_of asks before
         free = torch.full((system.n,), torch.inf)
@@ -172,22 +176,27 @@ class Transcription(Oracle):
         self._stopped = True
         raise Interrupted("Stopped while seeking optima; those of earlier evaluations are kept.", 130)
 
-    def minimise(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
-        """The local minimum that IPOPT finds from a start, or its reason for none."""
-        found = self._minimum(x0, start)
+    def minimise(self, x0: np.ndarray, start: Candidate, briefly: bool = False) -> Candidate | str:
+        """The local minimum that IPOPT finds from a start, or its reason for none.
+
+        Args:
+            briefly: in at most BRIEF iterations, as most minima take 20 to 80.
+        """
+        solver = self._brief_solver if briefly else self._solver
+        found = self._minimum(x0, start, solver)
         if found == INVALID:  # where slopes do not exist at x₀ itself, as those of |v| at rest
-            found = self._minimum(x0 + BESIDE * self._scales.of_states, start)
+            found = self._minimum(x0 + BESIDE * self._scales.of_states, start, solver)
         return found
 
-    def _minimum(self, x0: np.ndarray, start: Candidate) -> Candidate | str:
+    def _minimum(self, x0: np.ndarray, start: Candidate, solver: casadi.Function) -> Candidate | str:
         lower, upper = self._bounds
         of_x, of_u, scale = self._scales.of_states, self._scales.of_controls, self._scales.of_cost(x0)
         guess = np.concatenate([(start.u / of_u).ravel(), (start.x / of_x).ravel()])
         given = np.concatenate([x0, [scale], of_x, of_u])
         least, greatest = self._held
         with redirect_stderr(StringIO()):  # CasADi warns of what ends it; it goes on as a reason, or as what was raised
-            result = self._solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
-        status = self._solver.stats()["return_status"]
+            result = solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
+        status = solver.stats()["return_status"]
         if self._stopped:
             self._stop()
         if status not in CONVERGED:
@@ -242,8 +251,9 @@ def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> cas
     variables, zero = casadi.veccat(scaled_u, scaled_x), casadi.vec(casadi.diag(1 / of_x) @ (following - x))
     held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
     problem = {"x": variables, "p": casadi.vertcat(x0, scale, of_x, of_u), "f": J / scale, "g": held}
-    # within the limits themselves, and with a barrier of which nothing is seen in J
-    exact = {"ipopt.bound_relax_factor": 0.0, "ipopt.tol": 1e-10} if limited else {}
+    # so exact that an unstable system does not make another path of the controls; within the limits themselves, and with
+    # a barrier of which nothing is seen in J
+    exact = {"ipopt.tol": 1e-10, **({"ipopt.bound_relax_factor": 0.0} if limited else {})}
     # where rounding or a kink ends it before: a rollout confirms the cost, or nothing is found
     enough = {"tol": ACCEPTABLE, "constr_viol_tol": ACCEPTABLE, "compl_inf_tol": ACCEPTABLE, "dual_inf_tol": 1e-4}
     acceptable = {f"ipopt.acceptable_{name}": value for name, value in enough.items()}

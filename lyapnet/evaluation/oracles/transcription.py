@@ -251,8 +251,8 @@ def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> cas
     variables, zero = casadi.veccat(scaled_u, scaled_x), casadi.vec(casadi.diag(1 / of_x) @ (following - x))
     held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
     problem = {"x": variables, "p": casadi.vertcat(x0, scale, of_x, of_u), "f": J / scale, "g": held}
-    # so exact that an unstable system does not make another path of the controls; within the limits themselves, and with
-    # a barrier of which nothing is seen in J
+    # so exact that an unstable system does not make another path of the controls, nor the barrier another J; and within
+    # the limits themselves
     exact = {"ipopt.tol": 1e-10, **({"ipopt.bound_relax_factor": 0.0} if limited else {})}
     # where rounding or a kink ends it before: a rollout confirms the cost, or nothing is found
     enough = {"tol": ACCEPTABLE, "constr_viol_tol": ACCEPTABLE, "compl_inf_tol": ACCEPTABLE, "dual_inf_tol": 1e-4}

@@ -28,7 +28,7 @@ from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
-SMALL = {1: 48, 2: 192}  # in all, for tasks of one or two states, where they are close to one another so
+SMALL = {1: 48}  # in all, for tasks of one state, where they are close to one another so
 WAVES = 6  # random controls from which optima are sought where there is no expansion
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum

@@ -51,6 +51,7 @@ class MultiStart:
     ):
         self.x0, self.best, self.minimise = x0, list(best), minimise
         self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
+        self._tried = dict[tuple[int, int], Candidate]()  # by state and identity, as no start is tried twice
 
     def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
         """Try the starts of some states, given by their indices, then what that found from the states around."""
@@ -83,8 +84,9 @@ class MultiStart:
 
     def _try(self, i: int, start: Candidate | None) -> bool:
         """Whether a start improves a state's best."""
-        if start is None:
+        if start is None or (i, id(start)) in self._tried:
             return False
+        self._tried[i, id(start)] = start
         end = self.minimise(self.x0[i], start, self.best[i] is not None)
         if isinstance(end, str):
             self.reasons[i] = end

@@ -67,7 +67,7 @@ class TracedRoutines(NamedTuple):
             linearise = NumberKernel(self.linearise, self.block_arguments[:-1])
             with torch.no_grad():
                 intermediate = self.linearise(*self.block_arguments[:-1])[2:]
-            product = NumberKernel(self.product, [*self.block_arguments, *intermediate])
+            product = NumberKernel(self.product, [*self.block_arguments, *intermediate], handed=len(intermediate))
         except NotImplementedError as error:
             raise CompilationError(f"Expected operations that the kernel has, got {error}") from error
         return Routines(integrate, linearise, product, self.block)

@@ -1,6 +1,7 @@
 """Programs on numbers: each rule against torch, on tensors as they lie in memory; scans; what is refused."""
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -156,6 +157,31 @@ def test_integers_are_held_to_what_they_were():
         kernel(places + 1, x, y)
 
 
+def test_results_of_another_kernel_are_numbers_whatever_their_type():
+    first = trace(lambda x, y: (x.argmax(-1), x > y), pair())
+    second = trace(lambda y, place, truth: (y * truth + place[:, None],), (pair()[1], *first(*pair())))
+    handed = NumberKernel(second, (pair()[1], *first(*pair())), handed=2)
+    x, y = (-each for each in pair())
+    assert_close(handed(y, *NumberKernel(first, pair())(x, y))[0], y * (x > y) + x.argmax(-1)[:, None])
+
+
+def test_arguments_of_other_shapes_are_refused():
+    x, y = pair()
+    with pytest.raises(ValueError, match=r"Expected arguments \[\(5, 7\), \(5, 7\)\], got \[\(3, 7\)"):
+        NumberKernel(trace(lambda x, y: (x + y,), (x, y)), (x, y))(x[:3], y)
+    prepare, step, (W, t, dt, x0) = scan_of()
+    with pytest.raises(ValueError, match="Expected 6 steps, got 5"):
+        ScanKernel(prepare, step, (W, t, dt, x0))(W, t[:5], dt[:5], x0)
+
+
+def test_kernels_may_run_in_several_threads():
+    kernel = NumberKernel(trace(OPERATORS["mixed"], pair()), pair())
+    inputs = [(pair()[0] + k, pair()[1]) for k in range(200)]
+    with ThreadPoolExecutor(4) as pool:
+        for given, found in zip(inputs, pool.map(lambda given: kernel(*given), inputs), strict=True):
+            assert_close(found[0], OPERATORS["mixed"](*given)[0])
+
+
 def test_memory_is_shared_by_what_is_not_alive_at_once():
     def function(x, y):
         for k in range(40):
@@ -188,7 +214,7 @@ def test_a_scan_computes_what_its_loop_does():
     for given in (arguments, [W / 3, t + 1, dt / 2, 1 - x0]):
         for found, expected in zip(kernel(*given), Scan(prepare, step, 1).loop(*given), strict=True):
             assert_close(found, expected, rtol=1e-12, atol=1e-12)
-    assert len(kernel._program._code[0]) > 0, "what all steps share is computed once"
+    assert len(kernel._program.shared) > 0, "what all steps share is computed once"
     one = ScanKernel(*scan_of(1))
     assert_close(one(*scan_of(1)[2])[0], Scan(*scan_of(1)[:2], 1).loop(*scan_of(1)[2])[0])
 

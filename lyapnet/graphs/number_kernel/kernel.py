@@ -4,6 +4,7 @@ import ctypes
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,14 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
+from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.libraries import file_of_library, library_of
-from lyapnet.graphs.number_kernel.program import Instruction, Program
+from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
 from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
 
 SOURCE = Path(__file__).with_name("program.cpp")
+CHECKED = 2  # steps of a scan that are held against torch
 NAMES = {torch.float64: "float64", torch.float32: "float32"}
 
 
@@ -44,28 +47,28 @@ class NumberKernel:
     Args:
         graph: a trace.
         arguments: examples, on which the program is held against the graph.
+        handed: how many arguments, the last ones, are results of another kernel, and so numbers whatever their type.
 
     Raises:
         NotImplementedError: an operation has no rule; or the results are others.
         CompilationError: there is no machine code.
     """
 
-    def __init__(self, graph: GraphModule, arguments: Sequence[Tensor]):
-        self._program = _Assembled(arguments)
-        given = self._program.arguments(arguments, varying=len(arguments))
-        results = self._program.writer.write(graph, given)
-        program = self._program
+    def __init__(self, graph: GraphModule, arguments: Sequence[Tensor], handed: int = 0):
+        self._program = program = _Assembled(arguments, handed)
+        results = program.writer.write(graph, program.arguments(arguments, varying=len(arguments)))
         program.finish(results)
-        # what depends on constants alone is there from now on
-        program.function("run")(*program.first, program.tables, program.buffers(arguments, results))
+        program.run(program.shared, arguments, program.new_results())  # of constants alone: there from now on
         _require_same(self(*arguments), results)
 
     def __call__(self, *arguments: Tensor) -> list[Tensor]:
-        """The graph's results."""
-        program = self._program
-        results = program.new_results()
-        buffers = program.buffers(arguments, results)
-        program.function("run")(*program.every, program.tables, buffers)
+        """The graph's results.
+
+        Raises:
+            ValueError: arguments of other shapes, or other integers than in the examples.
+        """
+        results = self._program.new_results()
+        self._program.run(self._program.repeated, arguments, results)
         return results
 
 
@@ -84,117 +87,142 @@ class ScanKernel:
     def __init__(self, prepare: GraphModule, step: GraphModule, arguments: Sequence[Tensor]):
         *state, t, dt, x0 = arguments
         self._steps = len(t)
-        examples = [*state, t[0].clone(), dt[0].clone(), x0]
-        program = self._program = _Assembled(examples)
+        examples = [*state, t[0], dt[0], x0]
+        self._program = program = _Assembled(examples)
         *given, t0, dt0, x = program.arguments(examples, varying=3)
         shared = program.writer.write(prepare, given)
-        following, *kept = program.writer.write(step, [*given, t0, dt0, x, *shared])
-        program.finish([following, *kept])
+        program.finish(program.writer.write(step, [*given, t0, dt0, x, *shared]))
         with torch.no_grad():
-            following_of_torch, *kept_of_torch = step(*examples, *prepare(*state))
-        del following_of_torch
-        columns = self(*arguments)
-        _require_same([column[0] for column in columns], kept_of_torch)
+            expected = Scan(prepare, step, len(state)).loop(*state, t[:CHECKED], dt[:CHECKED], x0)
+        _require_same([column[:CHECKED] for column in self(*arguments)], expected)
 
     def __call__(self, *arguments: Tensor) -> list[Tensor]:
-        """What each step keeps, stacked over time."""
+        """What each step keeps, stacked over time.
+
+        Raises:
+            ValueError: as NumberKernel.
+        """
         program, (*state, t, dt, x0) = self._program, arguments
+        if not len(t) == len(dt) == self._steps:
+            raise ValueError(f"Expected {self._steps} steps, got {len(t)} and {len(dt)}; build the kernel anew.")
         following, *kept = program.result_shapes
         columns = [torch.empty(self._steps, *shape, dtype=program.dtype) for shape in kept]
-        first, spare = (torch.empty(following, dtype=program.dtype) for _ in range(2))
-        buffers = program.buffers([*state, t, dt, x0], [first, *columns])
-        inputs, results = program.given[-3:], program.results
-        advances = [(inputs[0], 1), (inputs[1], 1)]
-        advances += [(buffer, shape.numel()) for buffer, shape in zip(results[1:], kept, strict=True)]
-        moving = np.array(advances, dtype=np.int64)
-        program.function("scan")(
-            *program.first, *program.every, program.tables, buffers, _long(self._steps), _address(moving),
-            _long(len(advances)), _long(inputs[2]), _long(results[0]), ctypes.c_void_p(spare.data_ptr()),
-        )  # fmt: skip
+        program.scan([*state, t, dt, x0], torch.empty(2, *following, dtype=program.dtype), columns)
         return columns
 
 
 class _Assembled:
-    """A program with its memory."""
+    """A program with its memory.
 
-    def __init__(self, arguments: Sequence[Tensor]):
-        floating = [each.dtype for each in arguments if each.is_floating_point()]
-        self.dtype = floating[-1]
+    Args:
+        arguments, handed: as NumberKernel.
+    """
+
+    def __init__(self, arguments: Sequence[Tensor], handed: int = 0):
+        self.dtype = next(
+            each.dtype for each in arguments[len(arguments) - handed - 1 :: -1] if each.is_floating_point()
+        )
         if self.dtype not in NAMES or any(each.device.type != "cpu" for each in arguments):
             raise NotImplementedError(f"{self.dtype} on {arguments[-1].device}")
-        self._width = int(self.function("width")())
-        self._program = Program(self.dtype)
-        self.writer = Writer(self._program, self._width, RULES)
-        self.given, self.results = list[int](), list[int]()
+        self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
         self.result_shapes: list[torch.Size] = []
+        self._handed = handed
+        self._given, self._results = list[int](), list[int]()  # buffers
         self._frozen: list[tuple[int, Tensor]] = []  # arguments of other types, which are constants of the program
         self._shapes = [each.shape for each in arguments]
+        self._lock = Lock()  # a program has one memory
 
     def arguments(self, examples: Sequence[Tensor], varying: int) -> list[Tensor]:
         """Examples of their own memory, the last ones of which vary from step to step."""
         own = [each.detach().contiguous().clone() for each in examples]
         for k, example in enumerate(own):
-            if example.dtype not in (self.dtype, torch.bool):
-                self._frozen.append((k, example))
-                self.given.append(-1)
-            elif not example.numel():
-                self.given.append(-1)
+            is_number = example.dtype in (self.dtype, torch.bool) or k >= len(own) - self._handed
+            if is_number and example.numel():
+                self._given.append(self.writer.argument(example, varies=k >= len(own) - varying))
             else:
-                self.given.append(self.writer.argument(example, varies=k >= len(own) - varying))
+                self._given.append(-1)
+                self._frozen += [] if is_number else [(k, example)]
         return own
 
     def finish(self, results: Sequence[Tensor]) -> None:
         """Lay out the memory, for results that are copied out."""
-        program = self._program
+        program = self.writer.program
         for result in results:
             buffer = program.new_buffer(result.numel(), varies=True, given=True)
-            place = self.writer.place(result)
-            contiguous = torch.empty(result.shape, dtype=torch.int8).stride()
-            program.elementwise(
-                "copy", result.shape, place._replace(buffer=buffer, offset=0, strides=contiguous), [place]
-            )
-            self.results.append(buffer)
+            in_line = torch.empty(result.shape, dtype=torch.int8).stride()
+            program.elementwise("copy", result.shape, Place(buffer, 0, in_line), [self.writer.place(result)])
+            self._results.append(buffer)
             self.result_shapes.append(result.shape)
-        program.without_unread(self.results)
-        offsets, arena = program.laid_out()
-        self._arena = torch.empty(arena + 1, dtype=self.dtype)
+        program.without_unread(self._results)
+        offsets, numbers = program.laid_out()
+        self._arena = torch.empty(numbers + 1, dtype=self.dtype)
         self._constants = [each.constant for each in program.buffers]
-        addresses = [
-            constant.data_ptr()
-            if constant is not None
-            else self._arena.data_ptr() + max(offset, 0) * self.dtype.itemsize
-            for constant, offset in zip(self._constants, offsets, strict=True)
-        ]
-        self._addresses = np.array(addresses, dtype=np.int64)
-        self._code = [_array(program.shared), _array(program.repeated)]
+        self._addresses = np.array(
+            [
+                self._arena[max(offset, 0) :].data_ptr() if constant is None else constant.data_ptr()
+                for constant, offset in zip(self._constants, offsets, strict=True)
+            ],
+            dtype=np.int64,
+        )
+        self.shared, self.repeated = _array(program.shared), _array(program.repeated)
         self._tables = np.concatenate([*program.tables, np.zeros(1, dtype=np.int64)])
-        self.first, self.every = ((_address(code), _long(len(code))) for code in self._code)
-        self.tables = _address(self._tables)
-        del self._program
+        del self.writer  # and with it all that torch has computed of the examples
 
     def new_results(self) -> list[Tensor]:
+        """Tensors for the results."""
         return [torch.empty(shape, dtype=self.dtype) for shape in self.result_shapes]
 
-    def buffers(self, arguments: Sequence[Tensor], results: Sequence[Tensor]) -> ctypes.c_void_p:
-        """The addresses of all buffers for a call."""
+    def run(self, code: np.ndarray, arguments: Sequence[Tensor], results: Sequence[Tensor]) -> None:
+        """Run instructions, and have them write the results."""
+        given = self._checked(arguments, self._shapes)
+        table = self._buffers(given, results)
+        with self._lock:
+            self._function("run")(_address(code), _long(len(code)), _address(self._tables), _address(table))
+
+    def scan(self, arguments: Sequence[Tensor], states: Tensor, columns: Sequence[Tensor]) -> None:
+        """Run all steps: `states` is memory for two of them, and columns, over time, are for what they keep."""
+        *shapes, _, _, x = self._shapes
+        given = self._checked(arguments, [*shapes, arguments[-3].shape, arguments[-2].shape, x])
+        table = self._buffers(given, [states[0], *columns])
+        *_, t, dt, read = self._given
+        written, *kept = self._results
+        advances = [
+            (t, 1),
+            (dt, 1),
+            *((buffer, column[0].numel()) for buffer, column in zip(kept, columns, strict=True)),
+        ]
+        moving = np.array(advances, dtype=np.int64)
+        with self._lock:
+            self._function("scan")(
+                _address(self.shared), _long(len(self.shared)), _address(self.repeated), _long(len(self.repeated)),
+                _address(self._tables), _address(table), _long(len(columns[0])), _address(moving),
+                _long(len(advances)), _long(read), _long(written), ctypes.c_void_p(states[1].data_ptr()),
+            )  # fmt: skip
+
+    def _checked(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
+        """Arguments as the program reads them."""
+        got = [each.shape for each in arguments]
+        if got != [*shapes]:
+            raise ValueError(
+                f"Expected arguments {[*map(tuple, shapes)]}, got {[*map(tuple, got)]}; build another kernel."
+            )
         for k, example in self._frozen:
             if not torch.equal(arguments[k], example):
                 raise ValueError(
                     f"Expected {example.dtype} as it was traced in a program of {self.dtype}, got other numbers; build "
                     "the kernel anew."
                 )
-        # kept until the call is over
-        self._alive = [argument.detach().to(self.dtype).contiguous() for argument in arguments]
-        table = self._addresses.copy()
-        for buffer, argument in zip(self.given, self._alive, strict=True):
-            if buffer >= 0:
-                table[buffer] = argument.data_ptr()
-        for buffer, result in zip(self.results, results, strict=True):
-            table[buffer] = result.data_ptr()
-        self._table = table
-        return _address(table)
+        return [argument.detach().to(self.dtype).contiguous() for argument in arguments]
 
-    def function(self, name: str) -> Any:
+    def _buffers(self, arguments: Sequence[Tensor], results: Sequence[Tensor]) -> np.ndarray:
+        """The addresses of all buffers."""
+        table = self._addresses.copy()
+        for buffer, tensor in zip((*self._given, *self._results), (*arguments, *results), strict=True):
+            if buffer >= 0:
+                table[buffer] = tensor.data_ptr()
+        return table
+
+    def _function(self, name: str) -> Any:
         return getattr(library(), f"lyapnet_{name}_{NAMES[self.dtype]}")
 
 

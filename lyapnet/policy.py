@@ -191,34 +191,33 @@ class _HeldStep:
     def descended(self, u: Control, H: Tensor) -> Control:
         """The best of u and some shares of the Newton step from it."""
         direction = self.newton(u, H) - u
-        best, least = u, self._paid(u)
-        for share in SHARES:
-            tried = self.problem.controls.project(u + share * direction)
-            paid = self._paid(tried)
-            better = paid < least
-            best, least = torch.where(better[..., None], tried, best), torch.where(better, paid, least)
+        tried = torch.stack([u, *(self.problem.controls.project(u + share * direction) for share in SHARES)])
+        paid = self._paid(tried)
+        best, least = u, paid[0]
+        for control, cost in zip(tried[1:], paid[1:], strict=True):
+            better = cost < least
+            best, least = torch.where(better[..., None], control, best), torch.where(better, cost, least)
         return best
 
     def newton(self, u: Control, H: Tensor) -> Control:
         """The minimiser over U of Q to second order around u, with its curvature as a number."""
         answer = self.problem.response(self.x, u)
-        V_x = self.V.value_and_state_gradient(self.after, answer.x)[1]
+        with torch.enable_grad():
+            z = answer.x if answer.x.requires_grad else answer.x.detach().requires_grad_()
+            V_x = self.V.value_and_state_gradient(self.after, z)[1]
+            curvature = self._curvature(answer, z, V_x, H)
         slope = apply(answer.by_control.mT, V_x) + answer.slope
-        curvature = self._curvature(answer, H)
         return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
 
     def _paid(self, u: Control) -> PerState:
-        """Q."""
-        following, paid = self.problem.step(self.x, u)
+        """Q of controls (k, *batch, m)."""
+        following, paid = self.problem.step(self.x.expand(*u.shape[:-1], -1), u)
         return paid + self.V(self.after, following)
 
-    def _curvature(self, answer: Response, H: Tensor) -> Tensor:
-        """Q_uu/Δt where that is convex, else with H for V_xx; without a graph."""
+    def _curvature(self, answer: Response, z: State, V_x: State, H: Tensor) -> Tensor:
+        """Q_uu/Δt where that is convex, else with H for V_xx; without a graph, from V_x at z with its graph."""
         B, paid, dt = answer.by_control.detach(), answer.curvature.detach(), self.problem.horizon.dt
-        with torch.enable_grad():
-            z = answer.x.detach().requires_grad_()
-            along = apply(B.mT, self.V.value_and_state_gradient(self.after, z)[1])
-            own = dt * multiply(jacobian(along, z).detach(), B)
+        own = dt * multiply(jacobian(apply(B.mT, V_x), z).detach(), B)
         own = paid + (own + own.mT) / 2
         model = paid + dt * multiply(B.mT, multiply(H.detach(), B))
         return convex_or(own, paid, model)

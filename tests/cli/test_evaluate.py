@@ -106,8 +106,8 @@ def test_failed_optima_are_left_out_and_counted(run, capsys, monkeypatch, tmp_pa
     whole = evaluation(controller, 5)
     minimise, lost = Transcription.minimise, set(map(tuple, whole.table.x0[1:3].tolist()))
 
-    def failing(self, x0, start):
-        return "IPOPT: lost" if tuple(x0.tolist()) in lost else minimise(self, x0, start)
+    def failing(self, x0, start, briefly):
+        return "IPOPT: lost" if tuple(x0.tolist()) in lost else minimise(self, x0, start, briefly)
 
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "another"))
     monkeypatch.setattr(Transcription, "minimise", failing)

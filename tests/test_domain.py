@@ -247,6 +247,7 @@ def brief(monkeypatch):
     monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (60, 30))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 
 def written_to(tmp_path, **changes):

@@ -113,6 +113,7 @@ def test_a_guess_that_is_slow_at_first_is_not_given_up():
 def test_it_trains_and_comes_back(tmp_path, monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
              "rollout.compile=off"]  # fmt: skip
     run = lyapnet.train({**made(periodic=["angle"], obstacles=[BUMP]), "logs": str(tmp_path)}, brief)

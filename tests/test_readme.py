@@ -195,6 +195,7 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
 def test_a_system_of_your_own(workplace, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (40, 20))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
     assert len(source.strip().splitlines()) <= 24
     (config,) = [block for block in blocks("yaml") if "pendulum:Pendulum" in block and "system:" in block]

@@ -235,6 +235,7 @@ def test_a_training_without_a_goal(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (100, 50))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     (tmp_path / "task.yaml").write_text(
         json.dumps({
             "experiment": "far",

@@ -27,6 +27,7 @@ TASK = {
 def _few_optima(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 
 def linear(A, B, **changes):

@@ -254,6 +254,7 @@ def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 4)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (20, 10))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     monkeypatch.setattr("lyapnet.training.optima.optimal_cost", lambda problem: None)
     assert main(["check", "task.yaml"]) == 0
     shown, notes = capfd.readouterr()

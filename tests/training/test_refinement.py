@@ -162,6 +162,7 @@ def region_run(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 6)
         patch.setattr("lyapnet.training.pretraining.STEPS", (5, 5))
+        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         assert main(["train", "--config", "conf/regions/van_der_pol.yaml", f"logs={folder}", *changes]) == 0
     return folder / "van_der_pol_region/version_0"
 

@@ -41,6 +41,7 @@ def _few_optima():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 12)
         patch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
+        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         yield
 
 

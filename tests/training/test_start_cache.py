@@ -29,6 +29,7 @@ def _few_optima(monkeypatch, tmp_path):
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 6)
     monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (20, 10))
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 
 @pytest.fixture

@@ -61,11 +61,12 @@ class DiscreteAdjoint:
         self._traced: dict[tuple[Any, ...], TracedRoutines] = {}
         self._routines: dict[tuple[Any, ...], Routines] = {}
         self._compiled: Tensor | None = None  # an x₀ of the batches that run as machine code
+        self._compiled_key: tuple[Any, ...] | None = None
         self._told = False  # whether the log has said why the loop runs as it is written
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the work, which belongs to these very tensors: a copy does its own."""
-        return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None}
+        return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None, "_compiled_key": None}
 
     def __call__(self, x0: State, theta: Sequence[Tensor] | None = None) -> Rolled:
         """(x, ∫ℓ, V, u) at the nodes.
@@ -98,9 +99,9 @@ class DiscreteAdjoint:
             UntraceableError: the loop cannot be traced.
             CompilationError: as TracedRoutines.compiled.
         """
-        if self._compiled is None or self._key(self._compiled) != self._key(x0):
+        if self._compiled_key != self._key(x0):
             self._routines[self._key(x0)] = self._work(x0, self.trained() if theta is None else theta).compiled()
-            self._compiled = x0.detach()
+            self._compiled, self._compiled_key = x0.detach(), self._key(x0)
 
     def require_trace(self, x0: State, theta: Sequence[Tensor]) -> None:
         """Hold that the loop can be traced for batches like x₀.

@@ -55,9 +55,9 @@ class TracedRoutines(NamedTuple):
         Raises:
             CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
         """
-        if self.path_arguments[-1].device.type == "cpu":
-            return self._by_kernel()
         with compilation_errors():
+            if self.path_arguments[-1].device.type == "cpu":
+                return self._by_kernel()
             integrate, linearise, product = (compiled(*piece) for piece in self.pieces())
         return Routines(integrate, linearise, product, self.block)
 

@@ -92,6 +92,8 @@ class ScanKernel:
         *given, t0, dt0, x = program.arguments(examples, varying=3)
         shared = program.writer.write(prepare, given)
         program.finish(program.writer.write(step, [*given, t0, dt0, x, *shared]))
+        if not program.is_scan():
+            raise NotImplementedError("a scan of an empty batch, or of a state whose shape changes")
         with torch.no_grad():
             expected = Scan(prepare, step, len(state)).loop(*state, t[:CHECKED], dt[:CHECKED], x0)
         _require_same([column[:CHECKED] for column in self(*arguments)], expected)
@@ -168,6 +170,10 @@ class _Assembled:
         self._tables = np.concatenate([*program.tables, np.zeros(1, dtype=np.int64)])
         del self.writer  # and with it all that torch has computed of the examples
 
+    def is_scan(self) -> bool:
+        """Whether there are numbers in t, Δt and x, and x' is like x."""
+        return min(self._given[-3:]) >= 0 and self.result_shapes[0] == self._shapes[-1]
+
     def new_results(self) -> list[Tensor]:
         """Tensors for the results."""
         return [torch.empty(shape, dtype=self.dtype) for shape in self.result_shapes]
@@ -202,7 +208,7 @@ class _Assembled:
     def _checked(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
         """Arguments as the program reads them."""
         got = [each.shape for each in arguments]
-        if got != [*shapes]:
+        if got != [*shapes] or any(each.device.type != "cpu" for each in arguments):
             raise ValueError(
                 f"Expected arguments {[*map(tuple, shapes)]}, got {[*map(tuple, got)]}; build another kernel."
             )

@@ -79,7 +79,7 @@ template <class T>
 inline typename Of<T>::V gathered(const T *from, Integer stride, int count) {
     if (stride == 1) return count == Of<T>::LANES ? load(from) : load_some(from, count);
     typename Of<T>::V x = {};
-    if (stride == 0) return x + *from;
+    if (stride == 0) return *from - x;  // which keeps the sign of −0
     for (int i = 0; i < count; i++) x[i] = from[i * stride];
     return x;
 }
@@ -111,7 +111,7 @@ V each(V x) {
 }
 
 template <class T, class V>
-inline V absolute(V x) { return x < 0 ? -x : x; }
+inline V absolute(V x) { return x < 0 ? -x : x + V{}; }
 
 // eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2, by the series of eʳ
 inline Of<double>::V exponential(Of<double>::V x) {

@@ -127,7 +127,7 @@ class Program:
         self.repeated: list[Instruction] = []  # done at every step
         self.tables: list[np.ndarray] = []
         self._positions = 0
-        self._packed = dict[Place, int]()
+        self._packed = dict[tuple[Place, int, int], int]()
 
     def new_buffer(self, numbers: int, varies: bool, constant: Tensor | None = None, given: bool = False) -> int:
         """The index of memory for some numbers."""
@@ -207,11 +207,11 @@ class Program:
         if width // 4 > N or out.strides[1] != 1:
             self.multiply_batch(1, shape, [place._replace(strides=(0, *place.strides)) for place in places], add)
             return
-        if B not in self._packed:
+        if (B, K, N) not in self._packed:
             packed = self.new_buffer(-(-N // width) * width * K, self.buffers[B.buffer].varies)
             self._append("pack", [K, N, B.buffer, B.offset, *B.strides, packed, 0], [B.buffer], packed)
-            self._packed[B] = packed
-        packed = self._packed[B]
+            self._packed[B, K, N] = packed
+        packed = self._packed[B, K, N]
         row = [M, N, K, int(add), out.buffer, out.offset, out.strides[0], A.buffer, A.offset, *A.strides, packed, 0]
         reads = [A.buffer, packed, *([out.buffer] if add else [])]
         self._append("product_with_packed", row, reads, out.buffer)

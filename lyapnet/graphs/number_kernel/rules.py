@@ -17,24 +17,41 @@ UNARY = {
     "log10": "log10", "log1p": "log1p", "log2": "log2", "neg": "negative", "reciprocal": "reciprocal", "relu": "relu",
     "round": "round", "rsqrt": "inverse_root", "sigmoid": "sigmoid", "sign": "sign", "sgn": "sign", "sin": "sin",
     "sinh": "sinh", "sqrt": "root", "square": "square", "tan": "tan", "tanh": "tanh", "trunc": "truncate",
-    "logical_not": "not", "bitwise_not": "not", "_to_copy": "copy", "contiguous": "copy",
+    "logical_not": "not", "_to_copy": "copy", "contiguous": "copy",
 }  # fmt: skip
 BINARY = {
-    "atan2": "atan2", "bitwise_and": "product", "bitwise_or": "larger", "bitwise_xor": "unequal", "eq": "equal",
+    "atan2": "atan2", "eq": "equal",
     "le": "less_or_equal", "lt": "less", "maximum": "larger", "minimum": "smaller", "mul": "product", "ne": "unequal",
     "remainder": "remainder", "sigmoid_backward": "sigmoid_slope", "tanh_backward": "tanh_slope",
 }  # fmt: skip
 SWAPPED = {"ge": "less_or_equal", "gt": "less"}
+OF_MEMORY = {"memory_format", "dtype", "layout", "device", "pin_memory", "non_blocking"}  # options without a part in it
 POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "root", -0.5: "inverse_root"}
 
 
 def _unary(operation: str) -> Callable[..., None]:
     def write(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
-        if operation == "copy" and out.dtype != x.dtype and not out.is_floating_point():
-            return writer.elementwise("truth" if out.dtype == torch.bool else "truncate", out, x)
-        return writer.elementwise(operation, out, x)
+        if options.keys() - OF_MEMORY:
+            raise NotImplementedError(f"{operation} with {', '.join(options)}")
+        _copy(writer, out, x) if operation == "copy" else writer.elementwise(operation, out, x)
 
     return write
+
+
+def _copy(writer: Writer, out: Tensor, x: Number) -> None:
+    """x as torch stores it in the type of the result."""
+    given = x.dtype if isinstance(x, Tensor) else None
+    if out.dtype == torch.bool and given != torch.bool:
+        writer.elementwise("truth", out, x)
+    elif out.dtype == torch.int64 and given not in (torch.int64, torch.bool):
+        writer.elementwise("truncate", out, x)
+        writer.elementwise("sum", out, out, 0)  # an integer has one zero
+    else:
+        writer.elementwise("copy", out, x)
+
+
+def _assign(writer: Writer, out: Tensor, x: Tensor, source: Tensor, non_blocking: bool = False) -> None:
+    _copy(writer, out, source)
 
 
 def _binary(operation: str) -> Callable[..., None]:
@@ -66,9 +83,11 @@ def _subtract_from(writer: Writer, out: Tensor, x: Number, y: Number, alpha: flo
 
 
 def _divide(writer: Writer, out: Tensor, x: Number, y: Number, rounding_mode: str | None = None) -> None:
+    if rounding_mode == "floor":  # which is not ⌊x/y⌋ where x/y is rounded up to an integer
+        raise NotImplementedError("a floor division")
     writer.elementwise("quotient", out, x, y)
     if rounding_mode is not None:
-        writer.elementwise({"floor": "floor", "trunc": "truncate"}[rounding_mode], out, out)
+        writer.elementwise("truncate", out, out)
 
 
 def _power(writer: Writer, out: Tensor, x: Number, exponent: Number) -> None:
@@ -100,16 +119,18 @@ def _masked_fill(writer: Writer, out: Tensor, x: Tensor, mask: Tensor, value: Nu
 
 
 def _logical(operation: str) -> Callable[..., None]:
-    def write(writer: Writer, out: Tensor, x: Tensor, y: Tensor) -> None:
-        if x.dtype != torch.bool or y.dtype != torch.bool:
-            raise NotImplementedError("truths of numbers")
+    """Of truths; not of the bits of integers."""
+
+    def write(writer: Writer, out: Tensor, x: Number, y: Number) -> None:
+        if any(not isinstance(each, Tensor) or each.dtype != torch.bool for each in (out, x, y)):
+            raise NotImplementedError("a logical operation on numbers")
         writer.elementwise(operation, out, x, y)
 
     return write
 
 
 def _fill(writer: Writer, out: Tensor, x: Tensor, value: Number) -> None:
-    writer.elementwise("copy", out, value)
+    _copy(writer, out, value)
 
 
 def _reduction(operation: str, start: float) -> Callable[..., None]:
@@ -236,7 +257,7 @@ def _slice_backward(
 
 def _select_scatter(writer: Writer, out: Tensor, x: Tensor, part: Tensor, dim: int, index: int) -> None:
     writer.elementwise("copy", out, x)
-    writer.elementwise("copy", out.select(dim, index), part)
+    _copy(writer, out.select(dim, index), part)
 
 
 def _slice_scatter(
@@ -250,7 +271,7 @@ def _slice_scatter(
     step: int = 1,
 ) -> None:
     writer.elementwise("copy", out, x)
-    writer.elementwise("copy", torch.ops.aten.slice.Tensor(out, dim, start, end, step), part)
+    _copy(writer, torch.ops.aten.slice.Tensor(out, dim, start, end, step), part)
 
 
 def _positions(x: Tensor) -> Tensor:
@@ -298,6 +319,8 @@ def _index_add(writer: Writer, out: Tensor, x: Tensor, dim: int, index: Tensor, 
 
 
 def _put(writer: Writer, out: Tensor, x: Tensor, to: Tensor, values: Tensor, add: bool) -> None:
+    if add and out.dtype == torch.bool:
+        raise NotImplementedError("a sum of truths")
     writer.elementwise("copy", out, x)
     values = values.expand(to.shape)
     place = writer.place(values)
@@ -327,6 +350,11 @@ RULES: dict[str, Callable[..., None]] = {
     "threshold_backward": _threshold_backward,
     "where": _where,
     "masked_fill": _masked_fill,
+    "copy": _assign,
+    "bitwise_and": _logical("product"),
+    "bitwise_or": _logical("larger"),
+    "bitwise_xor": _logical("unequal"),
+    "bitwise_not": lambda writer, out, x: _logical("unequal")(writer, out, x, torch.ones_like(x)),
     "logical_and": _logical("product"),
     "logical_or": _logical("larger"),
     "logical_xor": _logical("unequal"),

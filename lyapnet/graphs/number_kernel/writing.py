@@ -4,6 +4,7 @@ Each node is run by torch once, on example arguments: what its result shares mem
 instruction; how its result lies in memory is how the program keeps it.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -62,12 +63,16 @@ class Writer:
         raise AssertionError("a graph ends with its output")
 
     def _result(self, target: Any, inputs: Any, keywords: Any) -> Any:
+        if target is torch.ops.aten.view.default:  # arguments are in line here, whatever they were in the trace
+            target = torch.ops.aten.reshape.default
         result = target(*inputs, **keywords)
         sources = [each for each in tree_leaves((inputs, keywords)) if isinstance(each, Tensor)]
         known = [each for each in sources if self.is_written(each)]
         if not known or name_of(target) in SHAPED:
             return result
         made = [each for each in tree_leaves(result) if isinstance(each, Tensor)]
+        if any(self.is_written(each) and each.dtype not in {source.dtype for source in known} for each in made):
+            raise NotImplementedError("the bits of numbers as another type")
         if all(self.is_written(each) or not each.numel() for each in made):
             return result
         rule = self.rules.get(name_of(target))
@@ -106,7 +111,7 @@ class Writer:
         """Where a tensor is, or a number that is in the program; repeated to a shape."""
         if not isinstance(value, Tensor):
             value = torch.tensor(float(value), dtype=self.program.dtype)
-            buffer = self._constant(("number", float(value)), value)
+            buffer = self._constant(("number", float(value), math.copysign(1, value)), value)
         elif self.is_written(value):
             buffer = self._buffers[value.untyped_storage().data_ptr()]
         else:

@@ -10,6 +10,7 @@ from lyapnet.build.entries import index_of
 from lyapnet.config import ConstraintsConfig
 from lyapnet.constraints import CONSTRAINTS, AllOf, Ball, Constraints, OfFirstStates, StateLimits
 from lyapnet.derivatives import jacobian
+from lyapnet.domain import size_of
 from lyapnet.errors import UsageError
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
@@ -52,9 +53,8 @@ def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
     """
     box, draws = problem.initial_states, torch.Generator().manual_seed(0)
     x = box.sample(STATES, draws)
-    size = box.magnitude.where(box.magnitude > 0, 1.0)
     # states that X₀ fixes are moved, as h may have no slope there
-    x = x + 0.1 * size * (box.lower == box.upper) * torch.randn(x.shape, generator=draws, dtype=x.dtype)
+    x = x + 0.1 * size_of(box) * (box.lower == box.upper) * torch.randn(x.shape, generator=draws, dtype=x.dtype)
     with torch.enable_grad():
         x.requires_grad_()
         slopes = jacobian(constraints(x), x)

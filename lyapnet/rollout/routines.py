@@ -63,11 +63,10 @@ class TracedRoutines(NamedTuple):
 
     def _by_kernel(self) -> Routines:
         try:
-            integrate = ScanKernel(self.prepare, self.step, self.path_arguments)
-            linearise = NumberKernel(self.linearise, self.block_arguments[:-1])
-            with torch.no_grad():
-                intermediate = self.linearise(*self.block_arguments[:-1])[2:]
-            product = NumberKernel(self.product, [*self.block_arguments, *intermediate], handed=len(intermediate))
+            (_, path), (_, block), (_, every) = self.pieces()
+            integrate = ScanKernel(self.prepare, self.step, path)
+            linearise = NumberKernel(self.linearise, block)
+            product = NumberKernel(self.product, every, handed=len(every) - len(self.block_arguments))
         except NotImplementedError as error:
             raise CompilationError(f"Expected operations that the kernel has, got {error}") from error
         return Routines(integrate, linearise, product, self.block)

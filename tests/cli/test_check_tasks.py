@@ -17,8 +17,7 @@ from lyapnet.build import Parts, build_problem, parts_of
 from lyapnet.cli import main
 from lyapnet.config import config_from_plain, load_config
 from lyapnet.errors import UsageError
-from lyapnet.linearisation import rounded
-from lyapnet.training.build_learner import build_learner
+from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.facts import facts_of, unreached_modes
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -36,7 +35,7 @@ def facts_before_optima(config, parts=None):
         raise EnoughError(stage)
 
     parts = parts_of(config) if parts is None else parts
-    learner = build_learner(config, rounded(build_problem(config, parts)).relaxed(), parts)
+    learner = build_learner(config, build_problem_to_train(config, parts), parts)
     try:
         facts_of(learner, stop, told.append)
     except EnoughError:

@@ -110,6 +110,18 @@ V each(V x) {
     return x;
 }
 
+template <class T, class V, class F>
+V each_pair(V x, V y, F f) {
+    for (int i = 0; i < Of<T>::LANES; i++) x[i] = f(x[i], y[i]);
+    return x;
+}
+
+template <class T>
+T remainder_like(T x, T y) {  // with the sign of y, as torch has it
+    const T r = std::fmod(x, y);
+    return r != 0 && (r < 0) != (y < 0) ? r + y : r;
+}
+
 template <class T, class V>
 inline V absolute(V x) { return x < 0 ? -x : x + V{}; }
 
@@ -233,35 +245,9 @@ BINARY(Unequal, x != y ? ONE : ZERO)
 BINARY(SigmoidSlope, x *(y * (1 - y)))  // of a costate x and σ = y
 BINARY(TanhSlope, x *(1 - y * y))
 
-template <class T>
-struct Power {
-    typedef typename Of<T>::V V;
-    static V of(V x, V y) {
-        for (int i = 0; i < Of<T>::LANES; i++) x[i] = std::pow(x[i], y[i]);
-        return x;
-    }
-};
-
-template <class T>
-struct Atan2 {
-    typedef typename Of<T>::V V;
-    static V of(V x, V y) {
-        for (int i = 0; i < Of<T>::LANES; i++) x[i] = std::atan2(x[i], y[i]);
-        return x;
-    }
-};
-
-template <class T>
-struct Remainder {  // with the sign of y, as torch has it
-    typedef typename Of<T>::V V;
-    static V of(V x, V y) {
-        for (int i = 0; i < Of<T>::LANES; i++) {
-            const T r = std::fmod(x[i], y[i]);
-            x[i] = r != 0 && (r < 0) != (y[i] < 0) ? r + y[i] : r;
-        }
-        return x;
-    }
-};
+BINARY(Power, (each_pair<T>(x, y, [](T a, T b) { return std::pow(a, b); })))
+BINARY(Atan2, (each_pair<T>(x, y, [](T a, T b) { return std::atan2(a, b); })))
+BINARY(Remainder, (each_pair<T>(x, y, remainder_like<T>)))
 
 template <class T>
 struct Where {

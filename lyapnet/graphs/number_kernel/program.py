@@ -145,18 +145,15 @@ class Program:
         if 0 in shape:
             return
         places = [out, *inputs]
-        sizes, strides = _merged(shape, [place.strides for place in places])
-        row = [len(sizes), *sizes]
-        for place, own in zip(places, strides, strict=True):
-            row += [place.buffer, place.offset, *own]
+        row = _row(places, *_merged(shape, [place.strides for place in places]))
         self._append(operation, row, [place.buffer for place in inputs], out.buffer)
 
     def reduce(self, operation: str, shape: Sequence[int], out: Place, given: Place) -> None:
         """out = operation(out, given) over a shape, along whose axes out has stride 0 where it is reduced."""
         if 0 in shape:
             return
-        sizes, (of, to) = _merged(shape, [given.strides, out.strides])
-        row = [len(sizes), *sizes, out.buffer, out.offset, *to, given.buffer, given.offset, *of]
+        sizes, (from_strides, to_strides) = _merged(shape, [given.strides, out.strides])
+        row = _row([out, given], sizes, [to_strides, from_strides])
         self._append(operation, row, [out.buffer, given.buffer], out.buffer)
 
     def find_extreme(self, operation: str, shape: Sequence[int], axis: int, out: Place, given: Place) -> None:
@@ -165,10 +162,8 @@ class Program:
             return
         others = [k for k in range(len(shape)) if k != axis]
         sizes, strides = _merged([shape[k] for k in others], [[p.strides[k] for k in others] for p in (out, given)])
-        row = [len(sizes) + 1, *sizes, shape[axis]]
-        for place, own in zip((out, given), strides, strict=True):
-            row += [place.buffer, place.offset, *own, place.strides[axis]]
-        self._append(operation, row, [given.buffer], out.buffer)
+        strides = [[*own, place.strides[axis]] for place, own in zip((out, given), strides, strict=True)]
+        self._append(operation, _row([out, given], [*sizes, shape[axis]], strides), [given.buffer], out.buffer)
 
     def index(
         self, shape: Sequence[int], axis: int, size: int, out: Place, given: Place, index: Place, into: bool = False
@@ -180,10 +175,7 @@ class Program:
         stride = places[0 if into else 1].strides[axis]
         strides = [list(place.strides) for place in places]
         strides[0 if into else 1][axis] = 0
-        sizes, strides = _merged(shape, strides)
-        row = [size, stride, len(sizes), *sizes]
-        for place, own in zip(places, strides, strict=True):
-            row += [place.buffer, place.offset, *own]
+        row = [size, stride, *_row(places, *_merged(shape, strides))]
         reads = [given.buffer, index.buffer, *([out.buffer] if into else [])]
         self._append("put_at_index" if into else "take_at_index", row, reads, out.buffer)
 
@@ -257,7 +249,7 @@ class Program:
             if k < len(self.shared) <= ends[buffer]:
                 ends[buffer] = len(rows)
         offsets, arena = [-1] * len(self.buffers), 0
-        line = LINE // torch.finfo(self.dtype).bits * 8
+        line = LINE // self.dtype.itemsize
         alive: list[tuple[int, int, int]] = []  # (offset, numbers, end)
         own = [b for b in begins if self.buffers[b].constant is None and not self.buffers[b].given]
         for buffer in sorted(own, key=lambda b: begins[b]):
@@ -272,6 +264,14 @@ class Program:
             alive.append((offset, size, ends[buffer]))
             arena = max(arena, offset + size)
         return offsets, arena
+
+
+def _row(places: Sequence[Place], sizes: Sequence[int], strides: Sequence[Sequence[int]]) -> list[int]:
+    """A shape and its operands, as `Machine::operand` in program.cpp reads them."""
+    row = [len(sizes), *sizes]
+    for place, own in zip(places, strides, strict=True):
+        row += [place.buffer, place.offset, *own]
+    return row
 
 
 def _merged(shape: Sequence[int], strides: Sequence[Sequence[int]]) -> tuple[list[int], list[list[int]]]:

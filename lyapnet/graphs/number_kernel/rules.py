@@ -20,9 +20,9 @@ UNARY = {
     "logical_not": "not", "_to_copy": "copy", "contiguous": "copy",
 }  # fmt: skip
 BINARY = {
-    "atan2": "atan2", "eq": "equal",
-    "le": "less_or_equal", "lt": "less", "maximum": "larger", "minimum": "smaller", "mul": "product", "ne": "unequal",
-    "remainder": "remainder", "sigmoid_backward": "sigmoid_slope", "tanh_backward": "tanh_slope",
+    "atan2": "atan2", "eq": "equal", "le": "less_or_equal", "lt": "less", "maximum": "larger", "minimum": "smaller",
+    "mul": "product", "ne": "unequal", "remainder": "remainder", "sigmoid_backward": "sigmoid_slope",
+    "tanh_backward": "tanh_slope",
 }  # fmt: skip
 SWAPPED = {"ge": "less_or_equal", "gt": "less"}
 OF_MEMORY = {"memory_format", "dtype", "layout", "device", "pin_memory", "non_blocking"}  # options without a part in it
@@ -243,19 +243,7 @@ def _stack(writer: Writer, out: Tensor, parts: Sequence[Tensor], dim: int = 0) -
         writer.elementwise("copy", out.select(dim, k), part)
 
 
-def _select_backward(writer: Writer, out: Tensor, costate: Tensor, sizes: Any, dim: int, index: int) -> None:
-    writer.elementwise("copy", out, 0)
-    writer.elementwise("copy", out.select(dim, index), costate)
-
-
-def _slice_backward(
-    writer: Writer, out: Tensor, costate: Tensor, sizes: Any, dim: int, start: int, end: int, step: int
-) -> None:
-    writer.elementwise("copy", out, 0)
-    writer.elementwise("copy", torch.ops.aten.slice.Tensor(out, dim, start, end, step), costate)
-
-
-def _select_scatter(writer: Writer, out: Tensor, x: Tensor, part: Tensor, dim: int, index: int) -> None:
+def _select_scatter(writer: Writer, out: Tensor, x: Number, part: Tensor, dim: int, index: int) -> None:
     writer.elementwise("copy", out, x)
     _copy(writer, out.select(dim, index), part)
 
@@ -263,7 +251,7 @@ def _select_scatter(writer: Writer, out: Tensor, x: Tensor, part: Tensor, dim: i
 def _slice_scatter(
     writer: Writer,
     out: Tensor,
-    x: Tensor,
+    x: Number,
     part: Tensor,
     dim: int = 0,
     start: Any = None,
@@ -272,6 +260,11 @@ def _slice_scatter(
 ) -> None:
     writer.elementwise("copy", out, x)
     _copy(writer, torch.ops.aten.slice.Tensor(out, dim, start, end, step), part)
+
+
+def _backward_of(scatter: Callable[..., None]) -> Callable[..., None]:
+    """The costate at the places that were taken, and zeros elsewhere."""
+    return lambda writer, out, costate, sizes, *places: scatter(writer, out, 0, costate, *places)
 
 
 def _positions(x: Tensor) -> Tensor:
@@ -378,8 +371,8 @@ RULES: dict[str, Callable[..., None]] = {
     "baddbmm": _add_matrix_product,
     "cat": _concatenate,
     "stack": _stack,
-    "select_backward": _select_backward,
-    "slice_backward": _slice_backward,
+    "select_backward": _backward_of(_select_scatter),
+    "slice_backward": _backward_of(_slice_scatter),
     "select_scatter": _select_scatter,
     "slice_scatter": _slice_scatter,
     "index_put": _index_put,

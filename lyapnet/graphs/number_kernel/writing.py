@@ -120,9 +120,9 @@ class Writer:
         repeated = value if shape is None else value.expand(tuple(shape))
         return Place(buffer, int(value.storage_offset()), repeated.stride())
 
-    def new_tensor(self, like: Tensor, shape: Sequence[int] | None = None) -> Tensor:
+    def new_tensor(self, like: Tensor) -> Tensor:
         """A tensor for what a rule keeps in between."""
-        made = torch.zeros(tuple(like.shape if shape is None else shape), dtype=self.program.dtype)
+        made = torch.zeros(like.shape, dtype=self.program.dtype)
         self._new_buffer(made, self.varies(like))
         return made
 

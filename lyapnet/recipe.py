@@ -16,6 +16,7 @@ STANDARD: dict[str, Any] = {
         "warmup": 40,
         "validate_every": 20,
         "lost_share": 0.5,
+        "least_gain": 5e-4,
     },
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},
@@ -48,6 +49,8 @@ def completed(
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
+    if program == "region":  # whose loss may stay where it is for long, and then fall
+        recipe["training"] = {**STANDARD["training"], "least_gain": 0.0}
     limited = _names(("lower", "upper"), "controls", content, overrides)
     if program in ("value", "region") and gradient == "discrete" and limited:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}

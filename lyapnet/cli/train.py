@@ -44,7 +44,8 @@ def train(
     except Interrupted as stop:
         raise Interrupted(f"{stop} The training had not begun.", stop.exit_status) from None
     if plan.finished:
-        console.print(f"{plan.run.folder} is finished: nothing to resume. Raise training.iterations to train longer.")
+        finished = f"{plan.run.folder} is finished: nothing to resume."
+        console.print(f"{finished} {plan.to_train_longer} to train longer.", soft_wrap=True)
         return
     with default_of(resolved):
         result = fit(plan, console, f"{command} --resume last")

@@ -7,16 +7,16 @@ gradient (lyapnet.rollout.runge_kutta has the equations). Memory is that of the 
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.func import functional_call
 
 from lyapnet.errors import LyapnetError, UntraceableError, one_line
 from lyapnet.graphs.compilation import Scan
+from lyapnet.graphs.stateless import stateless, trained_of, untrained_of
 from lyapnet.graphs.tracing import batched, cut, trace
 from lyapnet.horizon import TABLEAUX
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -90,7 +90,7 @@ class DiscreteAdjoint:
 
     def trained(self) -> list[Tensor]:
         """The loop's parameters that ask for a gradient."""
-        return [p for p in self.loop.parameters() if p.requires_grad]
+        return trained_of(self.loop)
 
     def compile(self, x0: State, theta: Sequence[Tensor] | None = None) -> None:
         """Have batches like x₀ run as machine code, and others, where no gradient is asked for, in slices of that size.
@@ -178,26 +178,7 @@ class DiscreteAdjoint:
 
     def _state(self, theta: Sequence[Tensor]) -> list[Tensor]:
         """The tensors that the loop is made of, the trained ones first."""
-        return [tensor.detach() for tensor in (*theta, *self.facts().values())]
-
-    def facts(self) -> dict[str, Tensor]:
-        """What the loop is made of besides its trained parameters."""
-        frozen = {name: p for name, p in self.loop.named_parameters() if not p.requires_grad}
-        return {**frozen, **dict(self.loop.named_buffers())}
-
-    def _with_state(self, module: nn.Module) -> Callable[..., tuple[Tensor, ...]]:
-        """(*state, *arguments) ↦ module(*arguments) with the loop made of `state`, its first part leaves of a graph."""
-        trained, places = self.trained(), _places(self.loop)
-        names = [places[tensor] for tensor in (*trained, *self.facts().values())]
-
-        def function(*tensors: Tensor) -> tuple[Tensor, ...]:
-            leaves = [p.detach().requires_grad_() for p in tensors[: len(trained)]]
-            made_of = zip(names, (*leaves, *tensors[len(trained) : len(names)]), strict=True)
-            state = {f"loop.{name}": tensor for of_one, tensor in made_of for name in of_one}
-            # ties are in `state`; torch, asked for them, leaves its own tensors in a module that occurs twice
-            return functional_call(module, state, tuple(tensors[len(names) :]), tie_weights=False)
-
-        return function
+        return [tensor.detach() for tensor in (*theta, *untrained_of(self.loop))]
 
     def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
         """The work for batches like x₀ as graphs, traced once.
@@ -228,7 +209,7 @@ class DiscreteAdjoint:
         grid = self._grid(x0, self.steps + 1)
         node_arguments, block_arguments = [*state, t[0], dt[0], x0], [*state, t, dt, stages, *bars, nodes.clone()]
         elsewhere = self._visited(x0, theta)
-        step, joint = self._with_state(self._step), self._with_state(self._linearise)
+        step, joint = stateless(self._step), stateless(self._linearise)
         if x0.ndim == 2:
             step, joint = trace(step, node_arguments, elsewhere), trace(joint, block_arguments)
         else:
@@ -285,7 +266,7 @@ class _Rollout(torch.autograd.Function):
         path = adjoint.integrate(routines, x0, theta)
         result = _read(path)
         ctx.adjoint, ctx.routines = adjoint, routines
-        ctx.save_for_backward(path.stages, *theta, *adjoint.facts().values())
+        ctx.save_for_backward(path.stages, *theta, *untrained_of(adjoint.loop))
         ctx.mark_non_differentiable(result[-1])
         return result
 
@@ -294,22 +275,13 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         stages, *state = ctx.saved_tensors  # torch refuses tensors that were changed in between
         theta, facts = state[: len(ctx.needs_input_grad) - 2], state[len(ctx.needs_input_grad) - 2 :]
-        now = [tensor.data_ptr() for tensor in ctx.adjoint.facts().values()]
+        now = [tensor.data_ptr() for tensor in untrained_of(ctx.adjoint.loop)]
         if now != [tensor.data_ptr() for tensor in facts]:
             raise RuntimeError(
                 "Expected the closed loop as it was rolled out, got another buffer; replace it afterwards."
             )
         x0_bar, theta_bar = ctx.adjoint.gradient(ctx.routines, theta, stages, bars[:3])
         return None, x0_bar, *theta_bar
-
-
-def _places(module: nn.Module) -> dict[Tensor, list[str]]:
-    """Parameter or buffer ↦ its names: several where modules share it, one in a module that occurs several times."""
-    places: dict[Tensor, list[str]] = {}
-    for prefix, part in module.named_modules():
-        for name, tensor in (*part.named_parameters(recurse=False), *part.named_buffers(recurse=False)):
-            places.setdefault(tensor, []).append(f"{prefix}.{name}" if prefix else name)
-    return places
 
 
 def _read(nodes: Nodes) -> Rolled:

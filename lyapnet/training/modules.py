@@ -115,13 +115,15 @@ class TrainingModule(L.LightningModule):
                 )
 
     def configure_optimizers(self) -> dict[str, Any]:
-        """One optimizer for all members: what it does to a weight depends on no other one."""
+        """One optimizer for all members, each with a learning rate of its own."""
         options = self.optimizer_options
-        optimizer = options.optimizer([p for member in self.members for p in member.V.parameters()])
+        optimizer = options.optimizer([{"params": [*member.V.parameters()]} for member in self.members])
         iterations = options.iterations or self.trainer.estimated_stepping_batches
-        schedule = torch.optim.lr_scheduler.LambdaLR(
-            optimizer, lambda step: self.rate_share * options.rate(step, iterations)
-        )
+
+        def rate_of(member: Learner) -> Callable[[int], float]:
+            return lambda step: self.rate_share * options.rate(step, iterations, member.settled_at)
+
+        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, [rate_of(member) for member in self.members])
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_callbacks(self) -> list[L.Callback]:

@@ -3,9 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
+
+COOLING = 60  # steps in which the learning rate of a training that has settled falls to its end
 
 
 @dataclass(frozen=True)
@@ -24,14 +27,25 @@ class OptimizerOptions:
     warmup: int = 0  # steps in which it rises to that first
     iterations: int | None = None  # steps of the schedule; None: those of the trainer
 
-    def optimizer(self, parameters: Sequence[nn.Parameter]) -> torch.optim.Optimizer:
-        """The optimizer of some parameters."""
+    def optimizer(self, parameters: Sequence[nn.Parameter | dict[str, Any]]) -> torch.optim.Optimizer:
+        """The optimizer of some parameters, or groups of them."""
         cls = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.name]
         return cls(parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
 
-    def rate(self, step: int, iterations: float) -> float:
-        """The learning rate at a step, as a share of the greatest."""
+    def rate(self, step: int, iterations: float, settled_at: int | None = None) -> float:
+        """The learning rate at a step, as a share of the greatest.
+
+        Args:
+            iterations: of the whole schedule.
+            settled_at: a step from which it falls to its end within COOLING steps, and then is zero; None: there is
+                none.
+        """
         final = self.final_learning_rate / self.learning_rate
-        progress = min(step / iterations, 1.0)
-        fallen = final + (1 - final) * (1 + math.cos(math.pi * progress)) / 2
-        return fallen * min((step + 1) / (self.warmup + 1), 1.0)
+        if settled_at is not None and step > settled_at:
+            share = (step - settled_at) / COOLING
+            return _half_cosine(self.rate(settled_at, iterations), final, share) if share < 1 else 0.0
+        return _half_cosine(1.0, final, step / iterations) * min((step + 1) / (self.warmup + 1), 1.0)
+
+
+def _half_cosine(first: float, last: float, share: float) -> float:
+    return last + (first - last) * (1 + math.cos(math.pi * min(share, 1.0))) / 2

@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,10 +25,11 @@ from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
 from lyapnet.training.run_lock import RunLock
 from lyapnet.training.runs import CONFIG, LAST, Run, is_further_process, last_run, new_run
+from lyapnet.training.settling import end_of_training
 from lyapnet.training.trainer_options import check_trainer_options
 
 CHANGEABLE_ON_RESUME = (
-    "training.iterations", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum",
+    "training.iterations", "training.least_gain", "trainer", "logs", "evaluation.figures_every", "evaluation.optimum",
     "evaluation.certify_every", "evaluation.certified_states", "evaluation.confidence", "loggers", "callbacks",
 )  # fmt: skip
 
@@ -43,6 +45,7 @@ class Plan:
     run: Run
     resume_from: Path | None = None  # a checkpoint
     step: int = 0  # at which that was written
+    end: float = math.inf  # of a training that has settled, its last step
     anew: bool = False  # whether a run goes on that was stopped before its first checkpoint
     lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
 
@@ -56,7 +59,13 @@ class Plan:
     @property
     def finished(self) -> bool:
         """Whether the run has its end behind it: there is nothing to train."""
-        return self.resume_from is not None and self.run.finished and self.step >= self.config.training.iterations
+        last = min(self.config.training.iterations, self.end)
+        return self.resume_from is not None and self.run.finished and self.step >= last
+
+    @property
+    def to_train_longer(self) -> str:
+        """What takes a finished run further, for messages."""
+        return "Set training.least_gain=0" if math.isfinite(self.end) else "Raise training.iterations"
 
 
 def plan_run(
@@ -105,7 +114,8 @@ def plan_run(
                 config.rollout.policy = stored.rollout.policy
                 module = build_module(config, parts)
             _require_same_experiment(config, stored, checkpoint)
-            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), lock=lock)
+            end = end_of_training(content, config)
+            plan = Plan(config, parts, module, callbacks, run, checkpoint, int(content["global_step"]), end, lock=lock)
         if not plan.finished:
             stack.pop_all()
         return plan

@@ -8,7 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.expansions import (
@@ -21,6 +21,8 @@ from lyapnet.expansions import (
     sizes,
     without_penalty,
 )
+from lyapnet.graphs.loss_gradient import gradient_of_loss
+from lyapnet.graphs.stateless import trained_of
 from lyapnet.linear_algebra import apply
 from lyapnet.policy import LookaheadPolicy
 from lyapnet.problem import Problem
@@ -31,10 +33,9 @@ from lyapnet.training.optima import nearest
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, PerState, State, StatePath
 
-STEPS, BATCH, RATE = (2000, 1000), 1024, (0.01, 0.005)  # before and after the fitted law shows where it leads
+STEPS, BATCH, RATE = (2000, 1000), 256, (0.01, 0.005)  # before and after the fitted law shows where it leads
 BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
-SHARES = {1: 0.25, 2: 0.5}  # of those steps, for V of one or two states
 GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
 NEWTON = 6  # steps to where a law that looks ahead looks at V
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
@@ -186,23 +187,41 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool)
 
 
 def errors(
-    V: ValueFunction, examples: Examples, problem: Problem, rows: Tensor | slice = slice(None)
+    V: ValueFunction, examples: Examples, problem: Problem, minimise: Callable[[Tensor, Control], Control] | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Of some of the examples: the means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
+    """The means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
 
     Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
     the second is zero where V asks for the optimal control u*, and convex in V_x, of slope B(u* − u). Without limits it
     is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
     all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state, and limits are left out.
 
+    Args:
+        minimise: that of the controls which are compared; None: the one that looks at numbers.
+
     Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
-    t, x, value, after, about, led, B, slope, W, best, cost, rate = (column[rows] for column in examples)
+    t, x, value, after, about, led, B, slope, W, best, cost, rate = examples
+    minimise = minimise or _compared(problem).minimise_now
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = _compared(problem).minimise_now(W / 2, b - apply(W, about))
+        u = minimise(W / 2, b - apply(W, about))
     excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
+
+
+class _Misfit(nn.Module):
+    """Columns of examples ↦ what a fit lowers."""
+
+    def __init__(self, V: ValueFunction, problem: Problem):
+        super().__init__()
+        self.V = V
+        self._problem = [problem]  # which has no part in what is trained
+
+    def forward(self, *columns: Tensor) -> Tensor:
+        (problem,) = self._problem
+        value_error, excess = errors(self.V, Examples(*columns), problem, _compared(problem).minimise)
+        return VALUE_WEIGHT * value_error + excess
 
 
 def _compared(problem: Problem) -> ControlSet:
@@ -243,15 +262,15 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
-    share, before = SHARES.get(learner.problem.system.n, 1.0), math.inf
+    before = math.inf
     size = float(sizes(learner.problem, optimum.path.cost).mean())
     enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
     for k in range(ROUNDS + 1):
         again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
-        steps, rate, seconds = (part[min(k, 1)] for part in (STEPS, RATE, SECONDS))
-        within = f"within {seconds:.0f} s of work"
+        late = min(k, 1)
+        within = f"within {SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        _lower(learner.V, examples, learner.problem, rows, max(1, int(share * steps)), rate, progress, seconds)
+        _lower(learner.V, examples, learner.problem, rows, STEPS[late], RATE[late], progress, SECONDS[late])
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
@@ -285,9 +304,12 @@ def _lower(
     seconds: float,
 ) -> None:
     """Lower both errors at the examples, by Adam, whose rate falls as a cosine over the steps, or the seconds."""
-    trained = [p for p in V.parameters() if p.requires_grad]
+    trained, began = trained_of(V), time.thread_time()
     examples = examples.to(trained[0])
-    optimizer, began = torch.optim.Adam(trained, rate), time.thread_time()
+
+    some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
+    differentiate = gradient_of_loss(_Misfit(V, problem), some)
+    optimizer = torch.optim.Adam(trained, rate)
     for k in range(steps):
         share = max(k / steps, (time.thread_time() - began) / seconds)
         if share >= 1:
@@ -296,9 +318,7 @@ def _lower(
             group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
         progress(k, steps)
         rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
-        value_error, excess = errors(V, examples, problem, rows)
-        optimizer.zero_grad()
-        (VALUE_WEIGHT * value_error + excess).backward()
+        differentiate(*(column[rows] for column in examples))
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
     optimizer.zero_grad()

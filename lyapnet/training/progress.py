@@ -72,7 +72,7 @@ class TrainingProgress(ProgressBar):
         cost = fmean(float(output.trajectory_cost) for output in outputs)
         speed = sum(member.steps_per_second for member in members)
         line = f"loss {loss:.4g}, cost {cost:.4g} of its batch  {speed:,.0f} rollout steps/s"
-        self._progress.update(self._task, completed=trainer.global_step, description=line)
+        self._progress.update(self._task, completed=trainer.global_step, total=trainer.max_epochs, description=line)
         self._log(f"step {trainer.global_step} of {trainer.max_epochs}", line)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -18,6 +18,7 @@ from lyapnet.training.lost_states import LostStates
 from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
 from lyapnet.training.recovery import RisingCost
+from lyapnet.training.settling import Settling
 from lyapnet.training.stages import PATIENCE, Stages
 from lyapnet.training.trainer_options import trainer_options
 from lyapnet.training.validation_optimum import ValidationOptimum
@@ -61,6 +62,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
         *([certified] if options.certify_every else []),
         TrainingProgress(stages),
         RisingCost(),
+        Settling(config.training.least_gain, config.training.warmup, stages),
         *([LostStates()] if config.training.lost_share else []),
         *plan.callbacks,
         Checkpoints(run.last, best, every, partial(run.note, saved=True)),

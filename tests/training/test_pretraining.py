@@ -186,7 +186,7 @@ def test_errors_count_against_what_their_own_trajectory_costs(problem):
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
     examples, exact = examples_of(problem, optimum, GENERATOR), shifted(problem, 0.0)
     wrong = Formula(lambda t, x: 1.1 * exact(t, x))
-    off = [errors(wrong, examples, problem, torch.tensor([row]))[0].item() for row in range(3)]
+    off = [errors(wrong, examples.each(lambda column, row=row: column[[row]]), problem)[0].item() for row in range(3)]
     assert off == pytest.approx([0.01 * 1e-4, 0.01, 0.01], rel=1e-6)
 
 

@@ -1,0 +1,57 @@
+"""The gradient of a loss in the parameters of a module, by lyapnet's kernel where that can be."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.errors import LyapnetError
+from lyapnet.graphs.number_kernel.kernel import NumberKernel
+from lyapnet.graphs.stateless import stateless, trained_of, untrained_of
+from lyapnet.graphs.tracing import trace
+
+
+def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., None]:
+    """(*arguments) ↦ puts the gradient of loss(*arguments) in its trained parameters into their `grad`.
+
+    On a CPU the loss and its gradient are traced and run by lyapnet's kernel, for the parameters and buffers as they
+    are at each call. What cannot be traced, or has an operation that the kernel lacks, is differentiated by torch.
+
+    Args:
+        arguments: of the same shapes and types as those of every call.
+    """
+    trained = trained_of(loss)
+    kernel = _kernel(loss, arguments)
+
+    def differentiate(*arguments: Tensor) -> None:
+        if kernel is None:
+            gradient = torch.autograd.grad(loss(*arguments), trained, allow_unused=True)
+        else:
+            gradient = kernel(*_state(loss), *arguments)
+        for parameter, slope in zip(trained, gradient, strict=True):
+            parameter.grad = slope
+
+    return differentiate
+
+
+def _state(loss: nn.Module) -> list[Tensor]:
+    return [tensor.detach() for tensor in (*trained_of(loss), *untrained_of(loss))]
+
+
+def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None:
+    """The gradient as a program; None where there is none."""
+    trained, of_state = len(trained_of(loss)), stateless(loss)
+
+    def gradient(*tensors: Tensor) -> tuple[Tensor, ...]:
+        leaves = [tensor.detach().requires_grad_() for tensor in tensors[:trained]]
+        with torch.enable_grad():
+            value = of_state(*leaves, *tensors[trained:])
+        return torch.autograd.grad(value, leaves, materialize_grads=True)
+
+    examples = [*_state(loss), *arguments]
+    if any(example.device.type != "cpu" for example in examples):
+        return None
+    try:
+        return NumberKernel(trace(gradient, examples), examples)
+    except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
+        return None

@@ -1,0 +1,88 @@
+"""The callback that ends a training in which further steps bring nothing."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from lyapnet.config import Config
+from lyapnet.training.curves import members_of
+from lyapnet.training.learner import Learner, mean_over_processes
+from lyapnet.training.optimizer import COOLING
+from lyapnet.training.stages import Stages
+
+WINDOW = 60  # steps in which the validation loss has to fall
+
+
+class Settling(Callback):
+    """Has a member's learning rate fall to its end once its validation loss has stopped falling; training ends with it.
+
+    The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
+    `least_gain` below its least value before. Of several seeds, each settles as it would alone, and training ends with
+    the last of them; one that has ended waits with a rate of zero.
+
+    Args:
+        least_gain: in units of the loss, which are shares of the mean cost, or of the spread of costs where there is no
+            goal; 0: training takes all its steps.
+        warmup: steps in which the learning rate rises.
+        stages: where it is said.
+    """
+
+    def __init__(self, least_gain: float, warmup: int, stages: Stages):
+        self.least_gain, self.warmup, self.stages = least_gain, warmup, stages
+        self.losses: dict[str, list[tuple[int, float]]] = {}  # label ↦ (step, loss) of each validation
+        self.settled: dict[str, int] = {}  # label ↦ the step
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"losses": self.losses, "settled": self.settled}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        if self.least_gain:
+            self.losses, self.settled = dict(state_dict["losses"]), dict(state_dict["settled"])
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        for member in members_of(pl_module):
+            member.settled_at = self.settled.get(member.label)
+        self._shorten(trainer, members_of(pl_module))
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        step, members = trainer.global_step, members_of(pl_module)
+        if not self.least_gain or step < self.warmup:
+            return
+        for member in members:
+            loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=pl_module.device)
+            self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
+            if member.settled_at is None and self._has_stopped(member.label, step):
+                self.settled[member.label] = member.settled_at = step
+                self._shorten(trainer, members)
+                if trainer.is_global_zero:
+                    named = f" of {member.label.replace('_', ' ')}" if member.label else ""
+                    self.stages.console.print(
+                        f"settled: in {WINDOW} steps the validation loss{named} fell by less than "
+                        f"{self.least_gain:g}; its training ends at step {step + COOLING}",
+                        soft_wrap=True,
+                    )
+
+    def _has_stopped(self, label: str, step: int) -> bool:
+        before = [loss for at, loss in self.losses[label] if at <= step - WINDOW]
+        since = [loss for at, loss in self.losses[label] if at > step - WINDOW]
+        return bool(before) and min(before) - min(since) < self.least_gain
+
+    def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
+        """End when all have settled."""
+        end = end_of(self.settled, len(members))
+        if end < (trainer.max_epochs or math.inf):
+            trainer.fit_loop.max_epochs = int(end)
+
+
+def end_of_training(checkpoint: Mapping[str, Any], config: Config) -> float:
+    """The last step of a training that has settled, as its checkpoint says; infinite where it has not."""
+    state = checkpoint.get("callbacks", {}).get(Settling.__qualname__, {})
+    return end_of(state.get("settled", {}), config.seeds) if config.training.least_gain else math.inf
+
+
+def end_of(settled: Mapping[str, int], members: int) -> float:
+    """The last step of a training whose members have settled; infinite where one has not."""
+    return max(settled.values()) + COOLING if len(settled) == members else math.inf

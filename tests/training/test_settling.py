@@ -1,0 +1,128 @@
+"""A training ends where further steps bring nothing, each seed as it would alone, and resumes to the same end."""
+
+import itertools
+import math
+from functools import partial
+
+import pytest
+from rich.console import Console
+
+from lyapnet.checkpoint import read_checkpoint
+from lyapnet.training.optimizer import COOLING, OptimizerOptions
+from lyapnet.training.runs import Run
+from lyapnet.training.settling import WINDOW, Settling, end_of
+from lyapnet.training.stages import Stages
+from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, without_figures
+
+EVERY = 20
+LONG = {
+    "training": {**SMALL["training"], "iterations": 400, "validate_every": EVERY, "least_gain": 1e6},
+    "rollout": {"gradient": "discrete", "compile": "off"},
+    "evaluation": {**SMALL["evaluation"], "optimum": False},
+}
+SETTLED_AT = EVERY + WINDOW  # with a gain that no loss has, after the first validation
+END = SETTLED_AT + COOLING
+
+
+def desk(folder, **changes):
+    folder.mkdir(exist_ok=True)
+    return Desk(folder, **{**LONG, **changes})
+
+
+def trained(folder, *arguments, **changes):
+    one = desk(folder, **changes)
+    status, out, errors = one.train(*arguments, prepare=without_figures)
+    assert (status, errors) == (0, "")
+    return one, out
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("settled"))
+
+
+@pytest.mark.parametrize(
+    ("losses", "stopped"),
+    [
+        ([3.0, 2.0, 1.0], False),  # no WINDOW has passed
+        ([3.0, 2.0, 1.0, 0.5, 0.2], False),
+        ([1.0, 1.0, 1.0, 1.0], True),
+        ([1.0, 5.0, 4.0, 0.9999], True),  # a rise, and less than before by less than the least gain
+        ([1.0, 5.0, 4.0, 0.9], False),
+    ],
+)
+def test_when_a_loss_has_stopped_falling(losses, stopped):
+    settling = Settling(1e-3, 0, Stages(Console(), ""))
+    settling.losses[""] = [(EVERY * k, loss) for k, loss in enumerate(losses)]
+    assert settling._has_stopped("", EVERY * (len(losses) - 1)) is stopped
+
+
+def test_the_rate_falls_from_where_it_settled():
+    options = OptimizerOptions(learning_rate=1e-2, final_learning_rate=1e-4)
+    whole = [options.rate(step, 400) for step in range(400)]
+    settled = [options.rate(step, 400, settled_at=100) for step in range(400)]
+    assert settled[:101] == whole[:101]
+    falling = settled[100 : 100 + COOLING]
+    assert all(later < earlier for earlier, later in itertools.pairwise(falling))
+    assert falling[-1] == pytest.approx(1e-2, rel=0.1)
+    assert not any(settled[100 + COOLING :])
+
+
+def test_it_ends_with_the_last_seed():
+    assert end_of({"seed_0": 60, "seed_1": 100}, 2) == 100 + COOLING
+    assert end_of({"seed_0": 60}, 2) == math.inf
+
+
+def test_training_ends_early_and_says_so(run):
+    one, out = run
+    ends = f"the validation loss fell by less than 1e+06; its training ends at step {END}"
+    assert f"settled: in {WINDOW} steps {ends}" in out
+    assert f"step {END}/{END}" in out
+    assert checkpoint(one, "last")["global_step"] == END
+    assert Run(one.run).finished
+
+
+def test_without_a_least_gain_it_takes_all_steps(tmp_path):
+    one, out = trained(tmp_path / "whole", training={**LONG["training"], "iterations": END + 5, "least_gain": 0})
+    assert "settled" not in out
+    assert checkpoint(one, "last")["global_step"] == END + 5
+
+
+@pytest.mark.parametrize("step", [SETTLED_AT + 5, END])
+def test_a_settled_training_resumes_to_the_same_end(run, step, tmp_path):
+    other = desk(tmp_path / "other")
+    dies = partial(dies_at, "lyapnet.training.modules:TrainingModule", "training_step", step)
+    assert other.train(prepare=partial(both, without_figures, dies))[0] != 0
+    status, out, errors = other.train("--resume", "last", prepare=without_figures)
+    assert (status, errors) == (0, "")
+    assert "settled" not in out  # it was said
+    assert [*differences(checkpoint(run[0], "last"), checkpoint(other, "last"))] == []
+
+
+def test_a_settled_run_is_finished_until_all_steps_are_asked_for(run, tmp_path):
+    one = run[0].copy(tmp_path / "copy")
+    status, out, _ = one.train("--resume", "last", prepare=without_figures)
+    assert status == 0
+    assert "nothing to resume. Set training.least_gain=0 to train longer." in out
+    further = "training.least_gain=0", f"training.iterations={END + 5}"
+    assert one.train(*further, "--resume", "last", prepare=without_figures)[0] == 0
+    assert checkpoint(one, "last")["global_step"] == END + 5
+
+
+def settles_at(step):
+    """Have the first seed settle at its first chance, and others at a step."""
+    Settling._has_stopped = lambda self, label, now: label in ("", "seed_0") or now >= step
+
+
+def test_a_seed_that_has_settled_waits_for_the_others(tmp_path):
+    first = partial(both, without_figures, partial(settles_at, 40))
+    alone = desk(tmp_path / "alone")
+    assert alone.train(prepare=first)[0] == 0
+    two = desk(tmp_path / "two", seeds=2)
+    status, out, errors = two.train(prepare=first)
+    assert (status, errors) == (0, "")
+    assert f"the validation loss of seed 0 fell by less than 1e+06; its training ends at step {EVERY + COOLING}" in out
+    assert f"step {40 + COOLING}/{40 + COOLING}" in out
+    weights, others = (read_checkpoint(path)["state_dict"] for path in (alone.best(), two.best("seed_0")))
+    for key in weights:
+        assert float((weights[key] - others[key]).abs().max()) < 1e-7

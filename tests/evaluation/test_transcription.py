@@ -1,6 +1,7 @@
 """The optimum by direct transcription, held against Riccati, rollouts and finite differences; and what it refuses."""
 
 import math
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from lyapnet.config import load_config
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of
-from lyapnet.evaluation.oracles.multistart import Candidate, MultiStart
+from lyapnet.evaluation.oracles.multistart import EXPLORED, Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.horizon import Horizon
 from lyapnet.systems import Cartpole, DoubleIntegrator, Linear, Reacher
@@ -194,6 +195,36 @@ def test_minima_spread_to_the_states_around():
     search = MultiStart(np.arange(20.0)[:, None], [None] * 20, minimise)
     search.run({i: [start(float(i > 0))] for i in range(20)}, lambda done, total: None)
     assert [candidate.cost for candidate in search.best] == [1.0] * 20
+
+
+@pytest.mark.parametrize("basins", [1, 2])
+def test_where_the_first_states_have_one_minimum_the_others_follow_their_neighbours(basins):
+    """From 20 on starts lead to the better of two basins; of one basin, 40 states have one start each."""
+    tried = Counter()
+
+    def minimise(x0, start, briefly):
+        tried[int(x0[0])] += 1
+        return Candidate(start.x, start.u, 1 + float(start.u[0, 0]))
+
+    def start(basin):
+        return Candidate(np.zeros((1, 1)), np.full((1, 1), float(basin)), math.inf)
+
+    search = MultiStart(np.arange(40.0)[:, None], [None] * 40, minimise)
+    better = {7: 0.0} if basins == 2 else {}  # among the first states, one start of one state
+    search.run({i: [start(1), start(better.get(i, 1))] for i in range(40)}, lambda done, total: None)
+    assert {candidate.cost for candidate in search.best} == {1.0 if basins == 2 else 2.0}
+    assert all(count == 1 for i, count in tried.items() if i >= EXPLORED) is (basins == 1)
+    assert all(tried[i] > 1 for i in range(EXPLORED))
+
+
+def test_known_controls_that_cost_less_are_tried_from_any_state():
+    def minimise(x0, start, briefly):
+        return Candidate(start.x, start.u, 1 + float(start.u[0, 0]))
+
+    cold, known = (Candidate(np.zeros((1, 1)), np.full((1, 1), u), cost) for u, cost in ((1.0, math.inf), (0.0, 1.1)))
+    search = MultiStart(np.arange(40.0)[:, None], [None] * 40, minimise)
+    search.run({i: [known, cold] if i == 30 else [cold] for i in range(40)}, lambda done, total: None)
+    assert {candidate.cost for candidate in search.best} == {1.0}, "and then reach all others"
 
 
 @pytest.mark.parametrize("solvable", [None, 3])

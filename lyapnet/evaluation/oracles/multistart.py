@@ -11,6 +11,7 @@ from lyapnet.evaluation.oracles.base import Report
 
 HOPELESS = 8  # failures from the first states on, after which there is nothing to be expected for the others
 SECONDS = 15.0  # of the starts of one state, after which no further one is made
+EXPLORED = 16  # first states on which all starts are tried, before it is judged whether there are several minima
 NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
 SAME = 1e-6  # relative difference of two costs that are the same
 
@@ -34,8 +35,10 @@ class MultiStart:
     """The best candidate of each initial state, improved start by start.
 
     Which local minimum a start leads to is luck, but the least cost is continuous in x₀: what was found from one state
-    is the first start of those after it that are near, and is tried from the states around it, and from theirs, as long
-    as that improves any.
+    is the first start of those after it that are near. Of the first EXPLORED states all starts are tried, and what was
+    found from the states around. Where none of them improves on a minimum that is known, the other states have that
+    first start alone, and those that cost less than where it led. Else they have all of them too, and in the end what
+    was found from one state is tried from the states around it, and from theirs, as long as that improves any.
 
     Args:
         x0: (b, n).
@@ -51,10 +54,11 @@ class MultiStart:
     ):
         self.x0, self.best, self.minimise = x0, list(best), minimise
         self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
+        self.several = False  # whether a start has improved on a minimum that was known
         self._tried = dict[tuple[int, int], Candidate]()  # by state and identity, as no start is tried twice
 
     def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
-        """Try the starts of some states, given by their indices, then what that found from the states around."""
+        """Try the starts of some states, given by their indices, and what was found from the states around."""
         failures, last = 0, ""  # in a row, from the first state on; the reason of the last one
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
@@ -64,23 +68,33 @@ class MultiStart:
             began, solved = time.monotonic(), [j for j in starts if j < i and self.best[j] is not None]
             if solved:  # the optimum of the nearest of them, from where IPOPT most often has the shortest way
                 self._try(i, self.best[solved[int(self._distances(i)[solved].argmin())]])
+            is_enough = done >= EXPLORED and not self.several and self.best[i] is not None
             for start in own:
-                self._try(i, start)
+                if not is_enough or is_better(start, self.best[i]):
+                    self._try(i, start)
                 if time.monotonic() - began > SECONDS:
                     break
             failures = failures + 1 if self.best[i] is None and failures == done else -1
             last = self.reasons[i]
-        nearest = [self._nearest(i) for i in range(len(self.x0))]
+            if done == min(EXPLORED, len(starts)) - 1:
+                explored = [*starts][:EXPLORED]
+                self._exchange(explored, explored)
+        if self.several:
+            self._exchange(starts, range(len(self.x0)))
+        progress(len(starts), len(starts))
+
+    def _exchange(self, states: Iterable[int], others: Sequence[int]) -> None:
+        """Try from some states what was found from those of others that are around."""
+        nearest = {i: self._nearest(i, others) for i in others}
         followers = defaultdict(list)
-        for i, neighbours in enumerate(nearest):
+        for i, neighbours in nearest.items():
             for j in neighbours:
                 followers[j].append(i)
-        pairs = deque((i, j) for i in starts for j in nearest[i])
+        pairs = deque((i, j) for i in states for j in nearest[i])
         while pairs:
             i, j = pairs.popleft()
             if self._try(i, self.best[j]):
                 pairs.extend((k, i) for k in followers[i])
-        progress(len(starts), len(starts))
 
     def _try(self, i: int, start: Candidate | None) -> bool:
         """Whether a start improves a state's best."""
@@ -93,6 +107,7 @@ class MultiStart:
             return False
         improved = is_better(end, self.best[i])
         if improved:
+            self.several |= self.best[i] is not None
             self.best[i] = end
         return improved
 
@@ -101,8 +116,7 @@ class MultiStart:
         spread = np.ptp(self.x0, axis=0)
         return (((self.x0 - self.x0[i]) / np.where(spread > 0, spread, 1)) ** 2).sum(1)
 
-    def _nearest(self, i: int) -> list[int]:
-        """The nearest other states, nearest first."""
+    def _nearest(self, i: int, others: Sequence[int]) -> list[int]:
+        """The nearest of some other states, nearest first."""
         distance = self._distances(i)
-        distance[i] = np.inf
-        return [int(j) for j in np.argsort(distance, kind="stable")[: min(NEIGHBOURS, len(distance) - 1)]]
+        return sorted((j for j in others if j != i), key=lambda j: distance[j])[:NEIGHBOURS]

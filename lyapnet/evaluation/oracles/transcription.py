@@ -18,7 +18,7 @@ from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
-from lyapnet.evaluation.oracles.multistart import SAME, Candidate, MultiStart, is_better
+from lyapnet.evaluation.oracles.multistart import EXPLORED, SAME, Candidate, MultiStart, is_better
 from lyapnet.evaluation.oracles.scales import Scales
 from lyapnet.problem import Problem
 from lyapnet.types import ControlPath, PerState, State, StatePath
@@ -32,7 +32,7 @@ INVALID = "IPOPT: Invalid_Number_Detected"
 WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
 BRIEF = 150  # iterations of further starts, where one has led to a minimum
-BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each; the others follow them
+BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each
 
 
 class Transcription(Oracle):
@@ -44,9 +44,11 @@ class Transcription(Oracle):
 
     The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
     close by the goal, random curves, the controls that the caller knows, a tried path where none of these leads to a
-    minimum, and the optima of its neighbours in the batch. The least cost counts, as a rollout of its controls in torch
-    has it, and is kept on disk. What no start leads to, or the rollout does not confirm, is NaN, and once the first few
-    states have none, the others are not tried. Controls that violate a constraint are none to compare with.
+    minimum, and the optima of its neighbours in the batch; where these lead to one minimum from each of the first
+    states, spread over the batch, the others follow their neighbours alone. The least cost counts, as a rollout of its
+    controls in torch has it, and is kept on disk. What no start leads to, or the rollout does not confirm, is NaN, and
+    once the first few states have none, the others are not tried. Controls that violate a constraint are none to
+    compare with.
 
     Args:
         problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
@@ -107,6 +109,8 @@ class Transcription(Oracle):
         search = MultiStart(states.numpy(), stored, self.minimise)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
+            explored = [pending[len(pending) * k // EXPLORED] for k in range(min(EXPLORED, len(pending)))]
+            pending = [*explored, *(i for i in pending if i not in explored)]
             starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
             self._search(search, starts, progress)
         optima = self._verified(states, search, given)
@@ -139,9 +143,8 @@ class Transcription(Oracle):
     ) -> Iterator[Iterator[Candidate]]:
         """For each pending state: what the caller knows, and the line to the goal with the control that costs nothing.
 
-        A few states, evenly spread over the batch, try random curves around that line too; a better minimum that these
-        find reaches the others from neighbour to neighbour. Where nothing has led to a minimum, the path that was tried
-        is the last one.
+        The first BENT states try random curves around that line too; a better minimum that these find reaches the
+        others from neighbour to neighbour. Where nothing has led to a minimum, the path that was tried is the last one.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()
@@ -151,11 +154,10 @@ class Transcription(Oracle):
         scale = np.where(extent > 0, extent, 1.0)
         tried, aside = self._scales.paths(states), ASIDE * self._scales.of_states * s
         curves = math.ceil(BENT * BENDS / min(BENT, len(pending)))
-        bent = {len(pending) * k // BENT for k in range(BENT)}
         for k, i in enumerate(pending):
             line = goal + (1 - s) * (states[i].numpy() - goal) + aside
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
-            paths = (line, *(line + bends)) if k in bent else (line,)
+            paths = (line, *(line + bends)) if k < BENT else (line,)
             cold = [Candidate(x, rest, math.inf) for x in paths]
             known = given[i]
             path = Candidate(tried.x[1:, i].numpy(), tried.u[:, i].numpy(), math.inf)

@@ -230,7 +230,7 @@ class TrainingConfig:
     )
     least_gain: float = option(
         0.0,
-        "By how much the validation loss has to fall in 60 steps for training to take all iterations; 0: always.",
+        "By how much the validation loss has to fall in 40 steps for training to take all iterations; 0: always.",
         at_least=0,
     )
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)

@@ -83,7 +83,7 @@ class Optimum(NamedTuple):
         return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows), self.mended[rows])
 
 
-def held_control(problem: Problem, free: Response, V_x: State, H: Tensor, now: bool = False) -> Control:
+def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
     """u held for Δt: the minimiser of ∫ℓ + V(F(x, u)) for V of gradient V_x at F(x, 0) and curvature H.
 
     It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
@@ -92,14 +92,12 @@ def held_control(problem: Problem, free: Response, V_x: State, H: Tensor, now: b
 
     Args:
         free: the step with the control that costs nothing.
-        now: whether it is computed from numbers, outside traces and without gradients.
     """
     B = free.by_control
     weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
     b = apply(B.mT, V_x) + free.slope
     if problem.controls.limited:
-        minimise = problem.controls.minimise_now if now else problem.controls.minimise
-        return minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
+        return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
     u = -solve(weight, b[..., None])[..., 0]
     return u if problem.cost.rest is None else u + problem.cost.rest
 
@@ -110,7 +108,7 @@ def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State],
     def law(n: int, x: State) -> Control:
         H, free = expansion.hessian[n + 1], problem.response(x)
         V_x = expansion.gradient[n + 1] + apply(H, free.x - expansion.x[n + 1])
-        return held_control(problem, free, V_x, H, now=True)
+        return held_control(problem, free, V_x, H)
 
     return law
 
@@ -381,7 +379,7 @@ def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
     if not problem.controls.limited:
         return -torch.linalg.solve(Q_uu, Q_ua)
     Q_u, Q_ux = Q_ua[..., 0], Q_ua[..., 1:]
-    to = problem.controls.minimise_now(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
+    to = problem.controls.minimise(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
     k = to - u
     slope = Q_u + (Q_uu @ k[..., None])[..., 0]
     further = problem.controls.project(to - slope.sign() * (1 + to.abs()))

@@ -112,3 +112,8 @@ class _Inverse(torch.autograd.Function):
     def backward(ctx: Any, bar: Tensor) -> Tensor:
         (inverse,) = ctx.saved_tensors
         return -multiply(inverse.mT, multiply(bar, inverse.mT))
+
+
+def has_values(x: Tensor) -> bool:
+    """Whether a tensor has numbers that may be looked at, as none has in a trace or under vmap."""
+    return type(x) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]

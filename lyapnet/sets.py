@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from lyapnet.linear_algebra import apply, solve
+from lyapnet.linear_algebra import apply, has_values, solve
 from lyapnet.types import Control, ControlMatrix, State
 
 
@@ -127,10 +127,6 @@ class ControlSet(nn.Module, ABC):
             b: (*batch, m).
         """
 
-    def minimise_now(self, R: ControlMatrix, b: Control) -> Control:
-        """`minimise` of numbers at hand, without gradients: it may look at them, as no traced function can."""
-        return self.minimise(R, b)
-
     @abstractmethod
     def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
         """Whether each control lies in U."""
@@ -166,7 +162,8 @@ class ControlBox(ControlSet):
 
     The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with two, clipped
     twice; with three or four, each way to hold some of them at a limit leaves a linear system for the others, and all
-    3ᵐ are solved as one batch; with more, by an active-set method.
+    3ᵐ are solved as one batch; with more, by an active-set method. Of numbers, from which no gradient is asked, with
+    three and more by rounds that a trace could not have, as it may not look at them.
 
     Args:
         lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none on that side.
@@ -227,24 +224,20 @@ class ControlBox(ControlSet):
         R, b = R.double(), b.double()
         if m == 2:
             return self._of_two(R, b, low, high).to(given)
-        u = (self._of_few if m <= FEW else self._of_many)(R, b, low, high).clamp(low, high)
+        way = self._of_numbers if _are_numbers(R, b) else self._of_few if m <= FEW else self._of_many
+        u = way(R, b, low, high).clamp(low, high)
         known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         return torch.where(known[..., None], u, torch.nan).to(given)  # what is no number stays none
 
-    @torch.no_grad()
-    def minimise_now(self, R: ControlMatrix, b: Control) -> Control:
-        """With three controls and more, rounds of which each holds those that the last one drives outwards; what is
-        not settled so, if anything, goes on with `minimise`."""
-        m = b.shape[-1]
-        if m <= 2 or type(self).minimise is not ControlBox.minimise or self.lower.numel() not in (1, m):
-            return self.minimise(R, b)
-        given, shape, (low, high) = b, b.shape, (side.double().expand(m) for side in self.limits)
-        R, b = R.double().expand(*shape, m).reshape(-1, m, m), b.double().reshape(-1, m)
+    def _of_numbers(self, R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """By rounds each of which holds those that the last one drives outwards; what is not settled so, if anything,
+        by the active-set method."""
+        m, shape = b.shape[-1], b.shape
+        R, b = R.expand(*shape, m).reshape(-1, m, m), b.reshape(-1, m)
         u, settled = _by_rounds(R, b, low, high)
         if not bool(settled.all()):
-            u[~settled] = self.minimise(R[~settled], b[~settled])
-        known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
-        return torch.where(known[:, None], u.clamp(low, high), torch.nan).reshape(shape).to(given)
+            u[~settled] = self._of_many(R[~settled], b[~settled], low, high)
+        return u.reshape(shape)
 
     @staticmethod
     def _of_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
@@ -358,6 +351,11 @@ def _active_set(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
         gain, which = (side * (2 * apply(R, u) + b) / scale).max(-1, keepdim=True)
         side = torch.where((each == which) & arrived & (gain > 0), 0.0, side)
     return side
+
+
+def _are_numbers(*tensors: Tensor) -> bool:
+    """Whether values may be looked at, and nothing asks for a gradient."""
+    return all(has_values(each) and not (torch.is_grad_enabled() and each.requires_grad) for each in tensors)
 
 
 FEW = 4  # controls of which all ways are tried: 3⁴ = 81 systems, less code to compile than that many rounds

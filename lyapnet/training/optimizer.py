@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-COOLING = 60  # steps in which the learning rate of a training that has settled falls to its end
+COOLING = 40  # steps in which the learning rate of a training that has settled falls to its end
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool)
         values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
         W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
-        return answer.x, B, answer.slope, W, _compared(problem).minimise_now(W / 2, b - apply(W, about))
+        return answer.x, B, answer.slope, W, _compared(problem).minimise(W / 2, b - apply(W, about))
 
     about = problem.rest.to(now).expand(*now.shape[:-1], -1)
     led, B, slope, W, best = responses(about)
@@ -186,9 +186,7 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool)
     return [y.flatten(0, 1).detach() for y in columns]
 
 
-def errors(
-    V: ValueFunction, examples: Examples, problem: Problem, minimise: Callable[[Tensor, Control], Control] | None = None
-) -> tuple[Tensor, Tensor]:
+def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tensor, Tensor]:
     """The means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
 
     Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
@@ -196,16 +194,12 @@ def errors(
     is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
     all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state, and limits are left out.
 
-    Args:
-        minimise: that of the controls which are compared; None: the one that looks at numbers.
-
     Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
     t, x, value, after, about, led, B, slope, W, best, cost, rate = examples
-    minimise = minimise or _compared(problem).minimise_now
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = minimise(W / 2, b - apply(W, about))
+        u = _compared(problem).minimise(W / 2, b - apply(W, about))
     excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
 
@@ -220,7 +214,7 @@ class _Misfit(nn.Module):
 
     def forward(self, *columns: Tensor) -> Tensor:
         (problem,) = self._problem
-        value_error, excess = errors(self.V, Examples(*columns), problem, _compared(problem).minimise)
+        value_error, excess = errors(self.V, Examples(*columns), problem)
         return VALUE_WEIGHT * value_error + excess
 
 

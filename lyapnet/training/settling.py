@@ -13,7 +13,7 @@ from lyapnet.training.learner import Learner, mean_over_processes
 from lyapnet.training.optimizer import COOLING
 from lyapnet.training.stages import Stages
 
-WINDOW = 60  # steps in which the validation loss has to fall
+WINDOW = 40  # steps in which the validation loss has to fall
 
 
 class Settling(Callback):

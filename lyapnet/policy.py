@@ -17,7 +17,8 @@ from lyapnet.sets import ControlSet
 from lyapnet.systems import ControlAffineSystem
 from lyapnet.types import Control, PerState, State, Time
 
-DESCENTS, SHARES = 5, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
+DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
+STEEP = 5  # as many steps where V is as steep as it is close to constraints
 
 
 class PolicyOutput(NamedTuple):
@@ -160,12 +161,12 @@ class LookaheadPolicy(SampledPolicy):
 
         u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
-    From the sampled law on, DESCENTS Newton steps with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx B, or H for V_xx where that is not
-    convex; of each, the share of SHARES that lowers Q most, or none. For a V that is steep within one step, as close to
-    state constraints, where the sampled law overshoots. Its derivative is that of the minimiser (implicit function
-    theorem), up to what the steps leave of Q_u, and V_xᵀF_uu, which is zero with Euler. Where Q_uu/Δt does not exceed
-    CONVEX · ℓ_uu, both are those of the model H, and u may be short of the minimiser. In float32 u is as exact as the
-    rounding of V lets Q be compared.
+    From the sampled law on, DESCENTS Newton steps, STEEP where there are constraints, with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx
+    B, or H for V_xx where that is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is
+    steep within one step, as close to state constraints, where the sampled law overshoots. Its derivative is that of
+    the minimiser (implicit function theorem), up to what the steps leave of Q_u, and V_xᵀF_uu, which is zero with
+    Euler. Where Q_uu/Δt does not exceed CONVEX · ℓ_uu, both are those of the model H, and u may be short of the
+    minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
 
     Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
     Wright, Numerical Optimization, 2006, ch. 3 (the steps).
@@ -176,7 +177,7 @@ class LookaheadPolicy(SampledPolicy):
         H = self._curvature(step.after)
         with torch.no_grad():
             u = super().forward(t, x)
-            for _ in range(DESCENTS):
+            for _ in range(DESCENTS if self.problem.constraints is None else STEEP):
                 u = step.descended(u, H)
         moved = step.newton(u, H)
         return u + (moved - moved.detach())

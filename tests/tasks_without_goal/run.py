@@ -40,9 +40,9 @@ def cpu_seconds(process: psutil.Process) -> float:
     return total
 
 
-def train(folder: Path, seed: int, limit: float) -> dict[str, Any]:
+def train(folder: Path, seed: int, limit: float, changes: Sequence[str] = ()) -> dict[str, Any]:
     """Train in a folder; the terminal goes to train.out there."""
-    command = [sys.executable, "-m", "lyapnet", "train", "--config", "task.yaml", f"seed={seed}"]
+    command = [sys.executable, "-m", "lyapnet", "train", "--config", "task.yaml", f"seed={seed}", *changes]
     used, started, stopped = 0.0, time.monotonic(), False
     with (folder / "train.out").open("w", encoding="utf-8") as out:
         process = psutil.Popen(command, cwd=folder, stdout=out, stderr=subprocess.STDOUT)
@@ -67,6 +67,7 @@ class Task(NamedTuple):
     folder: Path
     states: Sequence[Sequence[float]]
     optima: Sequence[float]  # J*
+    changes: Sequence[str] = ()  # to the file, as key=value
 
 
 def task_of(name: str) -> Task:
@@ -85,7 +86,7 @@ def measure(folder: Path, task: Task) -> dict[str, float]:
     if not checkpoints:
         raise FileNotFoundError(f"Expected best.ckpt under {folder / 'logs'}, got none; read train.out there.")
     with inside(folder):
-        parts = parts_of(load_config(Path("task.yaml"), []))
+        parts = parts_of(load_config(Path("task.yaml"), list(task.changes)))
         controller = lyapnet.load(checkpoints[-1], system=parts.system, cost=parts.cost)
     problem, optima = controller.problem, torch.tensor(task.optima, dtype=torch.float64)
     J, h, u = simulate(problem, task.states, lambda k, x: controller.policy(k * problem.horizon.dt, x))
@@ -107,7 +108,7 @@ def train_and_measure(task: Task, seed: int, limit: float = LIMIT) -> tuple[dict
         folder = Path(place)
         for file in ("system.py", "task.yaml"):
             shutil.copy(task.folder / file, folder)
-        run = train(folder, seed, limit)
+        run = train(folder, seed, limit, task.changes)
         print((folder / "train.out").read_text(encoding="utf-8"))
         return run, measure(folder, task)
 

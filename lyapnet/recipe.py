@@ -16,7 +16,7 @@ STANDARD: dict[str, Any] = {
         "warmup": 40,
         "validate_every": 20,
         "lost_share": 0.5,
-        "least_gain": 5e-4,
+        "least_gain": 2e-4,
     },
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -452,3 +453,26 @@ def test_defaults_are_not_shared_between_configs(plain):
 def test_first_line_of_a_shipped_config_runs_it(path):
     command = f"# python train.py --config conf/{path.relative_to(CONF)}"
     assert path.read_text().splitlines()[0].startswith(command)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        *((f"training.least_gain={value}", "training.least_gain") for value in ("-1", "much", "nan", "[1]", "inf", "")),
+        *((f"rollout.choose_policy={value}", "rollout.choose_policy as bool") for value in ("maybe", "[true]", "")),
+        *((f"constraints.margin={v}", "constraints.margin") for v in ("-0.1", "0", "wide", "nan", "[0.1]", "{a: 1}")),
+        *((f"network.penalty={value}", "network.penalty as bool") for value in ("heavy", "[1]")),
+        *((f"rollout.policy={value}", "rollout.policy as one of hjb") for value in ("look_ahead", "3")),
+        *((f"rollout.compile={value}", "rollout.compile as one of auto, on, off") for value in ("maybe", "1")),
+        ("horizon.stationary=sometimes", "horizon.stationary as bool"),
+        ("training.least_gian=0.1", "did you mean training.least_gain?"),
+        ("rollout.choose_polcy=true", "did you mean rollout.choose_policy?"),
+        ("constraints.margn=0.1", "did you mean constraints.margin?"),
+        ("network.penlty=true", "did you mean network.penalty?"),
+    ],
+)
+def test_what_is_no_value_of_a_key_is_refused_in_one_line(override, said):
+    with pytest.raises(UsageError) as refused:
+        load_config(Path("conf/obstacle.yaml"), [override])
+    assert said in str(refused.value)
+    assert re.fullmatch(r"Expected .+, got.+[;:,] .+[.?]", str(refused.value))

@@ -70,7 +70,7 @@ class Learner(nn.Module):
         self.output: ProgramOutput | None = None
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
-        self.settled_at: int | None = None  # the step from which its learning rate falls to its end
+        self.cooling: tuple[int, int] | None = None  # steps between which its learning rate falls to its end
         self.region_share: Tensor | None = None  # of D, with the region program
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
 

@@ -8,8 +8,6 @@ from typing import Any
 import torch
 from torch import nn
 
-COOLING = 40  # steps in which the learning rate of a training that has settled falls to its end
-
 
 @dataclass(frozen=True)
 class OptimizerOptions:
@@ -32,18 +30,17 @@ class OptimizerOptions:
         cls = {"adam": torch.optim.Adam, "adamw": torch.optim.AdamW}[self.name]
         return cls(parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
 
-    def rate(self, step: int, iterations: float, settled_at: int | None = None) -> float:
+    def rate(self, step: int, iterations: float, cooling: tuple[int, int] | None = None) -> float:
         """The learning rate at a step, as a share of the greatest.
 
         Args:
             iterations: of the whole schedule.
-            settled_at: a step from which it falls to its end within COOLING steps, and then is zero; None: there is
-                none.
+            cooling: steps between which it falls to its end, and then is zero; None: there are none.
         """
         final = self.final_learning_rate / self.learning_rate
-        if settled_at is not None and step > settled_at:
-            share = (step - settled_at) / COOLING
-            return _half_cosine(self.rate(settled_at, iterations), final, share) if share < 1 else 0.0
+        if cooling is not None and step > cooling[0]:
+            share = (step - cooling[0]) / (cooling[1] - cooling[0])
+            return _half_cosine(self.rate(cooling[0], iterations), final, share) if share < 1 else 0.0
         return _half_cosine(1.0, final, step / iterations) * min((step + 1) / (self.warmup + 1), 1.0)
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from statistics import fmean
 from typing import Any
 
 import torch
@@ -10,18 +11,20 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lyapnet.config import Config
 from lyapnet.training.curves import members_of
 from lyapnet.training.learner import Learner, mean_over_processes
-from lyapnet.training.optimizer import COOLING
 from lyapnet.training.stages import Stages
 
 WINDOW = 40  # steps in which the validation loss has to fall
+SHORT, LONG = 40, 160  # steps in which the learning rate falls to its end
+NOISE = 2.0  # times the least gain: the mean loss of a window above the least, from which on it takes LONG
 
 
 class Settling(Callback):
     """Has a member's learning rate fall to its end once its validation loss has stopped falling; training ends with it.
 
     The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
-    `least_gain` below its least value before. Of several seeds, each settles as it would alone, and training ends with
-    the last of them; one that has ended waits with a rate of zero.
+    `least_gain` below its least value before. The rate falls within SHORT steps; where losses of the window are well
+    above the least, as steps are too long for what is left to learn, within LONG ones. Of several seeds, each settles
+    as it would alone, and training ends with the last of them; one that has ended waits with a rate of zero.
 
     Args:
         least_gain: in units of the loss, which are shares of the mean cost, or of the spread of costs where there is no
@@ -33,18 +36,18 @@ class Settling(Callback):
     def __init__(self, least_gain: float, warmup: int, stages: Stages):
         self.least_gain, self.warmup, self.stages = least_gain, warmup, stages
         self.losses: dict[str, list[tuple[int, float]]] = {}  # label ↦ (step, loss) of each validation
-        self.settled: dict[str, int] = {}  # label ↦ the step
+        self.cooling: dict[str, list[int]] = {}  # label ↦ between which steps the rate falls
 
     def state_dict(self) -> dict[str, Any]:
-        return {"losses": self.losses, "settled": self.settled}
+        return {"losses": self.losses, "cooling": self.cooling}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         if self.least_gain:
-            self.losses, self.settled = dict(state_dict["losses"]), dict(state_dict["settled"])
+            self.losses, self.cooling = dict(state_dict["losses"]), dict(state_dict["cooling"])
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for member in members_of(pl_module):
-            member.settled_at = self.settled.get(member.label)
+            self._cool(member)
         self._shorten(trainer, members_of(pl_module))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -54,25 +57,43 @@ class Settling(Callback):
         for member in members:
             loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=pl_module.device)
             self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
-            if member.settled_at is None and self._has_stopped(member.label, step):
-                self.settled[member.label] = member.settled_at = step
+            end = step + self._steps_to_cool(member.label, step)
+            if (
+                member.cooling is None
+                and self._has_stopped(member.label, step)
+                and end < (trainer.max_epochs or math.inf)
+            ):
+                self.cooling[member.label] = [step, end]
+                self._cool(member)
                 self._shorten(trainer, members)
                 if trainer.is_global_zero:
                     named = f" of {member.label.replace('_', ' ')}" if member.label else ""
                     self.stages.console.print(
                         f"settled: in {WINDOW} steps the validation loss{named} fell by less than "
-                        f"{self.least_gain:g}; its training ends at step {step + COOLING}",
+                        f"{self.least_gain:g}; its training ends at step {end}",
                         soft_wrap=True,
                     )
 
     def _has_stopped(self, label: str, step: int) -> bool:
         before = [loss for at, loss in self.losses[label] if at <= step - WINDOW]
-        since = [loss for at, loss in self.losses[label] if at > step - WINDOW]
-        return bool(before) and min(before) - min(since) < self.least_gain
+        return bool(before) and min(before) - min(self._last(label, step)) < self.least_gain
+
+    def _steps_to_cool(self, label: str, step: int) -> int:
+        least = min(loss for _, loss in self.losses[label])
+        return LONG if fmean(self._last(label, step)) - least > NOISE * self.least_gain else SHORT
+
+    def _last(self, label: str, step: int) -> list[float]:
+        """The losses of the last WINDOW steps."""
+        return [loss for at, loss in self.losses[label] if at > step - WINDOW]
+
+    def _cool(self, member: Learner) -> None:
+        """Tell a member between which steps its rate falls."""
+        steps = self.cooling.get(member.label)
+        member.cooling = None if steps is None else (steps[0], steps[1])
 
     def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
         """End when all have settled."""
-        end = end_of(self.settled, len(members))
+        end = end_of(self.cooling, len(members))
         if end < (trainer.max_epochs or math.inf):
             trainer.fit_loop.max_epochs = int(end)
 
@@ -80,9 +101,9 @@ class Settling(Callback):
 def end_of_training(checkpoint: Mapping[str, Any], config: Config) -> float:
     """The last step of a training that has settled, as its checkpoint says; infinite where it has not."""
     state = checkpoint.get("callbacks", {}).get(Settling.__qualname__, {})
-    return end_of(state.get("settled", {}), config.seeds) if config.training.least_gain else math.inf
+    return end_of(state.get("cooling", {}), config.seeds) if config.training.least_gain else math.inf
 
 
-def end_of(settled: Mapping[str, int], members: int) -> float:
+def end_of(cooling: Mapping[str, Sequence[int]], members: int) -> float:
     """The last step of a training whose members have settled; infinite where one has not."""
-    return max(settled.values()) + COOLING if len(settled) == members else math.inf
+    return max(end for _, end in cooling.values()) if len(cooling) == members else math.inf

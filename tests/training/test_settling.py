@@ -8,9 +8,9 @@ import pytest
 from rich.console import Console
 
 from lyapnet.checkpoint import read_checkpoint
-from lyapnet.training.optimizer import COOLING, OptimizerOptions
+from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.runs import Run
-from lyapnet.training.settling import WINDOW, Settling, end_of
+from lyapnet.training.settling import SHORT, WINDOW, Settling, end_of
 from lyapnet.training.stages import Stages
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, without_figures
 
@@ -21,7 +21,7 @@ LONG = {
     "evaluation": {**SMALL["evaluation"], "optimum": False},
 }
 SETTLED_AT = EVERY + WINDOW  # with a gain that no loss has, after the first validation
-END = SETTLED_AT + COOLING
+END = SETTLED_AT + SHORT
 
 
 def desk(folder, **changes):
@@ -57,20 +57,30 @@ def test_when_a_loss_has_stopped_falling(losses, stopped):
     assert settling._has_stopped("", EVERY * (len(losses) - 1)) is stopped
 
 
+@pytest.mark.parametrize(
+    ("losses", "steps"),
+    [([1.0, 1.0, 1.0, 1.0], SHORT), ([1.0, 1.001, 1.0, 1.001], SHORT), ([1.0, 1.1, 1.0, 1.01], 4 * SHORT)],
+)
+def test_where_losses_go_up_and_down_the_rate_falls_more_slowly(losses, steps):
+    settling = Settling(1e-3, 0, Stages(Console(), ""))
+    settling.losses[""] = [(EVERY * k, loss) for k, loss in enumerate(losses)]
+    assert settling._steps_to_cool("", EVERY * (len(losses) - 1)) == steps
+
+
 def test_the_rate_falls_from_where_it_settled():
     options = OptimizerOptions(learning_rate=1e-2, final_learning_rate=1e-4)
     whole = [options.rate(step, 400) for step in range(400)]
-    settled = [options.rate(step, 400, settled_at=100) for step in range(400)]
+    settled = [options.rate(step, 400, cooling=(100, 140)) for step in range(400)]
     assert settled[:101] == whole[:101]
-    falling = settled[100 : 100 + COOLING]
+    falling = settled[100:140]
     assert all(later < earlier for earlier, later in itertools.pairwise(falling))
     assert falling[-1] == pytest.approx(1e-2, rel=0.2)
-    assert not any(settled[100 + COOLING :])
+    assert not any(settled[140:])
 
 
 def test_it_ends_with_the_last_seed():
-    assert end_of({"seed_0": 60, "seed_1": 100}, 2) == 100 + COOLING
-    assert end_of({"seed_0": 60}, 2) == math.inf
+    assert end_of({"seed_0": [60, 220], "seed_1": [100, 140]}, 2) == 220
+    assert end_of({"seed_0": [60, 100]}, 2) == math.inf
 
 
 def test_training_ends_early_and_says_so(run):
@@ -121,8 +131,8 @@ def test_a_seed_that_has_settled_waits_for_the_others(tmp_path):
     two = desk(tmp_path / "two", seeds=2)
     status, out, errors = two.train(prepare=first)
     assert (status, errors) == (0, "")
-    assert f"the validation loss of seed 0 fell by less than 1e+06; its training ends at step {EVERY + COOLING}" in out
-    assert f"step {40 + COOLING}/{40 + COOLING}" in out
+    assert f"the validation loss of seed 0 fell by less than 1e+06; its training ends at step {EVERY + SHORT}" in out
+    assert f"step {40 + SHORT}/{40 + SHORT}" in out
     weights, others = (read_checkpoint(path)["state_dict"] for path in (alone.best(), two.best("seed_0")))
     for key in weights:
         assert float((weights[key] - others[key]).abs().max()) < 1e-7

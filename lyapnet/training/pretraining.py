@@ -33,13 +33,13 @@ from lyapnet.training.optima import nearest
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, PerState, State, StatePath
 
-STEPS, BATCH, RATE = (2000, 1000), 256, (0.01, 0.005)  # before and after the fitted law shows where it leads
+STEPS, BATCH, RATE = (2000, 1000), 512, (0.01, 0.005)  # before and after the fitted law shows where it leads
 BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
-GAIN = 1e-3  # of the cost of the optima, by which a further fit has to lower that of the law for another one
+GAIN = 2e-4  # of the cost of the optima, by which a further fit has to lower that of the law for another one
 NEWTON = 6  # steps to where a law that looks ahead looks at V
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
-ROUNDS, GOOD = 4, 1.02  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
+ROUNDS, GOOD = 4, 1.001  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
 LEAST = 1e-4  # of the cost of its trajectory, against which an error of a stationary V counts where V is less
 TRUSTED, TRUSTED_NEAR = 0.01, 1.0  # ½ δᵀ|H|δ, as a share of J, up to which an expansion is believed
@@ -269,7 +269,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == ROUNDS or (k and (now[1] <= enough or before - now[1] <= gain)):
+        if k == ROUNDS or now[1] <= enough or before - now[1] <= gain:
             break
         before = now[1]
         examples = examples.with_further(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))

@@ -40,7 +40,7 @@ SWING = LINEAR | {
 def _few_optima():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 12)
-        patch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
+        patch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
         patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         yield
 

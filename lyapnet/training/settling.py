@@ -14,17 +14,17 @@ from lyapnet.training.learner import Learner, mean_over_processes
 from lyapnet.training.stages import Stages
 
 WINDOW = 40  # steps in which the validation loss has to fall
-SHORT, LONG = 40, 160  # steps in which the learning rate falls to its end
-NOISE = 2.0  # times the least gain: the mean loss of a window above the least, from which on it takes LONG
+COOLING = 40  # steps in which the learning rate then falls to its end
+NOISE = 2.0  # times the least gain: how far the mean loss of the window may be above the least
 
 
 class Settling(Callback):
     """Has a member's learning rate fall to its end once its validation loss has stopped falling; training ends with it.
 
     The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
-    `least_gain` below its least value before. The rate falls within SHORT steps; where losses of the window are well
-    above the least, as steps are too long for what is left to learn, within LONG ones. Of several seeds, each settles
-    as it would alone, and training ends with the last of them; one that has ended waits with a rate of zero.
+    `least_gain` below its least value before, and its mean not well above that: losses that go up and down need shorter
+    steps, not fewer. Of several seeds, each settles as it would alone, and training ends with the last of them; one
+    that has ended waits with a rate of zero.
 
     Args:
         least_gain: in units of the loss, which are shares of the mean cost, or of the spread of costs where there is no
@@ -57,12 +57,8 @@ class Settling(Callback):
         for member in members:
             loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=pl_module.device)
             self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
-            end = step + self._steps_to_cool(member.label, step)
-            if (
-                member.cooling is None
-                and self._has_stopped(member.label, step)
-                and end < (trainer.max_epochs or math.inf)
-            ):
+            end, last = step + COOLING, trainer.max_epochs or math.inf
+            if member.cooling is None and end < last and self._has_stopped(member.label, step):
                 self.cooling[member.label] = [step, end]
                 self._cool(member)
                 self._shorten(trainer, members)
@@ -76,15 +72,10 @@ class Settling(Callback):
 
     def _has_stopped(self, label: str, step: int) -> bool:
         before = [loss for at, loss in self.losses[label] if at <= step - WINDOW]
-        return bool(before) and min(before) - min(self._last(label, step)) < self.least_gain
-
-    def _steps_to_cool(self, label: str, step: int) -> int:
-        least = min(loss for _, loss in self.losses[label])
-        return LONG if fmean(self._last(label, step)) - least > NOISE * self.least_gain else SHORT
-
-    def _last(self, label: str, step: int) -> list[float]:
-        """The losses of the last WINDOW steps."""
-        return [loss for at, loss in self.losses[label] if at > step - WINDOW]
+        since = [loss for at, loss in self.losses[label] if at > step - WINDOW]
+        if not before or min(before) - min(since) >= self.least_gain:
+            return False
+        return fmean(since) - min(*before, *since) <= NOISE * self.least_gain
 
     def _cool(self, member: Learner) -> None:
         """Tell a member between which steps its rate falls."""

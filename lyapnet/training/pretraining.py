@@ -253,7 +253,8 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     Args:
         report: is told what is being done.
     """
-    policy, goal, rows = learner.rollout.closed_loop.policy, learner.problem.goal, stream(learner.seed, START, 3)
+    policy, goal = learner.rollout.closed_loop.policy, learner.problem.goal
+    fitting = _Fit(learner, examples, stream(learner.seed, START, 3))
     exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     before = math.inf
@@ -264,7 +265,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         late = min(k, 1)
         within = f"within {SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        _lower(learner.V, examples, learner.problem, rows, STEPS[late], RATE[late], progress, SECONDS[late])
+        fitting.lower(examples, STEPS[late], RATE[late], SECONDS[late], progress)
         path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
@@ -283,36 +284,39 @@ def looks_ahead(learner: Learner) -> bool:
 
 def fit_briefly(learner: Learner, examples: Examples) -> None:
     """Lower both errors of V at examples in a few steps."""
-    rows = stream(learner.seed, START, 6)
-    _lower(learner.V, examples, learner.problem, rows, BRIEF, RATE[0], lambda done, total: None, SECONDS[0])
+    briefly = _Fit(learner, examples, stream(learner.seed, START, 6))
+    briefly.lower(examples, BRIEF, RATE[0], SECONDS[0], lambda done, total: None)
 
 
-def _lower(
-    V: ValueFunction,
-    examples: Examples,
-    problem: Problem,
-    generator: torch.Generator,
-    steps: int,
-    rate: float,
-    progress: Callable[[int, int], None],
-    seconds: float,
-) -> None:
-    """Lower both errors at the examples, by Adam, whose rate falls as a cosine over the steps, or the seconds."""
-    trained, began = trained_of(V), time.thread_time()
-    examples = examples.to(trained[0])
+class _Fit:
+    """Lowers both errors of V at examples; their gradient is traced once.
 
-    some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
-    differentiate = gradient_of_loss(_Misfit(V, problem), some)
-    optimizer = torch.optim.Adam(trained, rate)
-    for k in range(steps):
-        share = max(k / steps, (time.thread_time() - began) / seconds)
-        if share >= 1:
-            break
-        for group in optimizer.param_groups:
-            group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
-        progress(k, steps)
-        rows = torch.randint(len(examples.t), (BATCH,), generator=generator).to(trained[0].device)
-        differentiate(*(column[rows] for column in examples))
-        torch.nn.utils.clip_grad_norm_(trained, 1.0)
-        optimizer.step()
-    optimizer.zero_grad()
+    Args:
+        examples: like all that V is fitted to.
+        generator: draws the rows of each step.
+    """
+
+    def __init__(self, learner: Learner, examples: Examples, generator: torch.Generator):
+        self._trained, self._generator = trained_of(learner.V), generator
+        some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
+        loss = _Misfit(learner.V, learner.problem)
+        self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
+
+    def lower(
+        self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
+    ) -> None:
+        """By Adam, whose rate falls as a cosine over the steps, or the seconds of this thread's work."""
+        trained, began = self._trained, time.thread_time()
+        examples, optimizer = examples.to(trained[0]), torch.optim.Adam(trained, rate)
+        for k in range(steps):
+            share = max(k / steps, (time.thread_time() - began) / seconds)
+            if share >= 1:
+                break
+            for group in optimizer.param_groups:
+                group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
+            progress(k, steps)
+            rows = torch.randint(len(examples.t), (BATCH,), generator=self._generator).to(trained[0].device)
+            self._differentiate(*(column[rows] for column in examples))
+            torch.nn.utils.clip_grad_norm_(trained, 1.0)
+            optimizer.step()
+        optimizer.zero_grad()

@@ -91,8 +91,8 @@ class Settling(Callback):
 
 def end_of_training(checkpoint: Mapping[str, Any], config: Config) -> float:
     """The last step of a training that has settled, as its checkpoint says; infinite where it has not."""
-    state = checkpoint.get("callbacks", {}).get(Settling.__qualname__, {})
-    return end_of(state.get("cooling", {}), config.seeds) if config.training.least_gain else math.inf
+    state = checkpoint.get("callbacks", {}).get(Settling.__qualname__)
+    return end_of(state["cooling"], config.seeds) if state and config.training.least_gain else math.inf
 
 
 def end_of(cooling: Mapping[str, Sequence[int]], members: int) -> float:

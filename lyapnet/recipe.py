@@ -49,7 +49,8 @@ def completed(
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
-    if program == "region":  # whose loss may stay where it is for long, and then fall
+    if program == "region" or _names(("iterations",), "training", content, overrides):
+        # its loss may stay where it is for long, and then fall; a number of steps that somebody asks for is taken
         recipe["training"] = {**STANDARD["training"], "least_gain": 0.0}
     limited = _names(("lower", "upper"), "controls", content, overrides)
     if program in ("value", "region") and gradient == "discrete" and limited:

@@ -24,7 +24,9 @@ from tests.configs import CONF, EXPERIMENTS, HANGAR, PLAIN, objects
 CALLS = """
 import contextlib, io, json, sys
 from pathlib import Path
-from lyapnet.cli import main
+from lyapnet.cli import main, options
+
+options.FIRST = float("inf")  # no line about what is being done, however busy the machine is
 
 def call(folder, arguments):
     with contextlib.redirect_stderr(io.StringIO()) as message, contextlib.redirect_stdout(io.StringIO()):
@@ -476,3 +478,20 @@ def test_what_is_no_value_of_a_key_is_refused_in_one_line(override, said):
         load_config(Path("conf/obstacle.yaml"), [override])
     assert said in str(refused.value)
     assert re.fullmatch(r"Expected .+, got.+[;:,] .+[.?]", str(refused.value))
+
+
+@pytest.mark.parametrize(
+    ("changes", "overrides", "least_gain"),
+    [
+        ({}, [], STANDARD["training"]["least_gain"]),
+        ({"training": {"batch_size": 7}}, [], STANDARD["training"]["least_gain"]),
+        ({"training": {"iterations": 900}}, [], 0),
+        ({}, ["training.iterations=900"], 0),
+        ({}, ["training.iterations=900", "training.least_gain=0.1"], 0.1),
+        ({"training": {"iterations": 900, "least_gain": 0.1}}, [], 0.1),
+        ({"program": {"name": "region"}}, [], 0),
+    ],
+)
+def test_who_names_a_number_of_steps_has_them_all(changes, overrides, least_gain, plain):
+    task = {"experiment": "mine", **{section: plain[section] for section in FOUR}}
+    assert config_from_plain({**task, **changes}, overrides).training.least_gain == least_gain

@@ -167,6 +167,7 @@ class TrainingModule(L.LightningModule):
 
         Constraints have the penalty that they had.
         """
+        self._tell_members_apart(checkpoint)
         if self.penalty is not None:
             self.penalty.weight.fill_(checkpoint.get(KEY, {}).get("penalty", 0.0))
         stored = checkpoint.get(KEY, {}).get("rate_share", 1.0)
@@ -174,6 +175,19 @@ class TrainingModule(L.LightningModule):
         for state in checkpoint.get("optimizer_states", []):
             for group in state["param_groups"]:
                 group["lr"] *= self.rate_share / stored
+
+    def _tell_members_apart(self, checkpoint: dict[str, Any]) -> None:
+        """Give each member a learning rate of its own where they have one for all, as in checkpoints of version 0.3."""
+        counts = [len([*member.V.parameters()]) for member in self.members]
+        for state in checkpoint.get("optimizer_states", []):
+            if len(state["param_groups"]) == 1:
+                (group,) = state["param_groups"]
+                own = torch.tensor(group["params"]).split(counts)
+                state["param_groups"] = [{**group, "params": each.tolist()} for each in own]
+        for state in checkpoint.get("lr_schedulers", []):
+            for key in ("base_lrs", "_last_lr", "lr_lambdas"):
+                if len(state.get(key, ())) == 1:
+                    state[key] = state[key] * len(counts)
 
     # A checkpoint holds each weight once, under the name that it has had since version 0.1.
 

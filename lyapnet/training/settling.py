@@ -15,7 +15,7 @@ from lyapnet.training.stages import Stages
 
 WINDOW = 40  # steps in which the validation loss has to fall
 COOLING = 40  # steps in which the learning rate then falls to its end
-NOISE = 2.0  # times the least gain: how far the mean loss of the window may be above the least
+NOISE = 5.0  # times the least gain: how far the mean loss of the window may be above the least
 
 
 class Settling(Callback):

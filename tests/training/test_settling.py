@@ -49,7 +49,7 @@ def run(tmp_path_factory):
         ([1.0, 1.0, 1.0, 1.0], True),
         ([1.0, 1.001, 1.001, 0.9999], True),  # less than before by less than the least gain
         ([1.0, 5.0, 4.0, 0.9999], False),  # which goes up and down
-        ([1.0, 1.1, 1.0, 1.01], False),
+        ([1.0, 1.1, 1.0, 1.05], False),
         ([1.0, 5.0, 4.0, 0.9], False),
     ],
 )

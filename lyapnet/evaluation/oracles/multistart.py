@@ -65,7 +65,7 @@ class MultiStart:
             if failures == HOPELESS:
                 self.reasons[i] = self.reasons[i] or f"{last}, from {HOPELESS} states in a row; this one was not tried"
                 continue
-            began, solved = time.monotonic(), [j for j in starts if j < i and self.best[j] is not None]
+            began, solved = time.monotonic(), [j for j in starts if j != i and self.best[j] is not None]
             if solved:  # the optimum of the nearest of them, from where IPOPT most often has the shortest way
                 self._try(i, self.best[solved[int(self._distances(i)[solved].argmin())]])
             is_enough = done >= EXPLORED and not self.several and self.best[i] is not None

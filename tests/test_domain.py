@@ -19,10 +19,12 @@ from lyapnet.expansions import optimal_trajectories, path_under
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
+from tests.tasks_without_goal.consumption import system
+from tests.tasks_without_goal.consumption.system import Village
 
 PLAIN = {
     "experiment": "economy",
-    "system": {"name": f"{__name__}:Economy"},
+    "system": {"name": f"{system.__name__}:Village"},
     "cost": {"name": f"{__name__}:Displeasure"},
     "controls": {"lower": 0, "upper": 3},
     "initial_states": {"lower": [2], "upper": [8]},
@@ -30,32 +32,10 @@ PLAIN = {
 }
 
 
-class Economy(lyapnet.ControlAffineSystem):
-    """Capital, which its own yield makes grow, and which is consumed."""
+class Displeasure(system.Displeasure):
+    """With a scrap value below what capital is worth on the way: nothing is to be left."""
 
-    state_names, state_units = ("capital",), ("",)
-    control_names, control_units = ("consumption",), ("1/year",)
-
-    def f(self, x):
-        return 0.8 * x**0.4 - 0.1 * x
-
-    def g(self, x):
-        return -torch.ones_like(x)[..., None]
-
-
-class Displeasure(lyapnet.Cost):
-    """(c − 3)²/6 − 3/2 per year, and a scrap value below what capital is worth on the way: nothing is to be left."""
-
-    rest = torch.tensor([3.0])
-
-    def state(self, x):
-        return torch.full_like(x[..., 0], -1.5)
-
-    def R(self, x):
-        return torch.full((*x.shape[:-1], 1, 1), 1 / 6, dtype=x.dtype)
-
-    def terminal(self, x):
-        return -0.2 * x[..., 0]
+    scrap = 0.2
 
 
 class Written(lyapnet.ControlAffineSystem):
@@ -145,10 +125,10 @@ def test_a_task_without_a_domain_stays_as_it_is():
 
 
 def test_functions_are_finite_beyond_the_border_and_the_same_within():
-    problem, bare = economy(), Economy()
+    problem, bare = economy(), Village()
     assert str(problem.domain) == "capital > 0, where f is defined"
-    assert type(problem.system).__name__ == "Economy"
-    assert isinstance(problem.system, Economy)
+    assert type(problem.system).__name__ == "Village"
+    assert isinstance(problem.system, Village)
     within = torch.tensor([[1e-3], [1.0], [9.0]], dtype=torch.float64)
     assert torch.equal(problem.system.f(within), bare.f(within))
     assert torch.equal(problem.cost.terminal(within), Displeasure().terminal(within))
@@ -190,7 +170,7 @@ def test_a_path_that_leaves_has_no_finite_cost_and_an_optimum_stays():
     path = path_under(problem, lambda n, x: torch.full_like(x, 3.0), x0)
     assert path.cost.isinf().all()
     assert path.x.isfinite().all()
-    bare = problem.replaced(system=Economy(), cost=Displeasure())
+    bare = problem.replaced(system=Village(), cost=Displeasure())
     assert path_under(bare, lambda n, x: torch.full_like(x, 3.0), x0).cost.isinf().all()
     optimum = optimal_trajectories(problem, x0, torch.full((40, 6, 1), 0.5, dtype=torch.float64))
     assert all(part.isfinite().all() for part in (*optimum.path, *optimum.expansion))
@@ -265,14 +245,14 @@ def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
     assert abs(result["regret"]) < 0.02
     assert "domain left, share of states" in capsys.readouterr().out
     run = tmp_path / "logs/economy/version_0/checkpoints/best.ckpt"
-    assert str(lyapnet.load(run, system=Economy(), cost=Displeasure()).problem.domain).startswith("capital > 0")
+    assert str(lyapnet.load(run, system=Village(), cost=Displeasure()).problem.domain).startswith("capital > 0")
 
 
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 @pytest.mark.parametrize("gradient", ["discrete", "backprop"])
 def test_the_gradient_of_a_closed_loop_that_leaves_is_finite(method, gradient):
     problem, V = economy(rollout={"method": method}), Worth(0.0)
-    bare = problem.replaced(system=Economy(), cost=Displeasure())
+    bare = problem.replaced(system=Village(), cost=Displeasure())
     slopes = []
     for each in (problem, bare):
         rollout = Rollout(each, lyapnet.SampledPolicy(each, V), gradient=gradient)
@@ -296,7 +276,7 @@ def test_a_family_has_a_domain():
     assert_close(problem.system.f(x)[1, :1], 0.8 * x[1, :1] ** 0.4 - 0.2)
 
 
-class WithShare(Economy):
+class WithShare(Village):
     def __init__(self, share=0.4):
         super().__init__()
         self.share = share

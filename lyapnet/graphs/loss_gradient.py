@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from lyapnet.errors import LyapnetError
 from lyapnet.graphs.number_kernel.kernel import NumberKernel
-from lyapnet.graphs.stateless import stateless, trained_of, untrained_of
+from lyapnet.graphs.stateless import state_of, stateless, trained_of
 from lyapnet.graphs.tracing import trace
 
 
@@ -27,15 +27,11 @@ def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[.
         if kernel is None:
             gradient = torch.autograd.grad(loss(*arguments), trained, allow_unused=True)
         else:
-            gradient = kernel(*_state(loss), *arguments)
+            gradient = kernel(*state_of(loss), *arguments)
         for parameter, slope in zip(trained, gradient, strict=True):
             parameter.grad = slope
 
     return differentiate
-
-
-def _state(loss: nn.Module) -> list[Tensor]:
-    return [tensor.detach() for tensor in (*trained_of(loss), *untrained_of(loss))]
 
 
 def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None:
@@ -48,7 +44,7 @@ def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None
             value = of_state(*leaves, *tensors[trained:])
         return torch.autograd.grad(value, leaves, materialize_grads=True)
 
-    examples = [*_state(loss), *arguments]
+    examples = [*state_of(loss), *arguments]
     if any(example.device.type != "cpu" for example in examples):
         return None
     try:

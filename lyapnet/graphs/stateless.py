@@ -1,6 +1,6 @@
 """Modules as functions of the tensors that they are made of."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from torch import Tensor, nn
@@ -15,6 +15,12 @@ def trained_of(module: nn.Module) -> list[Tensor]:
 def untrained_of(module: nn.Module) -> list[Tensor]:
     """What a module is made of besides its trained parameters."""
     return [*(p for p in module.parameters() if not p.requires_grad), *module.buffers()]
+
+
+def state_of(module: nn.Module, trained: Sequence[Tensor] | None = None) -> list[Tensor]:
+    """The tensors that a module is made of, the trained ones first, or others in their place; without graphs."""
+    first = trained_of(module) if trained is None else trained
+    return [tensor.detach() for tensor in (*first, *untrained_of(module))]
 
 
 def stateless(module: nn.Module) -> Callable[..., Any]:

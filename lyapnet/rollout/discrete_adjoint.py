@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from lyapnet.errors import LyapnetError, UntraceableError, one_line
 from lyapnet.graphs.compilation import Scan
-from lyapnet.graphs.stateless import stateless, trained_of, untrained_of
+from lyapnet.graphs.stateless import state_of, stateless, trained_of, untrained_of
 from lyapnet.graphs.tracing import batched, cut, trace
 from lyapnet.horizon import TABLEAUX
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -178,7 +178,7 @@ class DiscreteAdjoint:
 
     def _state(self, theta: Sequence[Tensor]) -> list[Tensor]:
         """The tensors that the loop is made of, the trained ones first."""
-        return [tensor.detach() for tensor in (*theta, *untrained_of(self.loop))]
+        return state_of(self.loop, theta)
 
     def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
         """The work for batches like x₀ as graphs, traced once.

@@ -231,8 +231,7 @@ def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:
     rows = torch.linspace(0, len(examples.t) - 1, min(SOME, len(examples.t))).long()
     some = examples.each(lambda column: column[rows])
     with torch.no_grad():
-        value_error, excess = errors(V, some.to(next(V.parameters())), problem)
-    return float((VALUE_WEIGHT * value_error + excess).nan_to_num(torch.inf))
+        return float(_Misfit(V, problem)(*some.to(next(V.parameters()))).nan_to_num(torch.inf))
 
 
 def relative_misfit(V: ValueFunction, examples: Examples) -> float:

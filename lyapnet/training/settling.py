@@ -36,7 +36,7 @@ class Settling(Callback):
     def __init__(self, least_gain: float, warmup: int, stages: Stages):
         self.least_gain, self.warmup, self.stages = least_gain, warmup, stages
         self.losses: dict[str, list[tuple[int, float]]] = {}  # label ↦ (step, loss) of each validation
-        self.cooling: dict[str, list[int]] = {}  # label ↦ between which steps the rate falls
+        self.cooling: dict[str, tuple[int, int]] = {}  # label ↦ between which steps the rate falls
 
     def state_dict(self) -> dict[str, Any]:
         return {"losses": self.losses, "cooling": self.cooling}
@@ -47,7 +47,7 @@ class Settling(Callback):
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for member in members_of(pl_module):
-            self._cool(member)
+            member.cooling = self.cooling.get(member.label)
         self._shorten(trainer, members_of(pl_module))
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -59,8 +59,7 @@ class Settling(Callback):
             self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
             end, last = step + COOLING, trainer.max_epochs or math.inf
             if member.cooling is None and end < last and self._has_stopped(member.label, step):
-                self.cooling[member.label] = [step, end]
-                self._cool(member)
+                self.cooling[member.label] = member.cooling = step, end
                 self._shorten(trainer, members)
                 if trainer.is_global_zero:
                     named = f" of {member.label.replace('_', ' ')}" if member.label else ""
@@ -77,11 +76,6 @@ class Settling(Callback):
             return False
         return fmean(since) - min(*before, *since) <= NOISE * self.least_gain
 
-    def _cool(self, member: Learner) -> None:
-        """Tell a member between which steps its rate falls."""
-        steps = self.cooling.get(member.label)
-        member.cooling = None if steps is None else (steps[0], steps[1])
-
     def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
         """End when all have settled."""
         end = end_of(self.cooling, len(members))
@@ -95,6 +89,6 @@ def end_of_training(checkpoint: Mapping[str, Any], config: Config) -> float:
     return end_of(state["cooling"], config.seeds) if state and config.training.least_gain else math.inf
 
 
-def end_of(cooling: Mapping[str, Sequence[int]], members: int) -> float:
+def end_of(cooling: Mapping[str, tuple[int, int]], members: int) -> float:
     """The last step of a training whose members have settled; infinite where one has not."""
     return max(end for _, end in cooling.values()) if len(cooling) == members else math.inf

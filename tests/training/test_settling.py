@@ -71,8 +71,8 @@ def test_the_rate_falls_from_where_it_settled():
 
 
 def test_it_ends_with_the_last_seed():
-    assert end_of({"seed_0": [60, 220], "seed_1": [100, 140]}, 2) == 220
-    assert end_of({"seed_0": [60, 100]}, 2) == math.inf
+    assert end_of({"seed_0": (60, 220), "seed_1": (100, 140)}, 2) == 220
+    assert end_of({"seed_0": (60, 100)}, 2) == math.inf
 
 
 def test_training_ends_early_and_says_so(run):

@@ -22,15 +22,16 @@ class Village(lyapnet.ControlAffineSystem):
 
 
 class Displeasure(lyapnet.Cost):
-    """(c − 3)²/6 − 1.5 per year, with 3 as much as anybody wants, and −0.6 for each unit of capital that is left."""
+    """(c − 3)²/6 − 1.5 per year, with 3 as much as anybody wants, and −scrap for each unit of capital that is left."""
 
     rest = torch.tensor([3.0])
+    scrap = 0.6
 
     def state(self, x):
         return torch.full_like(x[..., 0], -1.5)
 
     def R(self, x):
-        return torch.full((*x.shape[:-1], 1, 1), 1 / 6).to(x)
+        return torch.full((*x.shape[:-1], 1, 1), 1 / 6, dtype=x.dtype)
 
     def terminal(self, x):
-        return -0.6 * x[..., 0]
+        return -self.scrap * x[..., 0]

@@ -274,33 +274,36 @@ def in_float64(problem: Problem) -> Problem:
 
 @torch.no_grad()
 def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it.
-
-    A path that leaves the domain has no finite cost, nor has one that jumps over a pole of f, g, q or φ, where it
-    divides by zero: no trajectory does.
-    """
+    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
         following, paid = problem.step(x[-1], u[-1])
         x.append(following)
         J = J + paid
-    J = (J + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf)
-    x, poles = torch.stack(x).nan_to_num(), _poles_of(problem)
-    if poles is not None:
+    return path_of(problem, torch.stack(x), torch.stack(u), J)
+
+
+def path_of(problem: Problem, x: StatePath, u: ControlPath, running_cost: PerState) -> Path:
+    """A path of which states and controls at the nodes and ∫ℓ over all of it are known, whatever they are.
+
+    If it leaves the domain, or jumps over a pole of f, g, q or φ, as no trajectory does, its cost is infinite.
+    """
+    J, x = (running_cost + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf), x.nan_to_num()
+    if (poles := _poles_of(problem)) is not None:
         J = J.masked_fill(poles.crossed(x.double().cpu()).to(J.device), torch.inf)
     if problem.domain is not None:
         J = J.masked_fill(problem.domain.left(x), torch.inf)
-    return Path(x, torch.stack(u).nan_to_num(), J)
+    return Path(x, u.nan_to_num(), J)
 
 
 def _poles_of(problem: Problem) -> Poles | None:
     """Where f, g, q and φ of a problem divide by zero, sought once."""
     if "poles" not in problem.findings:
         own = in_float64(problem)
-        system, cost = own.system, own.cost
+        f, g, cost = own.system.f, own.system.g, own.cost
         problem.findings["poles"] = poles_of(
-            lambda x: (system.f(x), system.g(x), cost.state(x), cost.terminal(x)), own.initial_states.center
+            lambda x: (f(x), g(x), cost.state(x), cost.terminal(x)), own.initial_states.center
         )
     return problem.findings["poles"]
 

@@ -11,7 +11,7 @@ from lyapnet.after_horizon import choose_law
 from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
 from lyapnet.certification.sound_certificate import sound_certificate
 from lyapnet.cli import main
-from lyapnet.cost import ObstacleCost
+from lyapnet.cost import ObstacleCost, spread
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.optimality import in_spreads
@@ -173,13 +173,35 @@ def test_a_constant_changes_neither_loss_nor_gradient_nor_regret():
             torch.linspace(-1, 2, 9, dtype=torch.float64)[:, None]
         )
         program = ValueProgram(constraint=1, cost_to_go=10, trajectory_cost=1).without_goal("")
-        output = program(trajectory, has_goal=has_goal)
+        output = program(trajectory, spread_of_costs=None if has_goal else spread(trajectory.cost.detach()))
         (output.loss - output.terms["trajectory_cost"].detach()).backward()
         terms = output.terms["constraint"], output.terms["cost_to_go"]
         return [float(value.detach()) for value in (*terms, V.share.grad)]
 
     assert loss(0.0, False) == pytest.approx(loss(100.0, False), rel=1e-6)
     assert loss(5.0, True) != pytest.approx(loss(100.0, True), rel=0.1)
+
+
+def test_losses_of_validations_compare_in_units_of_the_same_spread():
+    """A law that costs more never has the lower loss because its costs differ more from state to state."""
+    problem = far()
+    V = Exact()
+    learner = Learner(problem, V, Rollout(problem, lyapnet.SampledPolicy(problem, V)), ValueProgram(0, 0, 1))
+    x0 = torch.linspace(-1, 2, 9, dtype=torch.float64)[:, None]
+    with torch.no_grad():
+        best = learner.rollout(x0)
+
+    def loss(scale):
+        """Of costs that are 5 higher, and differ so many times as much."""
+        end, mean = best.terminal_cost, best.terminal_cost.mean()
+        return float(learner.measure_on(best._replace(terminal_cost=mean + scale * (end - mean) + 5)))
+
+    apart = loss(1.0) - loss(3.0)
+    optima = best.cost.where(torch.arange(9) < 5, torch.nan)
+    learner.validation_optimum, optimal = optima, optima[:5].std(correction=0)
+    assert loss(1.0) == pytest.approx(loss(3.0))
+    assert loss(1.0) == pytest.approx(float((best.cost.mean() + 5) / optimal))
+    assert abs(apart) > 0.1, "the twin, where no optimum is known"
 
 
 class _Raised(Exact):

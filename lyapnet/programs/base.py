@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.cost import spread
 from lyapnet.errors import DivergenceError, UsageError
 from lyapnet.programs.tolerances import Tolerances
 from lyapnet.rollout import Trajectory
@@ -65,15 +64,15 @@ class Program(ABC):
         self,
         trajectory: Trajectory,
         mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value,
-        has_goal: bool = True,
+        spread_of_costs: Float[Tensor, ""] | None = None,
     ) -> ProgramOutput:
         """The program on one batch of trajectories under the control law of a V.
 
         Args:
             trajectory: the batch.
-            has_goal: of the task; without one the batch's spread of costs stands for its mean cost.
             mean_over_processes: takes a number of this process to its mean over all that share the batch, so that
                 they normalise alike and the mean of their gradients is the gradient on the joint batch.
+            spread_of_costs: of a task without a goal, what stands for the mean cost; None where there is one.
 
         Raises:
             ValueError: no V defines the control law.
@@ -87,7 +86,8 @@ class Program(ABC):
         terms = {name: term.mean() for name, term in per_state.items()}
         if self.normalise:
             cost = trajectory.cost.detach()
-            size = mean_over_processes(cost.mean() if has_goal else spread(cost))
+            has_goal = spread_of_costs is None
+            size = mean_over_processes(cost.mean()) if has_goal else spread_of_costs
             each = cost if has_goal else size.expand_as(cost)
             terms = {name: (term / self.unit(name, each, size)).mean() for name, term in per_state.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N

@@ -146,6 +146,12 @@ class Rollout(nn.Module):
         _require_finite(x, running_cost, t)
         return Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
 
+    @property
+    def takes_steps_of_problem(self) -> bool:
+        """Whether it goes from node to node as Problem.step does, with u held."""
+        held = self.stepped is not self.closed_loop
+        return self.method == self.problem.horizon.method and (held or self.method == "euler")
+
     def together(self, x0: State, theta: Sequence[Tensor]) -> Iterator[Trajectory]:
         """E closed loops in one batch, each with parameters of its own; for gradient discrete.
 

@@ -11,11 +11,12 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.cost import PenaltyCost, spread
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.expansions import Path, in_float64, path_of, path_under
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
 from lyapnet.random_streams import POINTS, VALIDATION, stream
 from lyapnet.rollout import Rollout, Trajectory
-from lyapnet.types import PerState
+from lyapnet.types import PerState, State
 
 
 class Learner(nn.Module):
@@ -74,13 +75,28 @@ class Learner(nn.Module):
         self.region_share: Tensor | None = None  # of D, with the region program
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
 
+    @torch.no_grad()
+    def path_from(self, x0: State) -> Path:
+        """Where the law leads from x₀ (b, n), each control held for Δt, whatever becomes of it, in float64.
+
+        By the compiled closed loop, where that takes the same steps.
+        """
+        goal, loop = self.problem.goal, self.rollout.discrete
+        exact, policy = in_float64(self.problem), self.rollout.closed_loop.policy
+        if loop is not None and self.rollout.takes_steps_of_problem:
+            x, running_cost, _, u = loop(x0.to(goal))
+            return path_of(exact, x.double().cpu(), u.double().cpu(), running_cost[-1].double().cpu())
+        times = self.problem.horizon.times(goal)
+        return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
+
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
         """The loss of a training batch; its parts are kept in `output`.
 
         Args:
             draw: names the stream of the points off the closed loops.
         """
-        output = self._evaluated(trajectory, draw, mean_over_processes)
+        size = None if self.problem.has_goal else mean_over_processes(spread(trajectory.cost.detach()))
+        output = self._evaluated(trajectory, draw, size, mean_over_processes)
         terms = {name: term.detach() for name, term in output.terms.items()}
         self.output = ProgramOutput(
             output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
@@ -98,22 +114,33 @@ class Learner(nn.Module):
             self.region_share = self.pointwise.sampled_share(stream(self.seed, VALIDATION, POINTS))
             loss = 1 - self.region_share
         else:
-            loss = self._evaluated(trajectory, (VALIDATION, POINTS)).loss
+            loss = self._evaluated(trajectory, (VALIDATION, POINTS), self._lasting_spread(trajectory.cost)).loss
         self.validation_loss = float(loss)
         return loss
+
+    def _lasting_spread(self, cost: PerState) -> Tensor | None:
+        """Of a task without a goal, the spread of the optima, with which losses of one step compare with those of
+        another; of the costs themselves, where no optimum is known."""
+        if self.problem.has_goal:
+            return None
+        known = cost if self.validation_optimum is None else self.validation_optimum.to(cost)
+        known = known[known.isfinite()]
+        return spread(known if len(known) > 1 else cost)
 
     def _evaluated(
         self,
         trajectory: Trajectory,
         draw: Sequence[int],
+        spread_of_costs: Tensor | None,
         over_processes: Callable[[Tensor], Tensor] = lambda value: value,
     ) -> ProgramOutput:
         """The program, with its condition off the closed loops where that has a weight."""
-        output = self.program(trajectory, over_processes, self.problem.has_goal)
+        output = self.program(trajectory, over_processes, spread_of_costs)
         if self.pointwise is None:
             return output
-        values, cost = trajectory.require_value(), trajectory.cost.detach()
-        size = mean_over_processes(output.trajectory_cost.detach() if self.problem.has_goal else spread(cost))
+        values, size = trajectory.require_value(), spread_of_costs
+        if size is None:
+            size = mean_over_processes(output.trajectory_cost.detach())
         term = self.pointwise(stream(self.seed, *draw), size, values[0].max())
         loss = output.loss + self.pointwise.weight * term
         return output._replace(loss=loss, terms={**output.terms, "pointwise": term})

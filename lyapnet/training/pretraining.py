@@ -16,7 +16,6 @@ from lyapnet.expansions import (
     Optimum,
     Path,
     in_float64,
-    path_under,
     penalty_of_one_step,
     sizes,
     without_penalty,
@@ -252,9 +251,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
     Args:
         report: is told what is being done.
     """
-    policy, goal = learner.rollout.closed_loop.policy, learner.problem.goal
-    fitting = _Fit(learner, examples, stream(learner.seed, START, 3))
-    exact, times, optimum = in_float64(learner.problem), learner.problem.horizon.times(goal), _finite(optimum)
+    fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _finite(optimum)
     best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
     before = math.inf
     size = float(sizes(learner.problem, optimum.path.cost).mean())
@@ -265,7 +262,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         within = f"within {SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
         fitting.lower(examples, STEPS[late], RATE[late], SECONDS[late], progress)
-        path = path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), optimum.path.x[0])
+        path = learner.path_from(optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now

@@ -16,6 +16,7 @@ from lyapnet.training.stages import Stages
 WINDOW = 40  # steps in which the validation loss has to fall
 COOLING = 40  # steps in which the learning rate then falls to its end
 NOISE = 5.0  # times the least gain: how far the mean loss of the window may be above the least
+PATIENCE = 120  # steps without a lower loss, after which it has stopped falling however it goes up and down
 
 
 class Settling(Callback):
@@ -23,8 +24,9 @@ class Settling(Callback):
 
     The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
     `least_gain` below its least value before, and its mean not well above that: losses that go up and down need shorter
-    steps, not fewer. Of several seeds, each settles as it would alone, and training ends with the last of them; one
-    that has ended waits with a rate of zero.
+    steps, not fewer. Where PATIENCE steps have brought no lower value it has stopped too: more would only cost time. Of
+    several seeds, each settles as it would alone, and training ends with the last of them; one that has ended waits
+    with a rate of zero.
 
     Args:
         least_gain: in units of the loss, which are shares of the mean cost, or of the spread of costs where there is no
@@ -70,11 +72,17 @@ class Settling(Callback):
                     )
 
     def _has_stopped(self, label: str, step: int) -> bool:
-        before = [loss for at, loss in self.losses[label] if at <= step - WINDOW]
-        since = [loss for at, loss in self.losses[label] if at > step - WINDOW]
-        if not before or min(before) - min(since) >= self.least_gain:
-            return False
-        return fmean(since) - min(*before, *since) <= NOISE * self.least_gain
+        def fell_by(steps: int) -> float:
+            """How far the least loss of so many last steps is below the least one before."""
+            before = [loss for at, loss in self.losses[label] if at <= step - steps]
+            since = [loss for at, loss in self.losses[label] if at > step - steps]
+            return min(before, default=math.inf) - min(since)
+
+        if fell_by(PATIENCE) < self.least_gain:
+            return True
+        window = [loss for at, loss in self.losses[label] if at > step - WINDOW]
+        least = min(loss for _, loss in self.losses[label])
+        return fell_by(WINDOW) < self.least_gain and fmean(window) - least <= NOISE * self.least_gain
 
     def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
         """End when all have settled."""

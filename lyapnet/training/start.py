@@ -240,8 +240,7 @@ class _Trials:
     def roll_out(self, name: str) -> Candidate:
         """Find what the closed loop of the learner costs as it is now."""
         self.report(f"closed loops from {name}")
-        problem = self.learner.problem
-        cost = costs_of_holding(self.learner.rollout.closed_loop.policy, problem.horizon, problem, self.x0)
+        cost = self.learner.path_from(self.x0).cost
         share = float(cost.isfinite().double().mean())
         seconds = time.perf_counter() - self.began
         candidate = Candidate(name, float(cost.mean()), share, seconds, note=self.notes.get(name, ""))

@@ -7,6 +7,7 @@ from torch.testing import assert_close
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
+from lyapnet.graphs.compilation import has_compiler
 from lyapnet.networks import FCN, Scaling
 from lyapnet.policy import SampledPolicy
 from lyapnet.programs import ValueProgram
@@ -123,18 +124,18 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     """At most ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
     problem, seen, _ = swing
     given, costs = examples_of(problem, seen, GENERATOR), list[float]()
-    mean = float(seen.path.cost.mean())
+    mean, led = float(seen.path.cost.mean()), Learner.path_from
 
     def fitted(*pretended):
         """The cost of the law that is kept, and of each that was tried; the mean cost of each is pretended."""
         costs.clear()
 
-        def pretending(*arguments):
-            path = path_under(*arguments)
+        def pretending(learner, x0):
+            path = led(learner, x0)
             costs.append(float(path.cost.mean()))
             return path._replace(cost=path.cost * pretended[len(costs) - 1] * mean / path.cost.mean())
 
-        monkeypatch.setattr(pretraining, "path_under", pretending)
+        monkeypatch.setattr(Learner, "path_from", pretending)
         learner = learner_of(problem, mean)
         fit(learner, seen, given)
         return float(learner.rollout(seen.path.x[0]).cost.mean().detach())
@@ -151,6 +152,32 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1)
     assert len(costs) == 1 + pretraining.ROUNDS
     assert kept == pytest.approx(costs[4], rel=1e-6)
+
+
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_the_compiled_loop_leads_where_the_law_does(swing, method):
+    """Also where some states diverge; a loop whose controls are not held leads elsewhere, and is not taken."""
+    problem = swing[0].in_steps(method=method)
+    learner, x0 = learner_of(problem, 1.0), torch.tensor([[3.0, 0.5], [1e200, 1.0], [0.1, 0.0]], dtype=torch.float64)
+    with torch.no_grad():
+        for parameter in learner.V.parameters():
+            parameter.normal_(generator=torch.Generator().manual_seed(0))
+    policy, times = learner.rollout.closed_loop.policy, problem.horizon.times(x0)
+    expected = path_under(problem, lambda n, x: policy(times[n], x).detach(), x0)
+    if has_compiler():
+        assert learner.rollout.discrete is not None
+        learner.rollout.discrete.compile(x0[:2])
+    found = learner.path_from(x0)
+    assert_close(found, expected)
+    assert found.cost.isfinite().tolist() == [True, False, True]
+    unheld = Rollout(problem, policy, gradient="discrete", held=False)
+    assert unheld.takes_steps_of_problem is (method == "euler")
+    learner.rollout = unheld
+    assert unheld.discrete is not None
+    assert_close(learner.path_from(x0), expected)
+    if method == "rk4":
+        led = unheld.discrete(x0)[0].detach()
+        assert float((led - expected.x)[:, 0].abs().max()) > 1e-6, "the twin"
 
 
 def test_near_states_are_no_further_than_their_expansion_is_believed(swing, monkeypatch):
@@ -177,7 +204,7 @@ def test_where_no_law_is_finite_a_fit_leaves_the_weights(swing, monkeypatch):
     monkeypatch.setattr(pretraining, "ROUNDS", 1)
     diverging = path_under(problem, at_rest(problem), seen.path.x[0])
     diverging = diverging._replace(cost=diverging.cost * torch.inf)
-    monkeypatch.setattr(pretraining, "path_under", lambda *arguments: diverging)
+    monkeypatch.setattr(Learner, "path_from", lambda *arguments: diverging)
     fit(learner, seen, examples_of(problem, seen, GENERATOR))
     assert_close(learner.V(torch.zeros(()), x), before, rtol=0, atol=0)
 

@@ -51,6 +51,9 @@ def run(tmp_path_factory):
         ([1.0, 5.0, 4.0, 0.9999], False),  # which goes up and down
         ([1.0, 1.1, 1.0, 1.05], False),
         ([1.0, 5.0, 4.0, 0.9], False),
+        ([1.0, 5.0, 3.0, 5.0, 3.0, 5.0], False),
+        ([1.0, 5.0, 3.0, 5.0, 3.0, 5.0, 3.0], True),  # for PATIENCE steps
+        ([1.0, 5.0, 3.0, 0.9, 3.0, 5.0, 3.0], False),
     ],
 )
 def test_when_a_loss_has_stopped_falling(losses, stopped):

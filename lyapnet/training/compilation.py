@@ -17,25 +17,24 @@ class Compilation(Callback):
     Args:
         stages: where it is said.
         batch_size: initial states in a training batch.
-        record: takes down that the run is compiled, and in how many seconds.
+        record: takes down that the run is compiled where it trains, and in how many seconds.
     """
 
     def __init__(self, stages: Stages, batch_size: int, record: Callable[..., None]):
         self.stages, self.batch_size, self.record = stages, batch_size, record
-        self._is_done = False
+        self._compiled_on: str | None = None  # the type of the device
 
     def before_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """On a CPU already before the start is sought, which rolls out closed loops too."""
-        if trainer.strategy.root_device.type == "cpu":
-            self._compile(trainer, pl_module)
+        """For the search of a start, which rolls out closed loops on the CPU, wherever the training runs then."""
+        self._compile(trainer, pl_module)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if not self._is_done:
+        if self._compiled_on != pl_module.device.type:
             self._compile(trainer, pl_module)
 
     def _compile(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._is_done = True
         module: Any = pl_module
+        self._compiled_on = module.device.type
         started = time.perf_counter()
         if trainer.is_global_zero:
             fresh = "" if is_built() else " and compiling lyapnet's kernel, once for this machine"
@@ -48,5 +47,5 @@ class Compilation(Callback):
             if trainer.is_global_zero:
                 self.stages.console.print(f"{error}; running without compilation.", soft_wrap=True)
             return
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and self._compiled_on == trainer.strategy.root_device.type:
             self.record(compiled=True, compilation_seconds=round(time.perf_counter() - started, 2))

@@ -2,8 +2,13 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+from rich.console import Console
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.cli import main
@@ -11,6 +16,8 @@ from lyapnet.errors import CompilationError
 from lyapnet.graphs import libraries
 from lyapnet.graphs.number_kernel import kernel
 from lyapnet.networks import FCN, NETWORKS
+from lyapnet.training.compilation import Compilation
+from lyapnet.training.stages import PATIENCE, Stages
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -93,6 +100,23 @@ def test_a_compilation_that_fails_is_not_on_record(tmp_path, machine_code, capsy
     compiled, lines = train(tmp_path, capsys, "rollout.compile=on")
     assert compiled is False
     assert lines[-1] == "Expected luck, got none; running without compilation."
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "devices", "seen_before_training"), [("cpu", ["cpu"], 1), ("cuda", ["cpu", "cuda"], 0)]
+)
+def test_the_start_is_compiled_for_on_the_cpu_wherever_the_training_runs(trained_on, devices, seen_before_training):
+    compiled, records, device = [], [], torch.device(trained_on)
+    module = Mock(spec=LightningModule, device=torch.device("cpu"))
+    module.compile_for = lambda size: compiled.append(module.device.type)
+    trainer = Mock(spec=Trainer, strategy=SimpleNamespace(root_device=device), is_global_zero=True)
+    callback = Compilation(Stages(Console(), "training", PATIENCE), 3, lambda **facts: records.append(facts))
+    callback.before_start(trainer, module)
+    assert len(records) == seen_before_training
+    module.device = device
+    callback.on_train_start(trainer, module)
+    assert compiled == devices
+    assert [record["compiled"] for record in records] == [True]
 
 
 @pytest.mark.parametrize("gradient", ["adjoint", "backprop"])

@@ -27,6 +27,7 @@ from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import silent
 from tests.configs import objects
 from tests.problems import CONF
+from tests.tasks_without_goal import tasks as tasks_without_goal
 
 INTEGRATOR = {
     "experiment": "constrained",
@@ -90,6 +91,15 @@ def test_a_config_names_them_and_scales_limits_by_their_distance_from_the_goal()
     assert_close(h(torch.tensor([1.25, 0.0]))[:2], torch.tensor([-2.25 / 2, -0.5]))
     touching = problem_of(constrained(upper={"position": 1}), "target=[1,0]").constraints
     assert_close(touching(torch.tensor([0.0, 0.0])), torch.tensor([-0.5])), "the goal is at it: as far as X₀ reaches"
+
+
+def test_without_a_goal_limits_are_scaled_by_how_far_x0_reaches_from_them():
+    """A room that is to stay above 20 °C is not 20 units away from 0 °C, nor 293 from 0 K."""
+    house = tasks_without_goal.problem_of("heating")
+    x = house.initial_states.center
+    x[0] = 20.5
+    assert house.constraints is not None
+    assert_close(house.constraints(x)[0], torch.tensor(-0.25, dtype=x.dtype)), "from 20 to 22"
 
 
 @pytest.mark.parametrize(

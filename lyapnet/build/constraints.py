@@ -67,14 +67,14 @@ def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
 def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:
     """The limits of states as one part, if there are some; what counts as 1 is how far they are from the goal.
 
-    For a limit that the goal is at, it is how far X₀ reaches from it.
+    For a limit that the goal is at, and in a task without a goal, it is how far X₀ reaches from the limit.
     """
-    system, goal, columns = problem.system, problem.goal, []
-    reach = problem.initial_states.reach_from(goal)
+    system, goal, box, columns = problem.system, problem.goal, problem.initial_states, []
     for key, side, given in (("lower", -1.0, config.lower), ("upper", 1.0, config.upper)):
         for name, limit in given.items():
             i = index_of(name, f"constraints.{key}", system)
-            far = abs(limit - float(goal[i])) or float(reach[i]) or 1.0
+            reach = float(box.reach_from(torch.full_like(goal, limit))[i])
+            far = (problem.has_goal and abs(limit - float(goal[i]))) or reach or 1.0
             sign, unit = "≤" if side > 0 else "≥", system.state_units[i]
             columns.append((i, limit, side, far, f"{name} {sign} {limit:g} {unit}".strip()))
     return [StateLimits(*zip(*columns, strict=True))] if columns else []

@@ -29,8 +29,8 @@ class Settling(Callback):
     with a rate of zero.
 
     Args:
-        least_gain: in units of the loss, which are shares of the mean cost, or of the spread of costs where there is no
-            goal; 0: training takes all its steps.
+        least_gain: in units of the loss, which are shares of the mean cost, or of the spread of the optimum where there
+            is no goal; 0: training takes all its steps.
         warmup: steps in which the learning rate rises.
         stages: where it is said.
     """
@@ -78,11 +78,11 @@ class Settling(Callback):
             since = [loss for at, loss in self.losses[label] if at > step - steps]
             return min(before, default=math.inf) - min(since)
 
-        if fell_by(PATIENCE) < self.least_gain:
-            return True
+        if fell_by(WINDOW) >= self.least_gain:
+            return False
         window = [loss for at, loss in self.losses[label] if at > step - WINDOW]
-        least = min(loss for _, loss in self.losses[label])
-        return fell_by(WINDOW) < self.least_gain and fmean(window) - least <= NOISE * self.least_gain
+        above_least = fmean(window) - min(loss for _, loss in self.losses[label])
+        return above_least <= NOISE * self.least_gain or fell_by(PATIENCE) < self.least_gain
 
     def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
         """End when all have settled."""

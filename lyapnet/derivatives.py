@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lyapnet.linear_algebra import apply
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 Step = Callable[[State, Control], tuple[State, PerState]]  # (x, u) ↦ (F, l)
@@ -57,11 +58,20 @@ def steps_along(step: Step, terminal: Callable[[State], PerState], x: StatePath,
     return Steps(z, F, F_z, paid.detach(), l_z, l_zz, end, torch.cat([mended, end_mended[None]]), beside)
 
 
+def costates(steps: Steps) -> StatePath:
+    """The slope of what controls cost from where each step lands on, (N, b, n): p_N = φ_x, p_n = l_x + F_xᵀp_{n+1}."""
+    p = [steps.end[1]]
+    n = p[0].shape[-1]
+    for l_z, F_z in zip(steps.l_z[1:].flip(0), steps.F_z[1:].flip(0), strict=True):
+        p.append(l_z[..., :n] + apply(F_z[..., :n].mT, p[-1]))
+    return torch.stack(p[::-1])
+
+
 def with_curvature(step: Step, steps: Steps, p: StatePath) -> Steps:
     """The same with the second derivatives of pᵀF added to l_zz: at nodes where no side has them, with none.
 
     Args:
-        p: V_x where each step lands, (N, b, n).
+        p: (N, b, n), of where each step lands.
     """
     n = p.shape[-1]
 

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lyapnet.contracts import copied
 from lyapnet.cost import PenaltyCost, spread
-from lyapnet.derivatives import Steps, jacobian, steps_along, with_curvature
+from lyapnet.derivatives import Steps, costates, jacobian, steps_along, with_curvature
 from lyapnet.graphs.poles import Poles, poles_of
 from lyapnet.linear_algebra import apply, multiply, solve
 from lyapnet.problem import Problem, Response
@@ -326,8 +326,9 @@ def _backward(
 ) -> _Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
 
-    With the second derivatives of F it runs twice. They enter as those of pᵀF, for p = V_x that the first pass finds
-    without them: n + m derivatives of one sum, not of each component; where k = 0 both passes have the same p.
+    The second derivatives of F enter as those of pᵀF, n + m derivatives of one sum and not of each component, with p the
+    costate of the controls as they are: V_x where k = 0. A pass without second derivatives would give another p, where
+    it meets negative eigenvalues of Q_uu that the task does not have.
 
     Derivatives that do not exist at a node are those beside it (`steps_along`).
 
@@ -336,12 +337,9 @@ def _backward(
         curved: with the second derivatives of F.
     """
     steps = steps_along(problem.step, problem.cost.terminal, x, u)
-    backward = _recursion(problem, x, u, steps, damping)
     if curved:
-        backward = _recursion(
-            problem, x, u, with_curvature(problem.step, steps, backward.expansion.gradient[1:]), damping
-        )
-    return backward
+        steps = with_curvature(problem.step, steps, costates(steps))
+    return _recursion(problem, x, u, steps, damping)
 
 
 def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None) -> _Backward:

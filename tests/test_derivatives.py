@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet import Box, ControlAffineSystem, ControlBox, Horizon, Problem, QuadraticCost
-from lyapnet.derivatives import jacobian, steps_along, with_curvature
+from lyapnet.derivatives import costates, jacobian, steps_along, with_curvature
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under
 
 
@@ -83,3 +83,19 @@ def test_derivatives_that_exist_are_left_as_they_are():
     still = with_curvature(problem.step, along(problem, rest.x, rest.u), p)
     assert bool(still.mended[:-1].all()), "at rest it is missing at every node"
     assert still.l_zz.isfinite().all()
+
+
+def test_costates_are_the_slopes_of_what_controls_cost_from_a_node_on():
+    problem, x0 = drone(), torch.tensor([[3.0, 1.0, 0.5, 0.2], [-2.0, 1.0, 0.1, -0.4]])
+    path = path_under(problem, lambda n, x: torch.full_like(x[..., :2], 0.5), x0)
+    p = costates(along(problem, path.x, path.u))
+    for k in (1, 17, 30):
+
+        def cost_from(x, controls=path.u[k:]):
+            total = torch.zeros(len(x))
+            for u in controls:
+                x, paid = problem.step(x, u)
+                total = total + paid
+            return (total + problem.cost.terminal(x)).sum()
+
+        assert_close(p[k - 1], torch.autograd.functional.jacobian(cost_from, path.x[k]))

@@ -167,7 +167,7 @@ def test_of_guesses_at_one_optimum_the_hopeless_are_left_once_one_has_settled(mo
     problem = hanging(steps=40)
     x0, best = problem.initial_states.center.expand(3, -1), problem.initial_states.center[None]
     settled = optimal_trajectories(problem, best, still(problem, 1)).path
-    guesses = torch.cat([settled.u + 1e-3, settled.u + 0.5, settled.u.new_full(settled.u.shape, -30)], 1)
+    guesses = torch.cat([settled.u + 1e-3, settled.u + 0.5, settled.u.new_full(settled.u.shape, -100)], 1)
     alone, rivals = (optimal_trajectories(problem, x0, guesses, rivals=each).path.cost for each in (False, True))
     assert_close(alone, settled.cost.expand(3), rtol=1e-6, atol=0)
     assert_close(rivals[:2], alone[:2], rtol=1e-6, atol=0)

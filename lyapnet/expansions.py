@@ -326,7 +326,7 @@ def _backward(
 ) -> _Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
 
-    The second derivatives of F enter as those of pᵀF, n + m derivatives of one sum and not of each component, with p the
+    The second derivatives of F enter as those of pᵀF, n + m derivatives of one sum and not of each component. p is the
     costate of the controls as they are: V_x where k = 0. A pass without second derivatives would give another p, where
     it meets negative eigenvalues of Q_uu that the task does not have.
 

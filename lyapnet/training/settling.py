@@ -24,9 +24,9 @@ class Settling(Callback):
 
     The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
     `least_gain` below its least value before, and its mean not well above that: losses that go up and down need shorter
-    steps, not fewer. Where PATIENCE steps have brought no lower value it has stopped too: more would only cost time. Of
-    several seeds, each settles as it would alone, and training ends with the last of them; one that has ended waits
-    with a rate of zero.
+    steps, not fewer. Where PATIENCE steps have brought no lower value either, that of the start counted, it has stopped
+    too: more would only cost time. Of several seeds, each settles as it would alone, and training ends with the last of
+    them; one that has ended waits with a rate of zero.
 
     Args:
         least_gain: in units of the loss, which are shares of the mean cost, or of the spread of the optimum where there
@@ -51,14 +51,15 @@ class Settling(Callback):
         for member in members_of(pl_module):
             member.cooling = self.cooling.get(member.label)
         self._shorten(trainer, members_of(pl_module))
+        if self.least_gain and trainer.global_step == 0:  # the start was validated by now
+            self._note_losses(0, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step, members = trainer.global_step, members_of(pl_module)
         if not self.least_gain or step < self.warmup:
             return
+        self._note_losses(step, pl_module)
         for member in members:
-            loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=pl_module.device)
-            self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
             end, last = step + COOLING, trainer.max_epochs or math.inf
             if member.cooling is None and end < last and self._has_stopped(member.label, step):
                 self.cooling[member.label] = member.cooling = step, end
@@ -71,18 +72,25 @@ class Settling(Callback):
                         soft_wrap=True,
                     )
 
+    def _note_losses(self, step: int, module: LightningModule) -> None:
+        for member in members_of(module):
+            loss = torch.tensor(member.validation_loss, dtype=torch.float64, device=module.device)
+            self.losses.setdefault(member.label, []).append((step, float(mean_over_processes(loss))))
+
     def _has_stopped(self, label: str, step: int) -> bool:
-        def fell_by(steps: int) -> float:
-            """How far the least loss of so many last steps is below the least one before."""
-            before = [loss for at, loss in self.losses[label] if at <= step - steps]
-            since = [loss for at, loss in self.losses[label] if at > step - steps]
+        losses = self.losses[label]
+
+        def fell_by(steps: int, first: int) -> float:
+            """How far the least loss of so many last steps is below the least one before, from a first step on."""
+            before = [loss for at, loss in losses if first <= at <= step - steps]
+            since = [loss for at, loss in losses if at > step - steps]
             return min(before, default=math.inf) - min(since)
 
-        if fell_by(WINDOW) >= self.least_gain:
+        if fell_by(WINDOW, self.warmup) >= self.least_gain:
             return False
-        window = [loss for at, loss in self.losses[label] if at > step - WINDOW]
-        above_least = fmean(window) - min(loss for _, loss in self.losses[label])
-        return above_least <= NOISE * self.least_gain or fell_by(PATIENCE) < self.least_gain
+        window = [loss for at, loss in losses if at > step - WINDOW]
+        above_least = fmean(window) - min(loss for _, loss in losses)
+        return above_least <= NOISE * self.least_gain or fell_by(PATIENCE, 0) < self.least_gain
 
     def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
         """End when all have settled."""

@@ -20,7 +20,7 @@ LONG = {
     "rollout": {"gradient": "discrete", "compile": "off"},
     "evaluation": {**SMALL["evaluation"], "optimum": False},
 }
-SETTLED_AT = EVERY + WINDOW  # with a gain that no loss has, after the first validation
+SETTLED_AT = WINDOW  # with a gain that no loss has and no warmup, after the start
 END = SETTLED_AT + COOLING
 
 
@@ -57,9 +57,34 @@ def run(tmp_path_factory):
     ],
 )
 def test_when_a_loss_has_stopped_falling(losses, stopped):
-    settling = Settling(1e-3, 0, Stages(Console(), ""))
+    assert has_stopped(losses, warmup=0) is stopped
+
+
+def has_stopped(losses, warmup):
+    """Whether it has after losses every EVERY steps, from the start on."""
+    settling = Settling(1e-3, warmup, Stages(Console(), ""))
     settling.losses[""] = [(EVERY * k, loss) for k, loss in enumerate(losses)]
-    assert settling._has_stopped("", EVERY * (len(losses) - 1)) is stopped
+    return settling._has_stopped("", EVERY * (len(losses) - 1))
+
+
+@pytest.mark.parametrize(
+    ("losses", "stopped"),
+    [
+        ([1.0, 1.0, 1.0], False),  # in the warmup little happens, and it counts for patience alone
+        ([1.0, 3.0, 5.0, 4.0, 5.0, 4.0, 5.0], True),  # never below the start
+        ([6.0, 3.0, 5.0, 4.0, 5.0, 4.0, 5.0], False),
+        ([1.0, 5.0, 4.0, 3.5, 3.0, 2.5, 2.0], False),  # on its way back to it
+    ],
+)
+def test_the_loss_of_the_start_counts_once_patience_is_out(losses, stopped):
+    assert has_stopped(losses, warmup=2 * EVERY) is stopped
+
+
+def test_the_start_is_among_the_losses(run):
+    losses = checkpoint(run[0], "last")["callbacks"]["Settling"]["losses"]
+    (kept,) = losses.values()
+    assert kept[0][0] == 0
+    assert math.isfinite(kept[0][1])
 
 
 def test_the_rate_falls_from_where_it_settled():

@@ -25,7 +25,7 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.stages import Report, silent
 from lyapnet.training.start import choose_start, has_place_for_start
 
-VERSION = 7  # of what a start is: to be raised where the search for one changes
+VERSION = 8  # of what a start is: to be raised where the search for one changes
 
 
 class StartCache:

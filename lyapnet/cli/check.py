@@ -103,7 +103,8 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     torch.set_num_threads(resolved.training.threads)
     parts = parts_of(resolved)
     with default_of(resolved):
-        facts_of(build_learner(resolved, build_problem_to_train(resolved, parts), parts), report, known)
+        learner = build_learner(resolved, build_problem_to_train(resolved, parts), parts)
+        facts_of(learner, report, known, resolved.rollout.choose_policy)
 
 
 def print_fact(console: Console, fact: Any) -> None:

@@ -103,6 +103,15 @@ class DiscreteAdjoint:
             self._routines[self._key(x0)] = self._work(x0, self.trained() if theta is None else theta).compiled()
             self._compiled, self._compiled_key = x0.detach(), self._key(x0)
 
+    def compile_like(self, other: "DiscreteAdjoint") -> None:
+        """Have batches run as machine code that do so for another loop of one V; none where that has several.
+
+        Raises:
+            UntraceableError, CompilationError: as compile.
+        """
+        if other._compiled is not None and other._compiled.ndim == 2:
+            self.compile(other._compiled)
+
     def require_trace(self, x0: State, theta: Sequence[Tensor]) -> None:
         """Hold that the loop can be traced for batches like x₀.
 

@@ -174,7 +174,7 @@ def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | N
         for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
             compilation.before_start(trainer, plan.module)
     with Stages(console, "start") if told else nullcontext(silent) as report:
-        start = kept_or_chosen(list(plan.module.members), report)
+        start = kept_or_chosen(list(plan.module.members), report, may_look_ahead=plan.config.rollout.choose_policy)
     if told and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)

@@ -43,13 +43,17 @@ ROUNDINGS = 100  # of the task's precision, for a rate that sums several terms
 
 
 def facts_of(
-    learner: Learner, report: Report = silent, known: Callable[[Fact], None] = lambda fact: None
+    learner: Learner,
+    report: Report = silent,
+    known: Callable[[Fact], None] = lambda fact: None,
+    may_look_ahead: bool = False,
 ) -> list[Fact]:
     """The facts of a learner's problem; V and the penalty of constraints are left where training begins.
 
     Args:
         report: is told what is being done.
         known: is told each fact as soon as it is.
+        may_look_ahead: whether training may take the law that looks ahead in the place of the sampled one.
     """
     problem, facts = learner.problem, list[Fact]()
 
@@ -78,7 +82,7 @@ def facts_of(
             relaxation = find_relaxation(problem, report)
             problem.cost.weight.fill_(relaxation.weight)
             tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
-        start = kept_or_chosen([learner], report, lambda candidate: tell(_tried(candidate, facts)))
+        start = kept_or_chosen([learner], report, lambda candidate: tell(_tried(candidate, facts)), may_look_ahead)
     except LinAlgError as error:
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -9,9 +10,10 @@ from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
 from lyapnet.cost import PenaltyCost, spread
-from lyapnet.errors import UsageError
+from lyapnet.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.expansions import Path, in_float64, path_of, path_under
+from lyapnet.policy import LookaheadPolicy
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
 from lyapnet.random_streams import POINTS, VALIDATION, stream
@@ -74,6 +76,15 @@ class Learner(nn.Module):
         self.cooling: tuple[int, int] | None = None  # steps between which its learning rate falls to its end
         self.region_share: Tensor | None = None  # of D, with the region program
         self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
+
+    def looking_ahead(self) -> "Learner":
+        """Another learner of the same V, under the law that looks ahead."""
+        rollout, law = self.rollout, LookaheadPolicy(self.problem, self.V)
+        ahead = Rollout(self.problem, law, rollout.method, rollout.gradient)
+        if rollout.discrete is not None and ahead.discrete is not None:
+            with suppress(UntraceableError, CompilationError):  # it runs as it is written then
+                ahead.discrete.compile_like(rollout.discrete)
+        return Learner(self.problem, self.V, ahead, self.program, seed=self.seed, label=self.label)
 
     @torch.no_grad()
     def path_from(self, x0: State) -> Path:

@@ -112,10 +112,22 @@ def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: fl
 def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
     """The rows at some deviations (N, b, n) from the finite trajectories, where f, g and the cost are defined."""
     problem, optimum = in_float64(problem), _finite(optimum)
-    parts = zip(*(_columns(problem, optimum, each, ahead) for each in deviations), strict=True)
+    columns = (_columns(problem, optimum, each, at) for each in deviations for at in _looked_at(problem, ahead))
+    parts = zip(*columns, strict=True)
     examples = Examples(*(torch.cat(columns) for columns in parts))
     defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
     return examples.each(lambda column: column[defined])
+
+
+def _looked_at(problem: Problem, ahead: bool) -> Sequence[bool]:
+    """Whether rows are about the best control, or about the one that costs nothing, or there are rows about each.
+
+    A law that looks ahead searches from the one to the other, so that V has to be right at both. In between constraints
+    may be violated: V is then steeper at the first than a network is, and the law knows that penalty by itself.
+    """
+    if not ahead:
+        return [False]
+    return [True] if problem.constraints is not None else [False, True]
 
 
 def _finite(optimum: Optimum) -> Optimum:
@@ -151,8 +163,10 @@ def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
     return share * (x[before, neighbour] - x[before, every])
 
 
-def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool) -> list[Tensor]:
+def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:
     """The columns of the examples at the nodes of some optima, each a deviation away from them.
+
+    They are about the best control, or the one that costs nothing.
 
     A penalty for constraints is no quadratic: of what V has of it in one step the known value is taken.
     """
@@ -174,7 +188,7 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, ahead: bool)
 
     about = problem.rest.to(now).expand(*now.shape[:-1], -1)
     led, B, slope, W, best = responses(about)
-    for _ in range(NEWTON if ahead else 0):
+    for _ in range(NEWTON if about_best else 0):
         about = best
         led, B, slope, W, best = responses(about)
     t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _costs_of(problem, optimum)

@@ -25,7 +25,7 @@ from lyapnet.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_rea
 from lyapnet.policy import LookaheadPolicy, SampledPolicy
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
-from lyapnet.training.candidates import CALM, Candidate, Start
+from lyapnet.training.candidates import CALM, MUCH, Candidate, Start
 from lyapnet.training.initial_networks import network_of, take, take_nothing
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
@@ -43,17 +43,21 @@ REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 
 
 def choose_start(
-    learners: Sequence[Learner], report: Report = silent, known: Callable[[Candidate], None] = lambda candidate: None
+    learners: Sequence[Learner],
+    report: Report = silent,
+    known: Callable[[Candidate], None] = lambda candidate: None,
+    may_look_ahead: bool = False,
 ) -> Start | None:
     """Put the best of what is known into the networks of learners of one problem; None where there is no place.
 
     Each candidate's closed loop is rolled out from states of X₀ that no training or evaluation draws: V = 0, each
     expansion, and the expansion that is least wrong along optima from further states of X₀, or nothing, with its
-    network fitted to them.
+    network fitted to them. Where the law that looks ahead costs much less with that V, V is fitted for it.
 
     Args:
         report: told what is being done.
         known: told each candidate as soon as it is.
+        may_look_ahead: whether that law may be trained in the place of the sampled one.
     """
     if not has_place_for_start(learners):
         return None
@@ -77,20 +81,22 @@ def choose_start(
         for learner in learners:
             take(learner, expansions[base.name], x0)
     sought = _worth_seeking(problem, expansions.get(base.name), x0[:FEW], partial(report, f"improving on {base.name}"))
-    if sought:
-        _fit_to_optima(learners, list(expansions.values()), calm, base, trials)
+    optimum = _fit_to_optima(learners, list(expansions.values()), calm, base, trials) if sought else None
     chosen = _best(trials.tried)
     if chosen.name == CALM:
         for network, state in zip(networks, calm, strict=True):
             network.load_state_dict(state)
             if math.isfinite(chosen.cost) and chosen.cost:
                 network.scale.fill_(abs(chosen.cost))
-    policy = learners[0].rollout.closed_loop.policy
-    held_cost = float(costs_of_plant(problem, policy, x0).mean())
-    gain_ahead = 0.0
+    policy, gain_ahead = learners[0].rollout.closed_loop.policy, 0.0
     if sought and type(policy) is SampledPolicy:
         report("closed loops of the law that looks ahead")
         gain_ahead = _gain_by_looking_ahead(policy, x0[:FEW])
+        if gain_ahead > MUCH and may_look_ahead:
+            policy = LookaheadPolicy(problem, policy.V)
+            if optimum is not None:
+                chosen = _fit_for_looking_ahead(learners, list(expansions.values()), calm, optimum, trials)
+    held_cost = float(costs_of_plant(problem, policy, x0).mean())
     return Start(chosen, [*trials.tried, *trials.left_out], held_cost, gain_ahead)
 
 
@@ -104,6 +110,29 @@ def _gain_by_looking_ahead(policy: SampledPolicy, x0: State) -> float:
         return float(ahead.isfinite().sum() > now.isfinite().sum())
     gain = (now - ahead).mean() / sizes(problem, ahead).mean()
     return max(float(gain), 0.0) if math.isfinite(gain) else 0.0
+
+
+def _fit_for_looking_ahead(
+    learners: Sequence[Learner],
+    expansions: Sequence[Expansion],
+    calm: Sequence[dict[str, Tensor]],
+    optimum: Optimum,
+    trials: "_Trials",
+) -> Candidate:
+    """Fit each V anew, as the law that looks ahead asks for it; the better of both, under that law."""
+    problem, others = learners[0].problem, [learner.looking_ahead() for learner in learners]
+    before = [copy.deepcopy(learner.V.state_dict()) for learner in learners]
+    with_old = trials.roll_out("the law that looks ahead", others[0])
+    examples = examples_of(problem, optimum, stream(0, START, 7), ahead=True)
+    _take_least_wrong(others, expansions, calm, optimum, examples, trials.x0)
+    for other in others:
+        fit(other, optimum, examples, trials.report)
+    fitted = trials.roll_out("V fitted for the law that looks ahead", others[0])
+    best = _best([with_old, fitted])
+    if best != fitted:
+        for learner, state in zip(learners, before, strict=True):
+            learner.V.load_state_dict(state)
+    return best
 
 
 def has_place_for_start(learners: Sequence[Learner]) -> bool:
@@ -134,8 +163,8 @@ def _fit_to_optima(
     calm: Sequence[dict[str, Tensor]],
     base: Candidate,
     trials: "_Trials",
-) -> None:
-    """Try networks that are fitted to optima, where there are any.
+) -> Optimum | None:
+    """Try networks that are fitted to optima, where there are any; the optima.
 
     Where they are no better than the base, the networks are what they were before.
     """
@@ -147,12 +176,12 @@ def _fit_to_optima(
         sought = optima_for(problem, expansions, states, report)
     except LinAlgError as error:
         trials.leave_out("optima from states of X₀", singular(error))
-        return
+        return None
     optimum = minima(problem, sought)
     found = len(optimum.path.cost)
     if not found:
         trials.leave_out("optima from states of X₀", _why_none(sought))
-        return
+        return None
     examples = examples_of(problem, optimum, stream(0, START, 4), looks_ahead(learners[0]))
     name = f"{found} optima from states of X₀"
     trials.note(name, _mended(optimum))
@@ -168,6 +197,7 @@ def _fit_to_optima(
     if _best([*rivals, fitted]) != fitted:
         for learner, state in zip(learners, before, strict=True):
             learner.V.load_state_dict(state)
+    return optimum
 
 
 def _why_none(sought: Optimum) -> Missing:
@@ -237,10 +267,10 @@ class _Trials:
         """Keep what was done to have a candidate, for when it is tried."""
         self.notes[name] = what
 
-    def roll_out(self, name: str) -> Candidate:
-        """Find what the closed loop of the learner costs as it is now."""
+    def roll_out(self, name: str, learner: Learner | None = None) -> Candidate:
+        """Find what the closed loop of the learner, or of another one, costs as it is now."""
         self.report(f"closed loops from {name}")
-        cost = self.learner.path_from(self.x0).cost
+        cost = (learner or self.learner).path_from(self.x0).cost
         share = float(cost.isfinite().double().mean())
         seconds = time.perf_counter() - self.began
         candidate = Candidate(name, float(cost.mean()), share, seconds, note=self.notes.get(name, ""))

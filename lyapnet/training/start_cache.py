@@ -36,11 +36,12 @@ class StartCache:
 
     Args:
         learners: as they are before a start is put into them.
+        may_look_ahead: as the search is told.
     """
 
-    def __init__(self, learners: Sequence[Learner]):
+    def __init__(self, learners: Sequence[Learner], may_look_ahead: bool = False):
         self.learners = learners
-        self.file = _file(learners)
+        self.file = _file(learners, may_look_ahead)
 
     def read(self) -> Start | None:
         """Put the start that is kept into the learners; None where there is none."""
@@ -72,7 +73,7 @@ class StartCache:
                 path.replace(self.file)
 
 
-def _file(learners: Sequence[Learner]) -> Path | None:
+def _file(learners: Sequence[Learner], may_look_ahead: bool) -> Path | None:
     problem, policy = learners[0].problem, learners[0].rollout.closed_loop.policy
     exact = in_float64(problem)
     x = exact.initial_states.sample(2, torch.Generator().manual_seed(0))
@@ -90,7 +91,7 @@ def _file(learners: Sequence[Learner]) -> Path | None:
         VERSION, torch.__version__, [(graph.code, constants_of(graph)) for graph in graphs], problem.goal.tolist(),
         box.lower.tolist(), box.upper.tolist(), type(controls).__qualname__,
         [(name, buffer.tolist()) for name, buffer in controls.named_buffers()], vars(problem.horizon),
-        type(policy).__qualname__, kept_of(learners[0]), search.OPTIMA, optima.SMALL, pretraining.STEPS,
+        type(policy).__qualname__, may_look_ahead, kept_of(learners[0]), search.OPTIMA, optima.SMALL, pretraining.STEPS,
         [(learner.seed, type(learner.V).__qualname__, str(learner.V), _digest(learner)) for learner in learners],
     ]  # fmt: skip
     return cache_folder() / "starts" / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt"
@@ -118,19 +119,22 @@ def _start_from(plain: dict[str, Any]) -> Start:
 
 
 def kept_or_chosen(
-    learners: Sequence[Learner], report: Report = silent, known: Callable[[Candidate], None] = lambda candidate: None
+    learners: Sequence[Learner],
+    report: Report = silent,
+    known: Callable[[Candidate], None] = lambda candidate: None,
+    may_look_ahead: bool = False,
 ) -> Start | None:
     """`choose_start`, or what it chose before for the same task, networks and law."""
     if not has_place_for_start(learners):
         return None
     report("looking for the start of an earlier search")
-    cache = StartCache(learners)
+    cache = StartCache(learners, may_look_ahead)
     start = cache.read()
     if start is not None:
         for candidate in start.candidates:
             known(candidate)
         return start
-    start = choose_start(learners, report, known)
+    start = choose_start(learners, report, known, may_look_ahead)
     if start is not None:
         cache.write(start)
     return start

@@ -4,11 +4,14 @@ import pytest
 import torch
 
 import lyapnet
+from lyapnet.build import build_problem
 from lyapnet.config import config_from_plain
 from lyapnet.cost import QuadraticCost
+from lyapnet.evaluation.references import costs_of_holding
 from lyapnet.expansions import riccati
 from lyapnet.policy import LookaheadPolicy, SampledPolicy
 from lyapnet.systems import Linear
+from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
 from lyapnet.training.start import _gain_by_looking_ahead
 from tests.problems import Formula, problem_of
@@ -26,6 +29,8 @@ TASK = {
     "horizon": {"steps": 8, "dt": 0.2},
 }
 SAID = "law: rollout.policy=lookahead, with V as it is, costs 0.2 of the cost less than sampled"
+
+FITTED = "V fitted for the law that looks ahead"
 
 
 @pytest.fixture
@@ -46,6 +51,10 @@ def test_the_law_that_costs_much_less_is_trained_and_stays_the_run_s(brief, caps
     assert SAID in capsys.readouterr().out
     assert "policy: lookahead" in (run.folder / "config.yaml").read_text()
     assert law_of(run.best) is law_of(run.last) is LookaheadPolicy
+    tried = run.record()["start"]["tried"]
+    chosen = run.record()["start"]["chosen"]
+    assert chosen in (FITTED, "the law that looks ahead")
+    assert tried[chosen] == min(tried[FITTED], tried["the law that looks ahead"])
     more = lyapnet.train(brief, [*FEW, "training.iterations=3"], resume="last")
     assert (more.folder, law_of(more.last)) == (run.folder, LookaheadPolicy)
 
@@ -54,6 +63,7 @@ def test_a_law_that_is_named_stays(brief, capsys):
     run = lyapnet.train(brief, [*FEW, "rollout.policy=sampled"])
     assert SAID in capsys.readouterr().out
     assert law_of(run.best) is SampledPolicy
+    assert FITTED not in run.record()["start"]["tried"]
 
 
 def test_what_looking_ahead_gains():
@@ -78,6 +88,19 @@ def test_what_looking_ahead_gains():
 )
 def test_who_names_a_law_has_it(given, overrides, chosen):
     assert config_from_plain({**TASK, **given}, overrides).rollout.choose_policy is chosen
+
+
+def test_the_same_v_under_the_law_that_looks_ahead():
+    config = config_from_plain(TASK, FEW)
+    learner = build_learner(config, build_problem(config))
+    ahead = learner.looking_ahead()
+    assert ahead.V is learner.V
+    assert type(ahead.rollout.closed_loop.policy) is LookaheadPolicy
+    assert type(learner.rollout.closed_loop.policy) is SampledPolicy
+    x0 = learner.problem.initial_states.sample(4, torch.Generator().manual_seed(0))
+    law = LookaheadPolicy(learner.problem, learner.V)
+    expected = costs_of_holding(law, learner.problem.horizon, learner.problem, x0)
+    torch.testing.assert_close(ahead.path_from(x0).cost, expected.double(), rtol=1e-5, atol=0)
 
 
 def test_little_is_no_reason():

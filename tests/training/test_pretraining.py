@@ -4,6 +4,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from lyapnet.constraints import StateLimits
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
@@ -13,7 +14,7 @@ from lyapnet.policy import SampledPolicy
 from lyapnet.programs import ValueProgram
 from lyapnet.rollout import Rollout
 from lyapnet.sets import ControlBox
-from lyapnet.systems import Linear
+from lyapnet.systems import Linear, Pendulum
 from lyapnet.training import pretraining
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
@@ -50,6 +51,25 @@ def test_examples_are_the_value_function_of_a_linear_problem(problem):
     value_error, excess = errors(shifted(problem, 0.0), examples, problem)
     assert float(value_error.detach()) < 1e-20
     assert float(excess.detach()) < 1e-20
+
+
+def test_a_law_that_looks_ahead_has_examples_where_its_search_begins_and_where_it_ends():
+    """About the control that costs nothing, and about the best one; with constraints about the best one alone."""
+    problem = problem_of(Pendulum(), steps=12, dt=0.05)
+    optimum = optimal_trajectories(problem, problem.initial_states.sample(3), torch.zeros(12, 3, 1))
+    plain, ahead = (examples_of(problem, optimum, torch.Generator().manual_seed(1), each) for each in (False, True))
+    assert len(ahead.t) == 2 * len(plain.t)
+    at_rest, at_best = (ahead.each(lambda column, k=k: column.unflatten(0, (2, 2, -1))[:, k]) for k in (0, 1))
+    assert_close(at_rest.about, torch.zeros_like(at_rest.about))
+    assert_close(at_rest.best.flatten(0, 1), plain.best)
+    assert_close(at_best.about, at_best.best, rtol=1e-6, atol=1e-9)
+    assert at_best.about.abs().max() > 0.1
+    assert_close(at_best.led, problem.step(at_best.x, at_best.about)[0])
+    never = StateLimits([1], [50.0], [1.0], [1.0])
+    relaxed = problem.replaced(constraints=never).relaxed(weight=1e-6)
+    assert_close(
+        examples_of(relaxed, optimum, torch.Generator().manual_seed(1), True).about, at_best.about.flatten(0, 1)
+    )
 
 
 def test_the_excess_is_what_wrong_controls_cost(problem):

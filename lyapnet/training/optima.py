@@ -3,12 +3,12 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from functools import partial, reduce
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from lyapnet.evaluation.oracles import optimal_cost
+from lyapnet.evaluation.oracles import Optima, optimal_cost
 from lyapnet.expansions import (
     Expansion,
     Optimum,
@@ -25,14 +25,13 @@ from lyapnet.expansions import (
 from lyapnet.problem import Problem
 from lyapnet.random_streams import START, stream
 from lyapnet.training.stages import Report, silent
-from lyapnet.types import Control, State
+from lyapnet.types import Control, ControlPath, State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
 SMALL = {1: 48}  # in all, for tasks of one state, where they are close to one another so
 WAVES = 6  # random controls from which optima are sought where there is no expansion
 NUMBERS = 50_000_000  # in the second derivatives (400 MB): fewer optima where they would not fit
 WILD = 100  # times the median of the greatest entries of V_xx, above which a trajectory is no minimum
-CHUNK = 4  # states at a time that the oracle is asked for
 SECONDS = 30.0  # of this thread's work, whatever else the machine does, for each of three ways to seek optima
 FINER, MANY = 0.999, 0.25  # by which share an oracle's are better, and of how many, for it to go on
 NEIGHBOURS, ROUNDS, BETTER = 4, 3, 0.99  # whose optima are tried, how often, and by which share they are better
@@ -60,15 +59,15 @@ def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, rep
     progress(0, len(few))
     u = cheapest([path_under(exact, law, few) for law in laws]).u
     optimum = optimal_trajectories(problem, few, u, progress=progress, seconds=SECONDS)
-    optimum, further = _by_oracle(problem, optimum, few, others, report)
+    optimum, known = _by_oracle(problem, optimum, others, report)
     optimum = _followed(exact, optimum, report)
-    if further is not None:
-        optimum = _joined(optimum, further)
-    elif len(others):
+    if len(others):
         progress = partial(report, f"optima from {len(others)} further states of X₀ within {SECONDS:.0f} s of work")
         progress(0, len(others))
-        columns = nearest(others, few).unbind(1)
-        u = cheapest([_along(exact, optimum, column, others) for column in columns]).u
+        paths = [_along(exact, optimum, column, others) for column in nearest(others, few).unbind(1)]
+        if known is not None:
+            paths.append(path_under(exact, lambda n, _: known[n], others))
+        u = cheapest(paths).u
         optimum = _joined(optimum, optimal_trajectories(problem, others, u, progress=progress, seconds=SECONDS))
     return _followed(exact, optimum, report)
 
@@ -102,39 +101,36 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
     return optimum.member(kept)
 
 
-def _by_oracle(
-    problem: Problem, optimum: Optimum, few: Tensor, others: Tensor, report: Report
-) -> tuple[Optimum, Optimum | None]:
-    """Some optima, the first of them exchanged for those of the oracle that cost less, and as long as these are many,
-    the next ones too; and then those of the oracle from other states, of which it is the better guide, else None.
+def _by_oracle(problem: Problem, optimum: Optimum, others: State, report: Report) -> tuple[Optimum, ControlPath | None]:
+    """Optima exchanged for those of the oracle that cost less: of the first FAR, and where these are many, of all.
+
+    Then with its controls from other states, as far as there was time, NaN where it has none; else None.
     """
-    oracle = optimal_cost(problem)
+    oracle, began = optimal_cost(problem), time.thread_time()
     if oracle is None:  # none is installed, or none is for such a problem
         return optimum, None
-    progress, began = partial(report, f"optima by the oracle within {SECONDS:.0f} s of work"), time.thread_time()
-    every, further, gained = torch.cat([few, others]), list[Optimum](), 0
-    for first in range(0, len(every), CHUNK):
-        progress(first, FAR if first < FAR else len(every))
-        rows = torch.arange(first, min(first + CHUNK, len(every)))
-        found = oracle.solve(every[rows])
-        known = found.cost.isfinite()
-        if found.u is None or not bool(known.any()):
-            break
-        if first >= len(few):
-            further.append(optimal_trajectories(problem, every[rows[known]], found.u[:, known]))
-        else:
-            rows = rows[rows < len(few)]
-            cost, size = (part[rows] for part in (optimum.path.cost, sizes(problem, optimum.path.cost)))
-            better = rows[found.cost[: len(rows)] < cost - (1 - FINER) * size]
-            gained += len(better)
-            if len(better):
-                closer = optimal_trajectories(problem, few[better], found.u[:, better - first])
-                optimum = _with(optimum, better, closer)
-        if time.thread_time() - began > SECONDS or (
-            first + CHUNK >= FAR and gained < MANY * min(first + CHUNK, len(few))
-        ):
-            break
-    return optimum, reduce(_joined, further) if further else None
+    progress = partial(report, f"optima by the oracle within {SECONDS:.0f} s of work")
+    x0, far = optimum.path.x[0], min(FAR, len(optimum.path.cost))
+    found = oracle.solve(x0[:far], progress=progress, seconds=SECONDS)
+    optimum, gained = _with_better(problem, optimum, torch.arange(far), found)
+    left = SECONDS - (time.thread_time() - began)
+    if found.u is None or gained < MANY * far or left < 0:
+        return optimum, None
+    found = oracle.solve(torch.cat([x0[far:], others]), progress=progress, seconds=left)
+    optimum, _ = _with_better(problem, optimum, torch.arange(far, len(x0)), found)
+    return optimum, None if found.u is None else found.u[:, len(x0) - far :]
+
+
+def _with_better(problem: Problem, optimum: Optimum, rows: Tensor, found: Optima) -> tuple[Optimum, int]:
+    """Some optima exchanged for those of an oracle from the same states that cost less, and how many these are."""
+    if found.u is None:
+        return optimum, 0
+    size, cost = sizes(problem, optimum.path.cost)[rows], found.cost[: len(rows)]
+    better = torch.nonzero(cost < optimum.path.cost[rows] - (1 - FINER) * size).flatten()
+    if len(better):
+        closer = optimal_trajectories(problem, optimum.path.x[0, rows[better]], found.u[:, better])
+        optimum = _with(optimum, rows[better], closer)
+    return optimum, len(better)
 
 
 def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:

@@ -246,6 +246,29 @@ def test_the_first_failures_in_a_row_spare_the_others(solvable):
         assert set(tried) == set(range(20)), "one that is found, and all are tried"
 
 
+def test_a_search_tries_no_state_after_its_seconds(monkeypatch):
+    """Each minimum takes a second of this clock, and there are three and a half."""
+    clock = [100.0]
+    monkeypatch.setattr("lyapnet.evaluation.oracles.multistart.time.thread_time", lambda: clock[0])
+
+    def minimise(x0, start, briefly):
+        clock[0] += 1
+        return Candidate(start.x, start.u, 1.0)
+
+    search = MultiStart(np.arange(20.0)[:, None], [None] * 20, minimise)
+    start = Candidate(np.zeros((1, 1)), np.zeros((1, 1)), math.inf)
+    search.run({i: [start] for i in range(20)}, lambda done, total: None, until=103.5)
+    found = [best is not None for best in search.best]
+    assert found == [True] * sum(found) + [False] * (20 - sum(found))
+    assert 0 < sum(found) <= 4
+    assert search.reasons[19] == "no time was left for it"
+
+
+def test_an_oracle_without_seconds_has_no_optima():
+    oracle, X0 = transcription_of("reacher", "horizon.steps=10")
+    assert oracle.solve(X0.sample(3), seconds=0.0).failures == 3
+
+
 # The cache
 
 

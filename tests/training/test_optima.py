@@ -54,7 +54,7 @@ def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, w
     problem = hanging(steps=40)
     x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
     monkeypatch.setattr(optima, "ROUNDS", 0)
-    for name, value in (("FAR", 3), ("CHUNK", 3), ("MANY", many)):
+    for name, value in (("FAR", 3), ("MANY", many)):
         monkeypatch.setattr(optima, name, value)
     good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
@@ -72,6 +72,32 @@ def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, w
     assert batches == taken
     assert_close(cost[3:], (good if 2 in taken else idle).cost[3:], rtol=1e-6, atol=0)
     assert_close(cost[:3], (good if 3 in taken else idle).cost[:3], rtol=1e-6, atol=0)
+
+
+def test_controls_of_the_oracle_are_where_the_search_from_other_states_begins(monkeypatch, without_oracle):
+    """But for the last one, which has none and begins with a neighbour's law."""
+    problem, begun = hanging(steps=40), []
+    x0, expansions = problem.initial_states.sample(6), [riccati(problem)]
+    monkeypatch.setattr(optima, "ROUNDS", 0)
+    for name in ("SOUGHT", "FAR"):
+        monkeypatch.setattr(optima, name, 3)
+    good = optima_for(problem, expansions, x0).path
+    u = good.u.index_fill(1, torch.tensor([5]), torch.nan)
+
+    def solve(states, **progress):
+        rows = slice(0, 3) if len(states) == 3 and torch.equal(states, x0[:3].double()) else slice(3, 6)
+        return Optima(good.cost[rows], [""] * 3, u[:, rows])
+
+    def spoiled(problem, x0, u, **progress):
+        begun.append(u)
+        return optimal_trajectories(problem, x0, u if len(begun) > 1 else 0 * u, 80 if len(begun) > 1 else 0)
+
+    monkeypatch.setattr(optima, "optimal_cost", lambda _: SimpleNamespace(solve=solve))
+    monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
+    found = optima_for(problem, expansions, x0).path
+    assert_close(begun[-1][:, :2], good.u[:, 3:5], rtol=1e-3, atol=1e-3)
+    assert begun[-1].isfinite().all()
+    assert_close(found.cost[:5], good.cost[:5], rtol=1e-6, atol=0)
 
 
 def test_a_search_ends_in_its_seconds(without_oracle):

@@ -1,5 +1,6 @@
 """What an oracle is: the least cost from each initial state, and how it is known."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -39,12 +40,15 @@ class Oracle(ABC):
     """x₀ ↦ J*(x₀), the least cost, in the dtype and on the device of x₀."""
 
     @abstractmethod
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+    def solve(
+        self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
+    ) -> Optima:
         """The optima of a batch (b, n).
 
         Args:
             known: a control sequence from each x₀, (N, b, m), which an iterative oracle takes for one of its starts.
             progress: is told how many states are done.
+            seconds: of this thread's work, after which an iterative oracle tries no further state.
         """
 
     def __call__(self, x0: State) -> PerState:

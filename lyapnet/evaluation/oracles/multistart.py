@@ -1,5 +1,6 @@
 """Local minima of one problem for each initial state, each from several starts and from its neighbours' ends."""
 
+import math
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -57,11 +58,18 @@ class MultiStart:
         self.several = False  # whether a start has improved on a minimum that was known
         self._tried = dict[tuple[int, int], Candidate]()  # by state and identity, as no start is tried twice
 
-    def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
-        """Try the starts of some states, given by their indices, and what was found from the states around."""
+    def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report, until: float = math.inf) -> None:
+        """Try the starts of some states, given by their indices, and what was found from the states around.
+
+        Args:
+            until: when this thread's work has taken so many seconds, no further state is tried.
+        """
         failures, last = 0, ""  # in a row, from the first state on; the reason of the last one
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
+            if time.thread_time() > until:
+                self.reasons[i] = self.reasons[i] or "no time was left for it"
+                continue
             if failures == HOPELESS:
                 self.reasons[i] = self.reasons[i] or f"{last}, from {HOPELESS} states in a row; this one was not tried"
                 continue
@@ -79,7 +87,7 @@ class MultiStart:
             if done == min(EXPLORED, len(starts)) - 1:
                 explored = [*starts][:EXPLORED]
                 self._exchange(explored, explored)
-        if self.several:
+        if self.several and time.thread_time() <= until:
             self._exchange(starts, range(len(self.x0)))
         progress(len(starts), len(starts))
 

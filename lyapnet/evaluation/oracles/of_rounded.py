@@ -1,5 +1,7 @@
 """Optima of a task whose cost has a kink at the goal, from those of the same task with the kink rounded."""
 
+import math
+
 import torch
 
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
@@ -23,8 +25,10 @@ class OracleOfRounded(Oracle):
     def __init__(self, rounded: Oracle, problem: Problem, method: str):
         self.rounded, self.problem = rounded, in_float64(problem.in_steps(method=method))
 
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
-        optima = self.rounded.solve(x0, known, progress)
+    def solve(
+        self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
+    ) -> Optima:
+        optima = self.rounded.solve(x0, known, progress, seconds)
         assert optima.u is not None
         u = optima.u.double().cpu()
         cost = path_under(self.problem, lambda n, _: u[n], x0.detach().double().cpu()).cost.to(x0)

@@ -48,7 +48,9 @@ class RiccatiOracle(Oracle):
     def __init__(self, solution: RiccatiSolution):
         self.solution = solution
 
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+    def solve(
+        self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
+    ) -> Optima:
         return Optima(self.solution.value(0, x0), [""] * len(x0))
 
 

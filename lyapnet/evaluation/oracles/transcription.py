@@ -4,6 +4,7 @@ Ground truth for tests and tables, never used in training. The model is the torc
 """
 
 import math
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from io import StringIO
@@ -99,7 +100,9 @@ class Transcription(Oracle):
             x, J = [*x, following], J + step_cost
         return torch.stack(x), J + self.problem.cost.terminal(x[-1])
 
-    def solve(self, x0: State, known: ControlPath | None = None, progress: Report = silent) -> Optima:
+    def solve(
+        self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
+    ) -> Optima:
         """The optima of a batch (b, n): from disk, unless `known` controls cost less than those."""
         states = x0.detach().double().cpu()
         nothing: list[Tensor | None] = [None] * len(states)
@@ -112,7 +115,7 @@ class Transcription(Oracle):
             explored = [pending[len(pending) * k // EXPLORED] for k in range(min(EXPLORED, len(pending)))]
             pending = [*explored, *(i for i in pending if i not in explored)]
             starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
-            self._search(search, starts, progress)
+            self._search(search, starts, progress, time.thread_time() + seconds)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
@@ -163,12 +166,14 @@ class Transcription(Oracle):
             path = Candidate(tried.x[1:, i].numpy(), tried.u[:, i].numpy(), math.inf)
             yield _until(search, i, cold if known is None else [known, *cold], path)
 
-    def _search(self, search: MultiStart, starts: Mapping[int, Iterable[Candidate]], progress: Report) -> None:
+    def _search(
+        self, search: MultiStart, starts: Mapping[int, Iterable[Candidate]], progress: Report, until: float
+    ) -> None:
         """Run a search; Ctrl-C and SIGTERM end it."""
         self._stopped = False
         with signals_taken(self._stop):
             try:
-                search.run(starts, progress)
+                search.run(starts, progress, until)
             finally:  # where CasADi made an error of its own of what ended it
                 if self._stopped:
                     self._stop()

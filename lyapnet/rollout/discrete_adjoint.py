@@ -104,13 +104,13 @@ class DiscreteAdjoint:
             self._compiled, self._compiled_key = x0.detach(), self._key(x0)
 
     def compile_like(self, other: "DiscreteAdjoint") -> None:
-        """Have batches run as machine code that do so for another loop of one V; none where that has several.
+        """Have batches run as machine code where another loop has them; of one member, where that has several.
 
         Raises:
             UntraceableError, CompilationError: as compile.
         """
-        if other._compiled is not None and other._compiled.ndim == 2:
-            self.compile(other._compiled)
+        if other._compiled is not None:
+            self.compile(other._compiled if other._compiled.ndim == 2 else other._compiled[0])
 
     def require_trace(self, x0: State, theta: Sequence[Tensor]) -> None:
         """Hold that the loop can be traced for batches like x₀.

@@ -348,7 +348,7 @@ def test_interrupted_a_run_saves_and_goes_on_to_the_same_end(number, desk, refer
 
 @pytest.mark.parametrize("script", ["lyapnet", "train.py"])
 def test_stopped_while_its_start_is_sought_a_run_says_how_to_go_on(script, tmp_path, monkeypatch, capsys):
-    def stops(*_):
+    def stops(*_, **options):
         signal.raise_signal(signal.SIGINT)
 
     Desk(tmp_path)

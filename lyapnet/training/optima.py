@@ -114,7 +114,7 @@ def _by_oracle(problem: Problem, optimum: Optimum, others: State, report: Report
     found = oracle.solve(x0[:far], progress=progress, seconds=SECONDS)
     optimum, gained = _with_better(problem, optimum, torch.arange(far), found)
     left = SECONDS - (time.thread_time() - began)
-    if found.u is None or gained < MANY * far or left < 0:
+    if gained < MANY * far or left < 0:
         return optimum, None
     found = oracle.solve(torch.cat([x0[far:], others]), progress=progress, seconds=left)
     optimum, _ = _with_better(problem, optimum, torch.arange(far, len(x0)), found)

@@ -122,8 +122,9 @@ def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], 
 def _looked_at(problem: Problem, ahead: bool) -> Sequence[bool]:
     """Whether rows are about the best control, or about the one that costs nothing, or there are rows about each.
 
-    A law that looks ahead searches from the one to the other, so that V has to be right at both. In between constraints
-    may be violated: V is then steeper at the first than a network is, and the law knows that penalty by itself.
+    A law that looks ahead searches from the second to the first, so that V has to be right at both. With constraints
+    the control that costs nothing may lead across one, where V is steeper than a network can follow; as the law knows
+    the penalty of one step by itself, rows about the best control are enough.
     """
     if not ahead:
         return [False]

@@ -92,10 +92,9 @@ def choose_start(
     if sought and type(policy) is SampledPolicy:
         report("closed loops of the law that looks ahead")
         gain_ahead = _gain_by_looking_ahead(policy, x0[:FEW])
-        if gain_ahead > MUCH and may_look_ahead:
+        if gain_ahead > MUCH and may_look_ahead and optimum is not None:
             policy = LookaheadPolicy(problem, policy.V)
-            if optimum is not None:
-                chosen = _fit_for_looking_ahead(learners, list(expansions.values()), calm, optimum, trials)
+            chosen = _fit_for_looking_ahead(learners, list(expansions.values()), calm, optimum, trials)
     held_cost = float(costs_of_plant(problem, policy, x0).mean())
     return Start(chosen, [*trials.tried, *trials.left_out], held_cost, gain_ahead)
 

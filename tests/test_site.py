@@ -32,7 +32,7 @@ def on_record(source: Path) -> set[str]:
     """The figures of a page, or those of a comparison's table as the leaderboard rounds them."""
     text = source.read_text(encoding="utf-8")
     if source.suffix != ".csv":
-        return {*FIGURE.findall(text.replace("two to four minutes", "2 to 4 min"))}
+        return {*FIGURE.findall(text)}
     lines = list(csv.DictReader(text.splitlines()))
     costs = {f"{float(line['cost_ratio']):.{digits}f}" for line in lines for digits in (2, 4)}
     return costs | {f"{float(line['seconds_mean']):.0f}" for line in lines}

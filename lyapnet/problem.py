@@ -13,6 +13,7 @@ from lyapnet.contracts import called, check_function, check_memory, copied
 from lyapnet.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.domain import Border, Domain, DomainCost, as_written, found_borders, size_of, within
 from lyapnet.errors import UsageError
+from lyapnet.findings import Findings
 from lyapnet.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.linear_algebra import apply, convex_or
 from lyapnet.sets import Box, ControlSet
@@ -23,13 +24,6 @@ LOOKED = 200  # steps, along which it is seen whether a task has a goal
 TRIED = 64  # states at which functions of others are tried
 LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
 ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
-
-
-class Findings(dict[str, Any]):
-    """What was found out about the functions of a problem, once for it and all its copies."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Findings":
-        return self
 
 
 class Response(NamedTuple):

@@ -13,6 +13,7 @@ LEVELS = (
     {
         "drawing",
         "errors",
+        "findings",
         "interpolation",
         "linear_algebra",
         "machine",
@@ -44,9 +45,9 @@ LEVELS = (
 )
 MATHEMATICS = {
     "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "derivatives", "domain", "errors",
-    "expansions", "family", "files", "graphs", "horizon", "interpolation", "linear_algebra", "linearisation",
-    "networks", "operating_points", "policy", "problem", "programs", "random_streams", "regulator", "rollout", "sets",
-    "shapes", "systems", "types",
+    "expansions", "family", "files", "findings", "graphs", "horizon", "interpolation", "linear_algebra",
+    "linearisation", "networks", "operating_points", "policy", "problem", "programs", "random_streams", "regulator",
+    "rollout", "sets", "shapes", "systems", "types",
 }  # fmt: skip
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
 SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print

@@ -4,7 +4,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet import Box, ControlAffineSystem, ControlBox, Horizon, Problem, QuadraticCost
-from lyapnet.derivatives import costates, jacobian, steps_along, with_curvature
+from lyapnet.derivatives import StepDerivatives, costates, jacobian, steps_along, with_curvature
 from lyapnet.expansions import at_rest, optimal_trajectories, path_under
 
 
@@ -38,7 +38,7 @@ def drone(system=None):
 
 
 def along(problem, x, u):
-    return steps_along(problem.step, problem.cost.terminal, x, u)
+    return steps_along(StepDerivatives(problem.step, problem.system.n), problem.cost.terminal, x, u)
 
 
 def of(problem, x0):
@@ -75,12 +75,12 @@ def test_derivatives_that_exist_are_left_as_they_are():
     steps = along(problem, path.x, path.u)
     assert not steps.mended.any()
     p = torch.randn(30, 1, 4)
-    curved = with_curvature(problem.step, steps, p)
-    z = steps.z.detach()[4, 0]
+    curved = with_curvature(StepDerivatives(problem.step, 4), steps, p)
+    z = steps.z[4, 0]
     hessian = torch.autograd.functional.hessian(lambda z: problem.step(z[:4], z[4:])[0] @ p[4, 0], z)
     assert_close(curved.l_zz[4, 0] - steps.l_zz[4, 0], hessian)
     rest = path_under(problem, at_rest(problem), x0 * torch.tensor([1.0, 1, 0, 0]))
-    still = with_curvature(problem.step, along(problem, rest.x, rest.u), p)
+    still = with_curvature(StepDerivatives(problem.step, 4), along(problem, rest.x, rest.u), p)
     assert bool(still.mended[:-1].all()), "at rest it is missing at every node"
     assert still.l_zz.isfinite().all()
 

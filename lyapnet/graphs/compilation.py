@@ -23,7 +23,7 @@ from lyapnet.files import digest_of_file, write_atomically
 
 
 class Scan(nn.Module):
-    """(*state, t, Δt, x₀) ↦ what step(*state, t_n, Δt_n, x_n, *prepare(*state)) keeps at each node, stacked over time.
+    """(*state, *columns, x₀) ↦ what step(*state, *columns at n, x_n, *prepare(*state)) keeps at each step, over time.
 
     Args:
         prepare: what all steps share.
@@ -37,10 +37,10 @@ class Scan(nn.Module):
 
     def loop(self, *arguments: Tensor) -> list[Tensor]:
         """The scan as a loop, for a step of any kind."""
-        state, (t, dt, x) = arguments[: self.tensors], arguments[self.tensors :]
+        state, (*columns, x) = arguments[: self.tensors], arguments[self.tensors :]
         shared, kept = self.prepare(*state), []
-        for grid in zip(t, dt, strict=True):
-            x, *node = self.step(*state, *grid, x, *shared)
+        for now in zip(*columns, strict=True):
+            x, *node = self.step(*state, *now, x, *shared)
             kept.append(node)
         return [torch.stack(column) for column in zip(*kept, strict=True)]
 
@@ -48,14 +48,14 @@ class Scan(nn.Module):
         """The scan as one operation, for the compiler."""
         from torch._higher_order_ops.scan import scan
 
-        state, (t, dt, x0) = arguments[: self.tensors], arguments[self.tensors :]
+        state, (*columns, x0) = arguments[: self.tensors], arguments[self.tensors :]
         shared = self.prepare(*state)
 
-        def body(x: Tensor, grid: tuple[Tensor, Tensor]) -> tuple[Tensor, tuple[Tensor, ...]]:
-            following, *kept = self.step(*state, *grid, x, *shared)
+        def body(x: Tensor, now: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+            following, *kept = self.step(*state, *now, x, *shared)
             return following, tuple(kept)
 
-        return list(scan(body, x0, (t, dt))[1])
+        return list(scan(body, x0, tuple(columns))[1])
 
 
 def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.errors import CompilationError, UntraceableError
@@ -37,7 +38,9 @@ class Compilation(Callback):
         self._compiled_on = module.device.type
         started = time.perf_counter()
         if trainer.is_global_zero:
-            fresh = "" if is_built() else " and compiling lyapnet's kernel, once for this machine"
+            fresh = (
+                "" if is_built(torch.get_default_dtype()) else " and compiling lyapnet's kernel, once for this machine"
+            )
             self.stages(f"tracing the closed loop and its gradient{fresh}")
         try:
             module.compile_for(self.batch_size)

@@ -11,15 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import (
-    FLOOR,
-    Optimum,
-    Path,
-    in_float64,
-    penalty_of_one_step,
-    sizes,
-    without_penalty,
-)
+from lyapnet.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
 from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
 from lyapnet.linear_algebra import apply

@@ -12,8 +12,8 @@ from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccat
 from lyapnet.systems import IntegratorChain, Linear
 from lyapnet.training import optima
 from lyapnet.training.optima import how_many, optima_for
+from tests.expansions.test_expansions import hanging
 from tests.problems import problem_of
-from tests.test_expansions import hanging
 
 
 def test_as_many_trajectories_as_fit_into_memory(monkeypatch):

@@ -19,8 +19,8 @@ from lyapnet.training import pretraining
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
 from lyapnet.training.pretraining import errors, examples_of, examples_visited, fit
+from tests.expansions.test_expansions import hanging
 from tests.problems import Formula, problem_of
-from tests.test_expansions import hanging
 
 GENERATOR = torch.Generator().manual_seed(0)
 

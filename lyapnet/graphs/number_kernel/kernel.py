@@ -20,22 +20,22 @@ from lyapnet.graphs.number_kernel.writing import Writer
 
 SOURCE = Path(__file__).with_name("program.cpp")
 CHECKED = 2  # steps of a scan that are held against torch
-NAMES = {torch.float64: "float64", torch.float32: "float32"}
+NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """The compiled C++, from disk, or compiled now: one file for each machine.
+def library(dtype: torch.dtype) -> ctypes.CDLL:
+    """The compiled C++ for one type of numbers, from disk, or compiled now: one file for each machine.
 
     Raises:
         CompilationError: as library_of.
     """
-    return library_of("numbers", (SOURCE,))
+    return library_of("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}")
 
 
-def is_built() -> bool:
-    """Whether the C++ was compiled before."""
-    return file_of_library("numbers", (SOURCE,)).is_file()
+def is_built(dtype: torch.dtype) -> bool:
+    """Whether the C++ for one type of numbers was compiled before."""
+    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}").is_file()
 
 
 class NumberKernel:
@@ -77,25 +77,27 @@ class ScanKernel:
 
     Args:
         prepare: of the state.
-        step: (*state, t, Δt, x, *prepared) ↦ (x', *kept).
-        arguments: (*state, t, Δt, x₀), t and Δt of all steps.
+        step: (*state, *columns at its time, x, *prepared) ↦ (x', *kept).
+        arguments: (*state, *columns, x₀), columns over all steps.
+        columns: how many there are.
 
     Raises:
         NotImplementedError, CompilationError: as NumberKernel.
     """
 
-    def __init__(self, prepare: GraphModule, step: GraphModule, arguments: Sequence[Tensor]):
-        *state, t, dt, x0 = arguments
-        self._steps = len(t)
-        examples = [*state, t[0], dt[0], x0]
+    def __init__(self, prepare: GraphModule, step: GraphModule, arguments: Sequence[Tensor], columns: int = 2):
+        state, moving, x0 = _split(arguments, columns)
+        self._steps, self._columns = len(moving[0]), columns
+        examples = [*state, *(column[0] for column in moving), x0]
         self._program = program = _Assembled(examples)
-        *given, t0, dt0, x = program.arguments(examples, varying=3)
-        shared = program.writer.write(prepare, given)
-        program.finish(program.writer.write(step, [*given, t0, dt0, x, *shared]))
-        if not program.is_scan():
+        own = program.arguments(examples, varying=columns + 1)
+        shared = program.writer.write(prepare, own[: len(state)])
+        program.finish(program.writer.write(step, [*own, *shared]))
+        if not program.is_scan(columns):
             raise NotImplementedError("a scan of an empty batch, or of a state whose shape changes")
         with torch.no_grad():
-            expected = Scan(prepare, step, len(state)).loop(*state, t[:CHECKED], dt[:CHECKED], x0)
+            first = [column[:CHECKED] for column in moving]
+            expected = Scan(prepare, step, len(state)).loop(*state, *first, x0)
         _require_same([column[:CHECKED] for column in self(*arguments)], expected)
 
     def __call__(self, *arguments: Tensor) -> list[Tensor]:
@@ -104,13 +106,20 @@ class ScanKernel:
         Raises:
             ValueError: as NumberKernel.
         """
-        program, (*state, t, dt, x0) = self._program, arguments
-        if not len(t) == len(dt) == self._steps:
-            raise ValueError(f"Expected {self._steps} steps, got {len(t)} and {len(dt)}; build the kernel anew.")
+        program, (state, moving, x0) = self._program, _split(arguments, self._columns)
+        lengths = [len(column) for column in moving]
+        if lengths != [self._steps] * self._columns:
+            raise ValueError(f"Expected {self._steps} steps, got {lengths}; build the kernel anew.")
         following, *kept = program.result_shapes
-        columns = [torch.empty(self._steps, *shape, dtype=program.dtype) for shape in kept]
-        program.scan([*state, t, dt, x0], torch.empty(2, *following, dtype=program.dtype), columns)
-        return columns
+        results = [torch.empty(self._steps, *shape, dtype=program.dtype) for shape in kept]
+        program.scan(state, moving, x0, torch.empty(2, *following, dtype=program.dtype), results)
+        return results
+
+
+def _split(arguments: Sequence[Tensor], columns: int) -> tuple[Sequence[Tensor], Sequence[Tensor], Tensor]:
+    """(state, columns over time, x₀) of the arguments of a scan."""
+    *state, x0 = arguments
+    return state[: len(state) - columns], state[len(state) - columns :], x0
 
 
 class _Assembled:
@@ -124,7 +133,7 @@ class _Assembled:
         self.dtype = next(
             each.dtype for each in arguments[len(arguments) - handed - 1 :: -1] if each.is_floating_point()
         )
-        if self.dtype not in NAMES or any(each.device.type != "cpu" for each in arguments):
+        if self.dtype not in NUMBERS or any(each.device.type != "cpu" for each in arguments):
             raise NotImplementedError(f"{self.dtype} on {arguments[-1].device}")
         self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
         self.result_shapes: list[torch.Size] = []
@@ -170,9 +179,9 @@ class _Assembled:
         self._tables = np.concatenate([*program.tables, np.zeros(1, dtype=np.int64)])
         del self.writer  # and with it all that torch has computed of the examples
 
-    def is_scan(self) -> bool:
-        """Whether there are numbers in t, Δt and x, and x' is like x."""
-        return min(self._given[-3:]) >= 0 and self.result_shapes[0] == self._shapes[-1]
+    def is_scan(self, columns: int) -> bool:
+        """Whether there are numbers in x and each column, and x' is like x."""
+        return min(self._given[-columns - 1 :]) >= 0 and self.result_shapes[0] == self._shapes[-1]
 
     def new_results(self) -> list[Tensor]:
         """Tensors for the results."""
@@ -185,24 +194,25 @@ class _Assembled:
         with self._lock:
             self._function("run")(_address(code), _long(len(code)), _address(self._tables), _address(table))
 
-    def scan(self, arguments: Sequence[Tensor], states: Tensor, columns: Sequence[Tensor]) -> None:
-        """Run all steps: `states` is memory for two of them, and columns, over time, are for what they keep."""
-        *shapes, _, _, x = self._shapes
-        given = self._checked(arguments, [*shapes, arguments[-3].shape, arguments[-2].shape, x])
-        table = self._buffers(given, [states[0], *columns])
-        *_, t, dt, read = self._given
-        written, *kept = self._results
-        advances = [
-            (t, 1),
-            (dt, 1),
-            *((buffer, column[0].numel()) for buffer, column in zip(kept, columns, strict=True)),
+    def scan(
+        self, state: Sequence[Tensor], moving: Sequence[Tensor], x0: Tensor, two: Tensor, columns: Sequence[Tensor]
+    ) -> None:
+        """Run all steps: `two` is memory for two states x, and `columns`, over time, are for what the steps keep."""
+        first = len(state)
+        shapes = [
+            torch.Size([len(column), *shape]) for column, shape in zip(moving, self._shapes[first:], strict=False)
         ]
-        moving = np.array(advances, dtype=np.int64)
+        given = self._checked([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
+        table = self._buffers(given, [two[0], *columns])
+        *read, carried = self._given[first:]
+        written, *kept = self._results
+        over_time = zip([*read, *kept], [*moving, *columns], strict=True)
+        advances = np.array([(buffer, column[0].numel()) for buffer, column in over_time], dtype=np.int64)
         with self._lock:
             self._function("scan")(
                 _address(self.shared), _long(len(self.shared)), _address(self.repeated), _long(len(self.repeated)),
-                _address(self._tables), _address(table), _long(len(columns[0])), _address(moving),
-                _long(len(advances)), _long(read), _long(written), ctypes.c_void_p(states[1].data_ptr()),
+                _address(self._tables), _address(table), _long(len(columns[0])), _address(advances),
+                _long(len(advances)), _long(carried), _long(written), ctypes.c_void_p(two[1].data_ptr()),
             )  # fmt: skip
 
     def _checked(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
@@ -229,7 +239,7 @@ class _Assembled:
         return table
 
     def _function(self, name: str) -> Any:
-        return getattr(library(), f"lyapnet_{name}_{NAMES[self.dtype]}")
+        return getattr(library(self.dtype), f"lyapnet_{name}")
 
 
 def _require_same(results: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
@@ -250,5 +260,5 @@ def _address(array: np.ndarray) -> ctypes.c_void_p:
     return ctypes.c_void_p(array.ctypes.data)
 
 
-def _long(number: int) -> ctypes.c_long:
-    return ctypes.c_long(number)
+def _long(number: int) -> ctypes.c_int64:
+    return ctypes.c_int64(number)

@@ -634,17 +634,15 @@ void scan(const Integer *first, Integer first_words, const Integer *every, Integ
 
 }  // namespace
 
-#define EXPORTED(NAME, T)                                                                                             \
-    extern "C" void lyapnet_run_##NAME(const Integer *code, Integer words, const Integer *tables, T **buffers) {      \
-        run<T>(code, words, tables, buffers);                                                                         \
-    }                                                                                                                 \
-    extern "C" int lyapnet_width_##NAME() { return COLUMNS * Of<T>::LANES; }                                          \
-    extern "C" void lyapnet_scan_##NAME(const Integer *first, Integer first_words, const Integer *every,              \
-                                        Integer words, const Integer *tables, T **buffers, Integer steps,             \
-                                        const Integer *advances, Integer moving, Integer input, Integer result,       \
-                                        T *spare) {                                                                   \
-        scan<T>(first, first_words, every, words, tables, buffers, steps, advances, moving, input, result, spare);    \
-    }
+// NUMBER is double or float: each is a file of its own, as most machines need one of them.
+extern "C" void lyapnet_run(const Integer *code, Integer words, const Integer *tables, NUMBER **buffers) {
+    run<NUMBER>(code, words, tables, buffers);
+}
 
-EXPORTED(float64, double)
-EXPORTED(float32, float)
+extern "C" int lyapnet_width() { return COLUMNS * Of<NUMBER>::LANES; }
+
+extern "C" void lyapnet_scan(const Integer *first, Integer first_words, const Integer *every, Integer words,
+                             const Integer *tables, NUMBER **buffers, Integer steps, const Integer *advances,
+                             Integer moving, Integer input, Integer result, NUMBER *spare) {
+    scan<NUMBER>(first, first_words, every, words, tables, buffers, steps, advances, moving, input, result, spare);
+}

@@ -15,17 +15,17 @@ Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from lyapnet.contracts import copied
 from lyapnet.cost import PenaltyCost, spread
-from lyapnet.derivatives import Steps, costates, jacobian, steps_along, with_curvature
-from lyapnet.graphs.poles import Poles, poles_of
-from lyapnet.linear_algebra import apply, multiply, solve
+from lyapnet.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
+from lyapnet.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
+from lyapnet.expansions.step_programs import StepPrograms
+from lyapnet.linear_algebra import apply, is_positive_definite, multiply, solve
 from lyapnet.problem import Problem, Response
 from lyapnet.sets import Unbounded
 from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
@@ -60,14 +60,6 @@ class Expansion(NamedTuple):
         """V(0, x₀) as a single expansion has it."""
         delta = x0 - self.x[0]
         return self.value[0] + ((self.gradient[0] + apply(self.hessian[0], delta) / 2) * delta).sum(-1)
-
-
-class Path(NamedTuple):
-    """Trajectories step by step; J_N is infinite where one is not finite, and x is then finite all the same."""
-
-    x: StatePath
-    u: ControlPath
-    cost: PerState
 
 
 class Optimum(NamedTuple):
@@ -147,7 +139,7 @@ def _at_goal(problem: Problem) -> "_Backward":
     """The backward pass around x*, without limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
-    return _backward(problem, x, u, curved=False)
+    return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False)
 
 
 def optimal_trajectories(
@@ -187,16 +179,23 @@ def optimal_trajectories(
 
     if higher_order:
         roughly = problem.in_steps(method="euler")
-        euler = _descended(roughly, under(u, roughly), False, iterations, NEAR, rivals, settled(0), until)
+        rough = StepPrograms(roughly, STEP_SIZES)
+        euler = _descended(roughly, rough, under(u, roughly), False, iterations, NEAR, rivals, settled(0), until)
         now = cheapest([now, under(euler.u)])
-    now = _descended(problem, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
-    now = _descended(problem, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
-    backward = _backward(problem, now.x, now.u)
+    programs = StepPrograms(problem, STEP_SIZES)
+    now = _descended(problem, programs, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
+    now = _descended(problem, programs, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
+    finite = now.cost.isfinite()
+    if not programs.agrees(now.x[:, finite], now.u[:, finite]):  # its numbers changed since programs were written
+        programs.forget()
+        return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
+    backward = _backward(problem, programs, now.x, now.u)
     return Optimum(now, backward.expansion, backward.mended.sum(0))
 
 
 def _descended(
     problem: Problem,
+    programs: StepPrograms,
     now: Path,
     curved: bool,
     iterations: int,
@@ -213,7 +212,7 @@ def _descended(
         if not len(rows) or time.thread_time() > until:
             break
         was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])
-        tried = _line_search(problem, was, _backward(problem, was.x, was.u, damping[rows], curved))
+        tried = _line_search(problem, programs, was, _backward(problem, programs, was.x, was.u, damping[rows], curved))
         better = tried.cost < was.cost
         x, u = torch.where(better[:, None], tried.x, was.x), torch.where(better[:, None], tried.u, was.u)
         now = exchanged(now, rows, Path(x, u, torch.where(better, tried.cost, was.cost)))
@@ -224,15 +223,6 @@ def _descended(
             least = now.cost[settled].min()
             settled |= now.cost > least + (HOPELESS - 1) * least.abs()
     return now
-
-
-def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
-    """Some trajectories exchanged for others."""
-    return Path(
-        path.x.index_copy(1, rows, others.x),
-        path.u.index_copy(1, rows, others.u),
-        path.cost.index_copy(0, rows, others.cost),
-    )
 
 
 def sizes(problem: Problem, cost: PerState) -> PerState:
@@ -260,69 +250,20 @@ def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
     return Expansion(expansion.x, expansion.value - value, expansion.gradient - gradient, expansion.hessian - hessian)
 
 
-def cheapest(paths: Sequence[Path]) -> Path:
-    """Of each state, that of several trajectories which costs least."""
-    x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
-    best, each = cost.argmin(0), torch.arange(cost.shape[1])
-    return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
-
-
-def in_float64(problem: Problem) -> Problem:
-    """A copy of a problem for what is computed before training: on the CPU, without gradients of its parameters."""
-    return copied(problem).requires_grad_(False)
-
-
-@torch.no_grad()
-def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
-    x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
-    for n in range(problem.horizon.steps):
-        u.append(law(n, x[-1]))
-        following, paid = problem.step(x[-1], u[-1])
-        x.append(following)
-        J = J + paid
-    return path_of(problem, torch.stack(x), torch.stack(u), J)
-
-
-def path_of(problem: Problem, x: StatePath, u: ControlPath, running_cost: PerState) -> Path:
-    """A path of which states and controls at the nodes and ∫ℓ over all of it are known, whatever they are.
-
-    If it leaves the domain, or jumps over a pole of f, g, q or φ, as no trajectory does, its cost is infinite.
-    """
-    J, x = (running_cost + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf), x.nan_to_num()
-    if (poles := _poles_of(problem)) is not None:
-        J = J.masked_fill(poles.crossed(x.double().cpu()).to(J.device), torch.inf)
-    if problem.domain is not None:
-        J = J.masked_fill(problem.domain.left(x), torch.inf)
-    return Path(x, u.nan_to_num(), J)
-
-
-def _poles_of(problem: Problem) -> Poles | None:
-    """Where f, g, q and φ of a problem divide by zero, sought once."""
-    if "poles" not in problem.findings:
-        own = in_float64(problem)
-        f, g, cost = own.system.f, own.system.g, own.cost
-        problem.findings["poles"] = poles_of(
-            lambda x: (f(x), g(x), cost.state(x), cost.terminal(x)), own.initial_states.center
-        )
-    return problem.findings["poles"]
-
-
-def _line_search(problem: Problem, now: Path, backward: _Backward) -> Path:
+def _line_search(problem: Problem, programs: StepPrograms, now: Path, backward: _Backward) -> Path:
     """The best of u + αk + K(x' − x) over step sizes α, of each trajectory."""
-    alpha = torch.tensor(STEP_SIZES, dtype=torch.float64)[:, None, None]
-
-    def law(n: int, x: State) -> Control:
-        u = now.u[n] + alpha * backward.k[n] + (backward.K[n] @ (x - now.x[n])[..., None])[..., 0]
-        return problem.controls.project(u)
-
-    tried = path_under(problem, law, now.x[0].expand(len(STEP_SIZES), *now.x.shape[1:]))
+    tried = path_of(problem, *programs.search(now.x, now.u, backward.k, backward.K))
     best, each = tried.cost.argmin(0), torch.arange(now.x.shape[1])
     return Path(tried.x[:, best, each], tried.u[:, best, each], tried.cost[best, each])
 
 
 def _backward(
-    problem: Problem, x: StatePath, u: ControlPath, damping: Tensor | None = None, curved: bool = True
+    problem: Problem,
+    derivatives: StepDerivatives,
+    x: StatePath,
+    u: ControlPath,
+    damping: Tensor | None = None,
+    curved: bool = True,
 ) -> _Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
 
@@ -333,12 +274,13 @@ def _backward(
     Derivatives that do not exist at a node are those beside it (`steps_along`).
 
     Args:
+        derivatives: of the problem's steps.
         damping: added to Q_uu, in units of the control cost.
         curved: with the second derivatives of F.
     """
-    steps = steps_along(problem.step, problem.cost.terminal, x, u)
+    steps = steps_along(derivatives, problem.cost.terminal, x, u)
     if curved:
-        steps = with_curvature(problem.step, steps, costates(steps))
+        steps = with_curvature(derivatives, steps, costates(steps))
     return _recursion(problem, x, u, steps, damping)
 
 
@@ -347,14 +289,14 @@ def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, dam
     n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
     one = torch.eye(1, 1 + steps.z.shape[-1]).to(x).expand(*steps.paid.shape, 1, -1)
-    M = torch.cat([one, torch.cat([(steps.F.detach() - x[1:])[..., None], steps.F_z], -1)], -2)
+    M = torch.cat([one, torch.cat([(steps.F - x[1:])[..., None], steps.F_z], -1)], -2)
     L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
     W = _quadratic(*steps.end)
     nodes, gains = [W], []
     for k in reversed(range(len(M))):
         Q = L[k] + M[k].mT @ W @ M[k]
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
-        raised = _raised(Q_uu, FLOOR * least[k], 0 if damping is None else damping * least[k])
+        raised = _raised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
         gain = _gains(problem, u[k], raised, Q_ua)
         W = Q[..., : 1 + n, : 1 + n] + gain.mT @ (Q_ua + Q_uu @ gain) + Q_ua.mT @ gain
         W = (W + W.mT) / 2
@@ -378,7 +320,7 @@ def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
     Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
     """
     if not problem.controls.limited:
-        return -torch.linalg.solve(Q_uu, Q_ua)
+        return -solve(Q_uu, Q_ua)
     Q_u, Q_ux = Q_ua[..., 0], Q_ua[..., 1:]
     to = problem.controls.minimise(Q_uu / 2, Q_u - (Q_uu @ u[..., None])[..., 0])
     k = to - u
@@ -389,10 +331,17 @@ def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
     return torch.cat([k[..., None], -torch.linalg.solve(A, share[..., None] * Q_ux)], -1)
 
 
-def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | int) -> Tensor:
+def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | None) -> Tensor:
     """Q_uu with eigenvalues of no less than a floor, and with damping added; what overflowed is zero."""
-    values, vectors = torch.linalg.eigh(Q_uu.where(Q_uu.isfinite(), 0))
-    values = values.clamp_min(0).maximum(floor[..., None])
-    values = values.maximum(ROUNDING * values[..., -1:])
-    values = values + (damping[..., None] if isinstance(damping, Tensor) else damping)
-    return (vectors * values[..., None, :]) @ vectors.mT
+    Q_uu, one = Q_uu.where(Q_uu.isfinite(), 0), torch.eye(Q_uu.shape[-1]).to(Q_uu)
+    least = floor.maximum(ROUNDING * Q_uu.diagonal(0, -2, -1).sum(-1))
+    if Q_uu.shape[-1] == 1:
+        raised = Q_uu.maximum(floor[..., None, None])
+    elif is_positive_definite(Q_uu - one * least[..., None, None]).all():
+        raised = Q_uu
+    else:
+        values, vectors = torch.linalg.eigh(Q_uu)
+        values = values.clamp_min(0).maximum(floor[..., None])
+        values = values.maximum(ROUNDING * values[..., -1:])
+        raised = (vectors * values[..., None, :]) @ vectors.mT
+    return raised if damping is None else raised + one * damping[..., None, None]

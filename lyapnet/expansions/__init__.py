@@ -1,0 +1,40 @@
+"""Optimal trajectories, and the value function to second order around them."""
+
+from lyapnet.expansions.dynamic_programming import (
+    FLOOR,
+    TRIES,
+    Expansion,
+    Optimum,
+    at_rest,
+    greedy_law,
+    held_control,
+    optimal_trajectories,
+    penalty_of_one_step,
+    regulator,
+    riccati,
+    sizes,
+    without_penalty,
+)
+from lyapnet.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
+
+__all__ = [
+    "FLOOR",
+    "TRIES",
+    "Expansion",
+    "Optimum",
+    "Path",
+    "at_rest",
+    "cheapest",
+    "exchanged",
+    "greedy_law",
+    "held_control",
+    "in_float64",
+    "optimal_trajectories",
+    "path_of",
+    "path_under",
+    "penalty_of_one_step",
+    "regulator",
+    "riccati",
+    "sizes",
+    "without_penalty",
+]

@@ -1,0 +1,152 @@
+"""Line searches along the steps of a problem, and their derivatives, as programs of lyapnet's kernel."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.derivatives import StepDerivatives
+from lyapnet.errors import LyapnetError
+from lyapnet.graphs.compilation import Scan
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
+from lyapnet.graphs.stateless import state_of, stateless
+from lyapnet.graphs.tracing import cut, trace
+from lyapnet.linear_algebra import apply
+from lyapnet.problem import Problem
+from lyapnet.types import Control, ControlPath, State, StatePath
+
+TRAJECTORIES, ROWS = 16, 512  # in one call of a program: of a line search, and of derivatives
+Kernel = NumberKernel | ScanKernel
+
+
+class StepPrograms(StepDerivatives):
+    """What differential dynamic programming asks of the steps of a problem, for batches of any size.
+
+    What cannot be traced, or has an operation that the kernel lacks, is run by torch, to the same result. Programs are
+    written once for a problem and its copies; the tensors that a problem is made of are read at each call, but other
+    numbers are as they were when it was traced: `agrees` tells.
+
+    Args:
+        problem: in float64, on the CPU.
+        step_sizes: α of the line search.
+    """
+
+    def __init__(self, problem: Problem, step_sizes: Sequence[float]):
+        super().__init__(problem.step, problem.system.n)
+        self.problem = problem
+        self._search = _SearchStep(problem, step_sizes)
+        self._first = _OfProblem(problem, super().first)
+        self._curvature = _OfProblem(problem, super().curvature)
+
+    def search(self, x: StatePath, u: ControlPath, k: ControlPath, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Closed loops from x̄_0 (b, n) under u = ū + αk + K(x − x̄), kept to U, for each step size α.
+
+        Args:
+            x, u: x̄ (N + 1, b, n) and ū (N, b, m).
+            k, K: (N, b, m) and (N, b, m, n).
+
+        Returns:
+            x (N + 1, sizes, b, n), u (N, sizes, b, m), and ∫ℓ over all of it (sizes, b).
+        """
+        along, sizes = [x[:-1], u, k, K], len(self._search.step_sizes)
+        start = torch.cat([x[0], torch.zeros_like(x[0, :, :1])], -1).expand(sizes, -1, -1)
+        parts = [
+            self._searched([_filled(column, rows, 1, TRAJECTORIES) for column in (*along, start)])
+            for rows in torch.arange(x.shape[1]).split(TRAJECTORIES)
+        ]
+        y, controls = (torch.cat(columns, 2)[:, :, : x.shape[1]] for columns in zip(*parts, strict=True))
+        return torch.cat([start[None, ..., :-1], y[..., :-1]]), controls, y[-1, ..., -1]
+
+    def first(self, z: Tensor) -> list[Tensor]:
+        parts = [self._run("first", self._first, part) for part in self._in_slices(z)]
+        return [torch.cat(columns)[: len(z)] for columns in zip(*parts, strict=True)]
+
+    def curvature(self, z: Tensor, p: State) -> Tensor:
+        parts = [self._run("curvature", self._curvature, part) for part in self._in_slices(z, p)]
+        return torch.cat([found[0] for found in parts])[: len(z)]
+
+    def agrees(self, x: StatePath, u: ControlPath) -> bool:
+        """Whether steps along finite paths are those of the problem as it is, up to a third of the digits."""
+        with torch.no_grad():
+            following, _ = self.problem.step(x[:-1], u)
+        third = torch.finfo(x.dtype).eps ** (1 / 3)
+        return not x.numel() or torch.allclose(following, x[1:], rtol=third, atol=third * float(x.abs().max()))
+
+    def forget(self) -> None:
+        """Run by torch from now on what programs were written for, here and for all copies of the problem."""
+        known = self.problem.findings.programs
+        known.update(dict.fromkeys(known))
+
+    def _in_slices(self, *columns: Tensor) -> list[list[Tensor]]:
+        rows = torch.arange(len(columns[0])).split(ROWS)
+        return [[_filled(column, some, 0, ROWS) for column in columns] for some in rows]
+
+    def _searched(self, arguments: list[Tensor]) -> Sequence[Tensor]:
+        """(y, u) over time of one slice."""
+        kernel = self._kernel("search", partial(self._written_search, arguments))
+        if kernel is None:
+            return Scan(lambda: (), self._search, 0).loop(*arguments)
+        return kernel(*state_of(self._search), *arguments)
+
+    def _written_search(self, arguments: list[Tensor]) -> Kernel:
+        *columns, y = arguments
+        state, moving = state_of(self._search), len(columns)
+        middle = [column[len(column) // 2] for column in columns]
+        graph = trace(stateless(self._search), [*state, *(column[0] for column in columns), y], [[*middle, y]])
+        prepare, step = cut(graph, late=moving + 1, early_outputs=0, repeat=False)
+        return ScanKernel(prepare, step, [*state, *arguments], moving)
+
+    def _run(self, name: str, module: "_OfProblem", arguments: list[Tensor]) -> Sequence[Tensor]:
+        examples = [*state_of(module), *arguments]
+        kernel = self._kernel(name, lambda: NumberKernel(trace(stateless(module), examples), examples))
+        return module(*arguments) if kernel is None else kernel(*examples)
+
+    def _kernel(self, name: str, write: Callable[[], Kernel]) -> Kernel | None:
+        known, key = self.problem.findings.programs, self._key(name)
+        if key not in known:
+            try:
+                known[key] = write()
+            except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
+                known[key] = None
+        return known[key]
+
+    def _key(self, name: str) -> tuple[Any, ...]:
+        """What a program is written for; problems with the same findings may differ in their steps and controls."""
+        shapes = tuple(tensor.shape for tensor in state_of(self.problem))
+        return name, self.problem.horizon, type(self.problem.controls), self._search.step_sizes, shapes
+
+
+class _SearchStep(nn.Module):
+    """(x̄, ū, k, K, y) ↦ (y', y', u), y = (x, ∫ℓ): one step under u = ū + αk + K(x − x̄), kept to U."""
+
+    def __init__(self, problem: Problem, step_sizes: Sequence[float]):
+        super().__init__()
+        self.problem, self.step_sizes = problem, tuple(step_sizes)
+        self.alpha = torch.tensor(step_sizes, dtype=torch.float64)[:, None, None]
+
+    @torch.no_grad()
+    def forward(self, along: Tensor, u: Tensor, k: Tensor, K: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
+        x = y[..., :-1]
+        u = self.problem.controls.project(u + self.alpha * k + apply(K, x - along))
+        following, paid = self.problem.step(x, u)
+        y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
+        return y, y, u
+
+
+class _OfProblem(nn.Module):
+    """A function of tensors, made of a problem."""
+
+    def __init__(self, problem: Problem, function: Callable[..., Any]):
+        super().__init__()
+        self.problem, self.function = problem, function
+
+    def forward(self, *arguments: Tensor) -> tuple[Tensor, ...]:
+        result = self.function(*arguments)
+        return (result,) if isinstance(result, Tensor) else tuple(result)
+
+
+def _filled(column: Tensor, rows: Tensor, axis: int, count: int) -> Tensor:
+    """Some rows along an axis, the last of them repeated until they are as many as a program takes."""
+    return column.index_select(axis, torch.cat([rows, rows[-1:].expand(count - len(rows))]))

@@ -1,0 +1,120 @@
+"""What differential dynamic programming asks of a problem's steps, by the kernel and by torch."""
+
+import pickle
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet import Box, ControlBox, Horizon, Problem, QuadraticCost
+from lyapnet.derivatives import StepDerivatives
+from lyapnet.expansions import in_float64, optimal_trajectories, path_of, path_under
+from lyapnet.expansions.step_programs import StepPrograms
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
+from lyapnet.systems import Pendulum
+
+SIZES = (1.0, 0.25)
+
+
+class Looking(Pendulum):
+    """A pendulum whose code looks at numbers, and so has no trace."""
+
+    def mass_matrix(self, q):
+        return super().mass_matrix(q) * (1.0 if float(q.detach().abs().max()) < 1e6 else 2.0)
+
+
+def swinging(system=None, steps=12, method="rk4"):
+    cost = QuadraticCost([[1.0, 0], [0, 0.1]], [[0.1]], [[5.0, 0], [0, 1]])
+    box = Box([-1, -1], [1, 1])
+    return in_float64(Problem(system or Pendulum(), cost, ControlBox(-2, 2), box, Horizon(steps, 0.05, method)))
+
+
+def law_along(problem, b):
+    """A path (x̄, ū) from b states, and some gains along it."""
+    generator = torch.Generator().manual_seed(b)
+    N = problem.horizon.steps
+    u, k = (torch.randn(N, b, 1, generator=generator, dtype=torch.float64) for _ in range(2))
+    K = torch.randn(N, b, 1, 2, generator=generator, dtype=torch.float64)
+    x0 = problem.initial_states.sample(b, generator).double()
+    return path_under(problem, lambda n, _: u[n], x0).x, u, k, K
+
+
+def programs_of(problem):
+    return {key[0]: type(program) for key, program in problem.findings.programs.items()}
+
+
+@pytest.mark.parametrize("b", [1, 16, 37])
+@pytest.mark.parametrize(("system", "kernel"), [(Pendulum, ScanKernel), (Looking, type(None))])
+def test_line_searches_are_closed_loops_of_their_law(system, kernel, b):
+    problem = swinging(system())
+    x, u, k, K = law_along(problem, b)
+
+    def law(n, now):
+        alpha = torch.tensor(SIZES, dtype=torch.float64)[:, None, None]
+        return problem.controls.project(u[n] + alpha * k[n] + (K[n] @ (now - x[n])[..., None])[..., 0])
+
+    expected = path_under(problem, law, x[0].expand(len(SIZES), b, 2))
+    found = path_of(problem, *StepPrograms(problem, SIZES).search(x, u, k, K))
+    assert programs_of(problem) == {"search": kernel}
+    assert found.x.shape == (13, 2, b, 2)
+    for mine, other in zip(found, expected, strict=True):
+        assert_close(mine, other, rtol=1e-10, atol=1e-10)
+    assert not torch.allclose(found.cost[0], found.cost[1]), "the step sizes lead elsewhere"
+
+
+@pytest.mark.parametrize("rows", [1, 512, 700])
+@pytest.mark.parametrize(("system", "kernel"), [(Pendulum, NumberKernel), (Looking, type(None))])
+def test_derivatives_are_those_of_autograd(system, kernel, rows):
+    problem = swinging(system())
+    generator = torch.Generator().manual_seed(0)
+    z, p = (torch.randn(rows, d, generator=generator, dtype=torch.float64) for d in (3, 2))
+    programs = StepPrograms(problem, SIZES)
+    first, bends = programs.first(z), programs.curvature(z, p)
+    assert programs_of(problem) == {"first": kernel, "curvature": kernel}
+    by_torch = StepDerivatives(problem.step, 2)
+    for mine, other in zip([*first, bends], [*by_torch.first(z), by_torch.curvature(z, p)], strict=True):
+        assert_close(mine, other, rtol=1e-10, atol=1e-12)
+    k = rows // 2
+    F, paid = (lambda z, part=part: problem.step(z[:2], z[2:])[part] for part in (0, 1))
+    of = torch.autograd.functional
+    expected = [F(z[k]), paid(z[k]), of.jacobian(F, z[k]), of.jacobian(paid, z[k]), of.hessian(paid, z[k])]
+    for mine, other in zip(first, expected, strict=True):
+        assert_close(mine[k], other, rtol=1e-10, atol=1e-12)
+    assert_close(bends[k], of.hessian(lambda z: F(z) @ p[k], z[k]), rtol=1e-10, atol=1e-12)
+
+
+def test_copies_of_a_problem_share_its_programs_and_other_steps_have_their_own():
+    problem = swinging()
+    one = StepPrograms(problem, SIZES).first(torch.ones(3, 3, dtype=torch.float64))
+    again = StepPrograms(in_float64(problem), SIZES).first(torch.ones(3, 3, dtype=torch.float64))
+    assert len(problem.findings.programs) == 1
+    assert_close(one, again, rtol=0, atol=0)
+    euler = StepPrograms(problem.in_steps(method="euler"), SIZES).first(torch.ones(3, 3, dtype=torch.float64))
+    assert len(problem.findings.programs) == 2
+    assert not torch.allclose(euler[0], one[0])
+    assert pickle.loads(pickle.dumps(problem)).findings.programs == {}, "a program belongs to its process"
+
+
+def test_tensors_of_a_problem_may_change():
+    problem = swinging(Pendulum())
+    z = torch.ones(3, 3, dtype=torch.float64)
+    before = StepPrograms(problem, SIZES).first(z)
+    problem.cost.Q.mul_(2)
+    after = StepPrograms(problem, SIZES).first(z)
+    assert_close(after, StepDerivatives(problem.step, 2).first(z), rtol=1e-12, atol=1e-12)
+    assert not torch.allclose(before[1], after[1])
+
+
+def test_a_number_that_changed_is_noticed_by_where_steps_lead():
+    problem = swinging(steps=30)
+    x0, u = torch.tensor([[0.5, 0.0], [-0.3, 0.8]]), torch.zeros(30, 2, 1)
+    light = optimal_trajectories(problem, x0, u).path
+    assert ScanKernel in programs_of(problem).values()
+    problem.system.mass = 3.0
+    programs = StepPrograms(problem, SIZES)
+    assert not programs.agrees(light.x, light.u)
+    heavy = optimal_trajectories(problem, x0, u).path
+    assert programs.agrees(heavy.x, heavy.u)
+    assert set(programs_of(problem).values()) == {type(None)}
+    assert_close(heavy.cost, optimal_trajectories(swinging(Pendulum(mass=3.0), steps=30), x0, u).path.cost)
+    assert not torch.allclose(heavy.cost, light.cost)

@@ -208,7 +208,11 @@ class TrainingConfig:
 
     iterations: int = option(200, "Gradient steps.", at_least=1, below=10**12)
     batch_size: int = option(64, "Initial states in each step, per process.", at_least=1)
-    optimizer: str = option("adam", "adam, or adamw with decoupled weight decay.", choices=("adam", "adamw"))
+    optimizer: str = option(
+        "adam",
+        "adam, adamw with decoupled weight decay, or muon for the matrices of V and adamw for the rest.",
+        choices=("adam", "adamw", "muon"),
+    )
     learning_rate: float = option(1e-2, "Greatest step size: at the start, or after the warmup.", above=0)
     final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
     warmup: int = option(0, "Steps in which the learning rate rises to its greatest, linearly.", at_least=0)

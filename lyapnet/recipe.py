@@ -12,6 +12,7 @@ STANDARD: dict[str, Any] = {
     "training": {
         "iterations": 400,
         "batch_size": 32,
+        "optimizer": "muon",
         "learning_rate": 0.003,
         "warmup": 40,
         "validate_every": 20,

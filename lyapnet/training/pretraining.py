@@ -21,10 +21,11 @@ from lyapnet.random_streams import START, stream
 from lyapnet.sets import ControlSet, Unbounded
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
+from lyapnet.training.optimizer import Muon
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, PerState, State, StatePath
 
-STEPS, BATCH, RATE = (2000, 1000), 512, (0.01, 0.005)  # before and after the fitted law shows where it leads
+STEPS, BATCH, RATE = (1000, 500), 512, (0.02, 0.01)  # before and after the fitted law shows where it leads
 BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
 GAIN = 2e-4  # of the cost of the optima, by which a further fit has to lower that of the law for another one
@@ -308,9 +309,9 @@ class _Fit:
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
-        """By Adam, whose rate falls as a cosine over the steps, or the seconds of this thread's work."""
+        """By Muon, whose rate falls as a cosine over the steps, or the seconds of this thread's work."""
         trained, began = self._trained, time.thread_time()
-        examples, optimizer = examples.to(trained[0]), torch.optim.Adam(trained, rate)
+        examples, optimizer = examples.to(trained[0]), Muon(trained, rate, weight_decay=0.0)
         for k in range(steps):
             share = max(k / steps, (time.thread_time() - began) / seconds)
             if share >= 1:

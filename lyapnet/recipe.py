@@ -4,7 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 # What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
-# a registered program has the weights that it recommends, and with constraints, where V is steep, the law looks ahead.
+# a registered program has the weights that it recommends. With constraints, where V is steep, the law looks ahead; with
+# them or limits of the controls V_x has kinks, to which Muon leads less surely than Adam.
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
@@ -40,7 +41,11 @@ def completed(
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
     recipe = dict(STANDARD)
-    if _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides):
+    constrained = _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides)
+    limited = _names(("lower", "upper"), "controls", content, overrides)
+    if constrained or limited:
+        recipe["training"] = {**STANDARD["training"], "optimizer": "adam"}
+    if constrained:
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
         law = _asked("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
         recipe["network"] = {**STANDARD["network"], "penalty": law == "lookahead"}
@@ -52,8 +57,7 @@ def completed(
     )
     if program == "region" or _names(("iterations",), "training", content, overrides):
         # its loss may stay where it is for long, and then fall; a number of steps that somebody asks for is taken
-        recipe["training"] = {**STANDARD["training"], "least_gain": 0.0}
-    limited = _names(("lower", "upper"), "controls", content, overrides)
+        recipe["training"] = {**recipe["training"], "least_gain": 0.0}
     if program in ("value", "region") and gradient == "discrete" and limited:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
     standard = {key: {**section, **sections.get(key, {})} for key, section in recipe.items()}

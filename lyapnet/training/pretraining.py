@@ -25,16 +25,36 @@ from lyapnet.training.optimizer import Muon
 from lyapnet.training.stages import Report, silent
 from lyapnet.types import Control, PerState, State, StatePath
 
-STEPS, BATCH, RATE = (1000, 500), 512, (0.02, 0.01)  # before and after the fitted law shows where it leads
+BATCH = 512  # examples in a step
 BRIEF = 200  # steps that tell what a fit can begin with
 SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
 GAIN = 2e-4  # of the cost of the optima, by which a further fit has to lower that of the law for another one
 NEWTON = 6  # steps to where a law that looks ahead looks at V
 SOME = 20_000  # examples that tell how wrong an expansion is before a fit
 ROUNDS, GOOD = 4, 1.001  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
+IN_VAIN = 2  # rounds without a gain, one after the other, that are the last
 VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
 LEAST = 1e-4  # of the cost of its trajectory, against which an error of a stationary V counts where V is less
 TRUSTED, TRUSTED_NEAR = 0.01, 1.0  # ½ δᵀ|H|δ, as a share of J, up to which an expansion is believed
+
+
+class Method(NamedTuple):
+    """How a fit moves the weights, before and after the fitted law shows where it leads."""
+
+    optimizer: Callable[..., torch.optim.Optimizer]
+    steps: tuple[int, int]
+    rate: tuple[float, float]  # the greatest
+
+
+# Where controls or states are at a limit V_x has kinks: a V that Muon fits is as right along optimal trajectories, and
+# wild beside them.
+SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01))
+WITH_LIMITS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005))
+
+
+def method_for(problem: Problem) -> Method:
+    """The method of a fit to optima of a problem."""
+    return WITH_LIMITS if problem.controls.limited or problem.constraints is not None else SMOOTH
 
 
 class Examples(NamedTuple):
@@ -260,8 +280,8 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         report: is told what is being done.
     """
     fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _finite(optimum)
-    best, least = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf)
-    before = math.inf
+    method = method_for(learner.problem)
+    best, least, in_vain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
     size = float(sizes(learner.problem, optimum.path.cost).mean())
     enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
     for k in range(ROUNDS + 1):
@@ -269,14 +289,14 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         late = min(k, 1)
         within = f"within {SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        fitting.lower(examples, STEPS[late], RATE[late], SECONDS[late], progress)
+        fitting.lower(examples, method.steps[late], method.rate[late], SECONDS[late], progress)
         path = learner.path_from(optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
+        in_vain = 0 if now < (least[0], least[1] - gain) else in_vain + 1
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == ROUNDS or now[1] <= enough or before - now[1] <= gain:
+        if k == ROUNDS or now[1] <= enough or in_vain == IN_VAIN:
             break
-        before = now[1]
         examples = examples.with_further(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
     learner.V.load_state_dict(best)
 
@@ -289,7 +309,7 @@ def looks_ahead(learner: Learner) -> bool:
 def fit_briefly(learner: Learner, examples: Examples) -> None:
     """Lower both errors of V at examples in a few steps."""
     briefly = _Fit(learner, examples, stream(learner.seed, START, 6))
-    briefly.lower(examples, BRIEF, RATE[0], SECONDS[0], lambda done, total: None)
+    briefly.lower(examples, BRIEF, method_for(learner.problem).rate[0], SECONDS[0], lambda done, total: None)
 
 
 class _Fit:
@@ -305,13 +325,14 @@ class _Fit:
         some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
         loss = _Misfit(learner.V, learner.problem)
         self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
+        self._new_optimizer = method_for(learner.problem).optimizer
 
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
-        """By Muon, whose rate falls as a cosine over the steps, or the seconds of this thread's work."""
+        """The learning rate falls as a cosine over the steps, or the seconds of this thread's work."""
         trained, began = self._trained, time.thread_time()
-        examples, optimizer = examples.to(trained[0]), Muon(trained, rate, weight_decay=0.0)
+        examples, optimizer = examples.to(trained[0]), self._new_optimizer(trained, rate)
         for k in range(steps):
             share = max(k / steps, (time.thread_time() - began) / seconds)
             if share >= 1:

@@ -25,7 +25,7 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.stages import Report, silent
 from lyapnet.training.start import choose_start, has_place_for_start
 
-VERSION = 8  # of what a start is: to be raised where the search for one changes
+VERSION = 9  # of what a start is: to be raised where the search for one changes
 
 
 class StartCache:
@@ -91,7 +91,8 @@ def _file(learners: Sequence[Learner], may_look_ahead: bool) -> Path | None:
         VERSION, torch.__version__, [(graph.code, constants_of(graph)) for graph in graphs], problem.goal.tolist(),
         box.lower.tolist(), box.upper.tolist(), type(controls).__qualname__,
         [(name, buffer.tolist()) for name, buffer in controls.named_buffers()], vars(problem.horizon),
-        type(policy).__qualname__, may_look_ahead, kept_of(learners[0]), search.OPTIMA, optima.SMALL, pretraining.STEPS,
+        type(policy).__qualname__, may_look_ahead, kept_of(learners[0]), search.OPTIMA, optima.SMALL,
+        pretraining.method_for(problem).steps,
         [(learner.seed, type(learner.V).__qualname__, str(learner.V), _digest(learner)) for learner in learners],
     ]  # fmt: skip
     return cache_folder() / "starts" / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt"

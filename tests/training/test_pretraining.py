@@ -117,7 +117,8 @@ def at(x, problem):
 @pytest.fixture
 def swing(monkeypatch):
     """A pendulum that hangs, and optima of it: (problem, those that are fitted to, those that are not)."""
-    monkeypatch.setattr(pretraining, "STEPS", (400, 200))
+    for name in ("SMOOTH", "WITH_LIMITS"):
+        monkeypatch.setattr(pretraining, name, getattr(pretraining, name)._replace(steps=(400, 200)))
     problem = hanging(steps=40)
     expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
     seen, unseen = (optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)) for _ in range(2))

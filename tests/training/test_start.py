@@ -16,6 +16,7 @@ from lyapnet.config import config_from_plain
 from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.expansions import optimal_trajectories
+from lyapnet.training import pretraining
 from lyapnet.training.build import build_module
 from lyapnet.training.candidates import CALM
 from lyapnet.training.optimizer import OptimizerOptions
@@ -40,7 +41,8 @@ SWING = LINEAR | {
 def _few_optima():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 12)
-        patch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+        for name in ("SMOOTH", "WITH_LIMITS"):
+            patch.setattr(pretraining, name, getattr(pretraining, name)._replace(steps=(130, 70)))
         patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         yield
 
@@ -187,7 +189,7 @@ def test_fitting_to_optima_is_kept_where_it_is_better_and_taken_back_where_not(m
     }
     _, better = started(task)
     assert better.chosen.name == "12 optima from states of X₀"
-    monkeypatch.setattr("lyapnet.training.pretraining.RATE", (1e3, 1e3))
+    monkeypatch.setattr(pretraining, "SMOOTH", pretraining.SMOOTH._replace(rate=(1e3, 1e3)))
     (learner,), taken_back = started(task)
     assert taken_back.chosen.name == "the Riccati solution at the goal"
     assert not learner.V.network.output.weight.any(), "the network is zero again"

@@ -26,6 +26,7 @@ from lyapnet.training.modules import ValueModule
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import silent
 from tests.configs import objects
+from tests.fits import shorten_fits
 from tests.problems import CONF
 from tests.tasks_without_goal import tasks as tasks_without_goal
 
@@ -197,7 +198,7 @@ def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
+    shorten_fits(monkeypatch, 260, 140)
     monkeypatch.setattr("lyapnet.training.relaxation.STATES", 6)
 
 
@@ -205,7 +206,7 @@ def few_optima(monkeypatch):
 def run(tmp_path_factory):
     content = {**constrained(**SPEED), "logs": str(tmp_path_factory.mktemp("logs"))}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.pretraining.STEPS", (1000, 500))
+        shorten_fits(patch, 1000, 500)
         # a law that is faster as it is written, and holds a wide margin alone
         return lyapnet.train(content, [*BRIEF, "rollout.policy=sampled", "constraints.margin=0.02"])
 

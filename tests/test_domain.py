@@ -19,6 +19,7 @@ from lyapnet.expansions import optimal_trajectories, path_under
 from lyapnet.family import FamilySystem
 from lyapnet.problem import Problem
 from lyapnet.rollout import Rollout
+from tests.fits import shorten_fits
 from tests.tasks_without_goal.consumption import system
 from tests.tasks_without_goal.consumption.system import Village
 
@@ -226,7 +227,7 @@ def brief(monkeypatch):
     """A search for a start that takes a second or two."""
     monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (60, 30))
+    shorten_fits(monkeypatch, 60, 30)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 

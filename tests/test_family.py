@@ -24,11 +24,12 @@ from lyapnet.networks import ExpansionNetwork
 from lyapnet.random_streams import TEST, stream
 from lyapnet.systems import SYSTEMS, Pendulum
 from lyapnet.systems.base import MechanicalSystem
-from lyapnet.training import pretraining, start
+from lyapnet.training import start
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.initial_networks import take
 from lyapnet.training.optima import minima
 from tests.configs import objects
+from tests.fits import shorten_fits
 from tests.problems import CONF, problem_of
 
 MASSES = {
@@ -173,7 +174,7 @@ def trained(tmp_path_factory):
     })  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(start, "OPTIMA", 8)
-        patch.setattr(pretraining, "STEPS", (20, 10))
+        shorten_fits(patch, 20, 10)
         lyapnet.train(config)
     return folder / "masses" / "version_0" / "checkpoints" / "best.ckpt"
 

@@ -14,6 +14,7 @@ from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.expansions import greedy_law, optimal_trajectories, path_under
 from lyapnet.training.start import expansions_of
 from tests.configs import objects
+from tests.fits import shorten_fits
 from tests.problems import CONF
 
 PENDULUM = {
@@ -112,7 +113,7 @@ def test_a_guess_that_is_slow_at_first_is_not_given_up():
 
 def test_it_trains_and_comes_back(tmp_path, monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (260, 140))
+    shorten_fits(monkeypatch, 260, 140)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
              "rollout.compile=off"]  # fmt: skip

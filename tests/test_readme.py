@@ -13,6 +13,7 @@ import lyapnet
 from lyapnet.cli import app, main
 from lyapnet.comparison.plan import jobs_of, load_comparison
 from lyapnet.config import load_config
+from tests.fits import shorten_fits
 from tests.pages import PAGES, README, REPORT, ROOT, blocks
 from tests.problems import problem_of
 
@@ -194,7 +195,7 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
 
 def test_a_system_of_your_own(workplace, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (40, 20))
+    shorten_fits(monkeypatch, 40, 20)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     (source,) = [block for block in blocks("python") if "(ControlAffineSystem)" in block]
     assert len(source.strip().splitlines()) <= 24

@@ -18,6 +18,7 @@ from lyapnet.expansions import riccati
 from lyapnet.networks import FCN, Scaling, StationaryNetwork, Timeless
 from lyapnet.training.build import build_module
 from lyapnet.training.start import choose_start
+from tests.fits import shorten_fits
 
 CHAIN = {
     "experiment": "mine",
@@ -247,7 +248,7 @@ def test_from_the_goal_alone_there_is_a_start():
 def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     """Of a pendulum between tight limits it lies far below what V is on a wide X₀, and a fit sees both."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (150, 50))
+    shorten_fits(monkeypatch, 150, 50)
     tight = ["controls={lower: -12, upper: 12}", "initial_states={lower: [-3, -3], upper: [3, 3]}", "cost.R=0.05"]
     (learner,) = build_module(config_from_plain(PENDULUM, tight)).members
     start = choose_start([learner])
@@ -264,7 +265,7 @@ def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    shorten_fits(monkeypatch, 130, 70)
 
 
 @pytest.mark.usefixtures("few_optima")

@@ -20,6 +20,7 @@ from lyapnet.rollout import Rollout
 from lyapnet.sets import Box, ControlBox, Unbounded
 from lyapnet.systems import ControlAffineSystem, Pendulum
 from tests.configs import objects
+from tests.fits import shorten_fits
 from tests.problems import CONF, Formula, problem_of, untrained
 
 TARGET = [math.pi / 4, 0.0]
@@ -192,7 +193,7 @@ def test_what_a_cost_ignores_it_ignores_about_a_target():
 
 def test_fine_tuning_to_another_target_is_no_silent_matter(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    shorten_fits(monkeypatch, 130, 70)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     brief = ["training.iterations=1", "evaluation.test_states=2", "evaluation.validation_states=2", "loggers=[csv]",
              "rollout.compile=off", "evaluation.optimum=false"]  # fmt: skip

@@ -22,6 +22,7 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.lost_states import excess
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import silent
+from tests.fits import shorten_fits
 
 R, T = 0.5, 1.0
 
@@ -256,7 +257,7 @@ def test_a_training_without_a_goal(tmp_path, monkeypatch, capsys):
     """From YAML to a table: one state, a cost of both signs, an end that is to be far."""
     monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (100, 50))
+    shorten_fits(monkeypatch, 100, 50)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     (tmp_path / "task.yaml").write_text(
         json.dumps({

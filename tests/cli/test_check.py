@@ -14,6 +14,7 @@ from lyapnet.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.facts import facts_of, unreached_modes
 from lyapnet.training.start import Candidate, Start
+from tests.fits import shorten_fits
 
 TASK = {
     "system": {"name": "pendulum"},
@@ -26,7 +27,7 @@ TASK = {
 @pytest.fixture(autouse=True)
 def _few_optima(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    shorten_fits(monkeypatch, 130, 70)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 

@@ -19,6 +19,7 @@ from lyapnet.config import config_from_plain, load_config
 from lyapnet.errors import UsageError
 from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.facts import facts_of, unreached_modes
+from tests.fits import shorten_fits
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -252,7 +253,7 @@ def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 4)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (20, 10))
+    shorten_fits(monkeypatch, 20, 10)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     monkeypatch.setattr("lyapnet.training.optima.optimal_cost", lambda problem: None)
     assert main(["check", "task.yaml"]) == 0

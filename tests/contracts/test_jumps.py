@@ -12,6 +12,7 @@ from lyapnet.interpolation import Table
 from lyapnet.systems import SYSTEMS
 from lyapnet.training.experiment import train
 from lyapnet.training.facts import jump_facts
+from tests.fits import shorten_fits
 from tests.problems import problem_of
 
 LOW, HIGH = torch.tensor([-1.0, -1.0]).double(), torch.tensor([1.0, 1.5]).double()
@@ -83,7 +84,7 @@ class Block(lyapnet.ControlAffineSystem):
 
 def test_training_begins_with_a_note(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (130, 70))
+    shorten_fits(monkeypatch, 130, 70)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     config = {
         "experiment": "block", "logs": str(tmp_path), "loggers": ["csv"], "rollout": {"compile": "off"},

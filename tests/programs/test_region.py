@@ -16,6 +16,7 @@ from lyapnet.sets import Box
 from lyapnet.systems import DoubleIntegrator
 from lyapnet.training.build import build_module
 from lyapnet.training.start import choose_start
+from tests.fits import shorten_fits
 from tests.problems import problem_of
 
 A, B, Q = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], torch.eye(2).double()
@@ -136,7 +137,7 @@ def test_what_does_not_suit_a_region_is_refused(overrides, message):
 
 def test_training_for_it_makes_the_region_larger(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (200, 100))
+    shorten_fits(monkeypatch, 200, 100)
     (learner,) = build_module(config_from_plain(OWN | OSCILLATOR, ["pointwise.points=128"])).members
     choose_start([learner])
     condition, optimizer = learner.pointwise, torch.optim.Adam(learner.V.parameters(), 0.003)

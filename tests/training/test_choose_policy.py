@@ -14,6 +14,7 @@ from lyapnet.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
 from lyapnet.training.start import _gain_by_looking_ahead
+from tests.fits import shorten_fits
 from tests.problems import Formula, problem_of
 
 FEW = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
@@ -37,7 +38,7 @@ FITTED = "V fitted for the law that looks ahead"
 def brief(monkeypatch, tmp_path):
     """The task, its log folder, and a search for a start that is brief and finds that looking ahead gains a fifth."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (60, 20))
+    shorten_fits(monkeypatch, 60, 20)
     monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: 0.2)
     return {**TASK, "logs": str(tmp_path)}
 

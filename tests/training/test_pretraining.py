@@ -20,6 +20,7 @@ from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
 from lyapnet.training.pretraining import errors, examples_of, examples_visited, fit
 from tests.expansions.test_expansions import hanging
+from tests.fits import shorten_fits
 from tests.problems import Formula, problem_of
 
 GENERATOR = torch.Generator().manual_seed(0)
@@ -117,8 +118,7 @@ def at(x, problem):
 @pytest.fixture
 def swing(monkeypatch):
     """A pendulum that hangs, and optima of it: (problem, those that are fitted to, those that are not)."""
-    for name in ("SMOOTH", "WITH_LIMITS"):
-        monkeypatch.setattr(pretraining, name, getattr(pretraining, name)._replace(steps=(400, 200)))
+    shorten_fits(monkeypatch, 400, 200)
     problem = hanging(steps=40)
     expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
     seen, unseen = (optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)) for _ in range(2))

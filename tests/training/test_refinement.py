@@ -32,6 +32,7 @@ from lyapnet.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
 from lyapnet.training.runs import Run
+from tests.fits import shorten_fits
 
 TINY = [
     *("training.iterations=2", "training.batch_size=4", "horizon.steps=8", "network.hidden=[4]"),
@@ -161,7 +162,7 @@ def region_run(tmp_path_factory):
     changes = [*tiny, "horizon={steps: 40, dt: 0.2, stationary: true}", "training.warmup=0", "pointwise.points=16"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 6)
-        patch.setattr("lyapnet.training.pretraining.STEPS", (5, 5))
+        shorten_fits(patch, 5, 5)
         patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         assert main(["train", "--config", "conf/regions/van_der_pol.yaml", f"logs={folder}", *changes]) == 0
     return folder / "van_der_pol_region/version_0"

@@ -21,6 +21,7 @@ from lyapnet.training.build import build_module
 from lyapnet.training.candidates import CALM
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.start import choose_start, expansions_of
+from tests.fits import shorten_fits
 
 LINEAR = {
     "experiment": "mine",
@@ -41,8 +42,7 @@ SWING = LINEAR | {
 def _few_optima():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lyapnet.training.start.OPTIMA", 12)
-        for name in ("SMOOTH", "WITH_LIMITS"):
-            patch.setattr(pretraining, name, getattr(pretraining, name)._replace(steps=(130, 70)))
+        shorten_fits(patch, 130, 70)
         patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
         yield
 

@@ -13,6 +13,7 @@ from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints
 from lyapnet.training.facts import facts_of
 from lyapnet.training.start_cache import StartCache, kept_or_chosen
+from tests.fits import shorten_fits
 
 TASK = {
     "experiment": "mine",
@@ -28,7 +29,7 @@ TASK = {
 def _few_optima(monkeypatch, tmp_path):
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 6)
-    monkeypatch.setattr("lyapnet.training.pretraining.STEPS", (20, 10))
+    shorten_fits(monkeypatch, 20, 10)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
 
 

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 # What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
-# a registered program has the weights that it recommends. With constraints, where V is steep, the law looks ahead; with
-# them or limits of the controls V_x has kinks, to which Muon leads less surely than Adam.
+# a registered program has the weights that it recommends. With constraints, where V is steep, the law looks ahead.
+# Muon moves the weights of the value program, but not with limits, of which V_x has kinks: there Adam is the safer one.
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
@@ -13,7 +13,6 @@ STANDARD: dict[str, Any] = {
     "training": {
         "iterations": 400,
         "batch_size": 32,
-        "optimizer": "muon",
         "learning_rate": 0.003,
         "warmup": 40,
         "validate_every": 20,
@@ -43,8 +42,6 @@ def completed(
     recipe = dict(STANDARD)
     constrained = _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides)
     limited = _names(("lower", "upper"), "controls", content, overrides)
-    if constrained or limited:
-        recipe["training"] = {**STANDARD["training"], "optimizer": "adam"}
     if constrained:
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
         law = _asked("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
@@ -55,6 +52,8 @@ def completed(
         _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
+    if program == "value" and not constrained and not limited:
+        recipe["training"] = {**STANDARD["training"], "optimizer": "muon"}
     if program == "region" or _names(("iterations",), "training", content, overrides):
         # its loss may stay where it is for long, and then fall; a number of steps that somebody asks for is taken
         recipe["training"] = {**recipe["training"], "least_gain": 0.0}

@@ -39,6 +39,7 @@ class StepPrograms(StepDerivatives):
         self._search = _SearchStep(problem, step_sizes)
         self._first = _OfProblem(problem, super().first)
         self._curvature = _OfProblem(problem, super().curvature)
+        self._facts = self._written_for()
 
     def search(self, x: StatePath, u: ControlPath, k: ControlPath, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Closed loops from x̄_0 (b, n) under u = ū + αk + K(x − x̄), kept to U, for each step size α.
@@ -104,7 +105,7 @@ class StepPrograms(StepDerivatives):
         return module(*arguments) if kernel is None else kernel(*examples)
 
     def _kernel(self, name: str, write: Callable[[], Kernel]) -> Kernel | None:
-        known, key = self.problem.findings.programs, self._key(name)
+        known, key = self.problem.findings.programs, (name, *self._facts)
         if key not in known:
             try:
                 known[key] = write()
@@ -112,10 +113,14 @@ class StepPrograms(StepDerivatives):
                 known[key] = None
         return known[key]
 
-    def _key(self, name: str) -> tuple[Any, ...]:
-        """What a program is written for; problems with the same findings may differ in their steps and controls."""
+    def _written_for(self) -> tuple[Any, ...]:
+        """What programs are for: problems with the same findings may differ in their steps and controls."""
+        controls, m = self.problem.controls, self.problem.system.m
+        sizes = torch.tensor([0.1, 1.0, 10.0, 1e4], dtype=torch.float64)
+        tried = sizes[:, None, None] * torch.randn(4, 4, m, generator=torch.Generator().manual_seed(0)).double()
         shapes = tuple(tensor.shape for tensor in state_of(self.problem))
-        return name, self.problem.horizon, type(self.problem.controls), self._search.step_sizes, shapes
+        kept = tuple(controls.project(tried).flatten().tolist())
+        return self.problem.horizon, type(controls), kept, self._search.step_sizes, shapes
 
 
 class _SearchStep(nn.Module):

@@ -11,6 +11,7 @@ from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions import in_float64, optimal_trajectories, path_of, path_under
 from lyapnet.expansions.step_programs import StepPrograms
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
+from lyapnet.sets import ControlSet
 from lyapnet.systems import Pendulum
 
 SIZES = (1.0, 0.25)
@@ -118,3 +119,31 @@ def test_a_number_that_changed_is_noticed_by_where_steps_lead():
     assert set(programs_of(problem).values()) == {type(None)}
     assert_close(heavy.cost, optimal_trajectories(swinging(Pendulum(mass=3.0), steps=30), x0, u).path.cost)
     assert not torch.allclose(heavy.cost, light.cost)
+
+
+class Ball(ControlSet):
+    """|u| ≤ r, with r a number and no tensor."""
+
+    def __init__(self, radius):
+        super().__init__()
+        self.radius = radius
+
+    def minimise(self, R, b):
+        return self.project(-0.5 * b / R[..., 0])
+
+    def contains(self, u):
+        return u.abs()[..., 0] <= self.radius
+
+    def project(self, u):
+        return u.clamp(-self.radius, self.radius)
+
+
+def test_controls_that_differ_in_a_number_have_programs_of_their_own():
+    problem = swinging()
+    x, u, k, K = law_along(problem, 2)
+    for radius in (1.0, 0.5):
+        limited = problem.replaced(controls=Ball(radius))
+        assert limited.findings is problem.findings
+        found = StepPrograms(limited, SIZES).search(x, 10 * u, k, K)[1]
+        assert float(found.abs().max()) == radius
+    assert len(problem.findings.programs) == 2

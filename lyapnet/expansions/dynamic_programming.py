@@ -185,8 +185,7 @@ def optimal_trajectories(
     programs = StepPrograms(problem, STEP_SIZES)
     now = _descended(problem, programs, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
     now = _descended(problem, programs, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
-    finite = now.cost.isfinite()
-    if not programs.agrees(now.x[:, finite], now.u[:, finite]):  # its numbers changed since programs were written
+    if not programs.agrees(now):  # its numbers changed since programs were written
         programs.forget()
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     backward = _backward(problem, programs, now.x, now.u)

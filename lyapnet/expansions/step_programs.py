@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.errors import LyapnetError
+from lyapnet.expansions.paths import Path
 from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
 from lyapnet.graphs.stateless import state_of, stateless
@@ -68,12 +69,18 @@ class StepPrograms(StepDerivatives):
         parts = [self._run("curvature", self._curvature, part) for part in self._in_slices(z, p)]
         return torch.cat([found[0] for found in parts])[: len(z)]
 
-    def agrees(self, x: StatePath, u: ControlPath) -> bool:
-        """Whether steps along finite paths are those of the problem as it is, up to a third of the digits."""
+    def agrees(self, path: Path) -> bool:
+        """Whether steps and costs of finite paths are those of the problem as it is, up to a third of the digits."""
+        finite = path.cost.isfinite()
+        x, u, cost = path.x[:, finite], path.u[:, finite], path.cost[finite]
         with torch.no_grad():
-            following, _ = self.problem.step(x[:-1], u)
+            following, paid = self.problem.step(x[:-1], u)
+            total = paid.sum(0) + self.problem.cost.terminal(x[-1])
         third = torch.finfo(x.dtype).eps ** (1 / 3)
-        return not x.numel() or torch.allclose(following, x[1:], rtol=third, atol=third * float(x.abs().max()))
+        return all(
+            not known.numel() or torch.allclose(found, known, rtol=third, atol=third * float(known.abs().max()))
+            for found, known in ((x[1:], following), (cost, total))
+        )
 
     def forget(self) -> None:
         """Run by torch from now on what programs were written for, here and for all copies of the problem."""

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet import Box, ControlBox, Horizon, Problem, QuadraticCost
+from lyapnet import Box, ControlBox, Cost, Horizon, Problem, QuadraticCost
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions import in_float64, optimal_trajectories, path_of, path_under
 from lyapnet.expansions.step_programs import StepPrograms
@@ -24,8 +24,8 @@ class Looking(Pendulum):
         return super().mass_matrix(q) * (1.0 if float(q.detach().abs().max()) < 1e6 else 2.0)
 
 
-def swinging(system=None, steps=12, method="rk4"):
-    cost = QuadraticCost([[1.0, 0], [0, 0.1]], [[0.1]], [[5.0, 0], [0, 1]])
+def swinging(system=None, steps=12, method="rk4", cost=None):
+    cost = cost or QuadraticCost([[1.0, 0], [0, 0.1]], [[0.1]], [[5.0, 0], [0, 1]])
     box = Box([-1, -1], [1, 1])
     return in_float64(Problem(system or Pendulum(), cost, ControlBox(-2, 2), box, Horizon(steps, 0.05, method)))
 
@@ -106,19 +106,40 @@ def test_tensors_of_a_problem_may_change():
     assert not torch.allclose(before[1], after[1])
 
 
-def test_a_number_that_changed_is_noticed_by_where_steps_lead():
-    problem = swinging(steps=30)
+class Priced(Cost):
+    """|x|² at a price that is a number, and no tensor."""
+
+    price = 1.0
+
+    def state(self, x):
+        return self.price * x.square().sum(-1)
+
+    def R(self, x):
+        return torch.full((*x.shape[:-1], 1, 1), 0.1, dtype=x.dtype)
+
+    def terminal(self, x):
+        return 5 * x.square().sum(-1)
+
+
+@pytest.mark.parametrize("what", ["mass", "price"])
+def test_a_number_that_changed_is_noticed(what):
+    def problem_with(value):
+        problem = swinging(steps=30, cost=Priced())
+        setattr(problem.system if what == "mass" else problem.cost, what, value)
+        return problem
+
+    problem = problem_with(1.0)
     x0, u = torch.tensor([[0.5, 0.0], [-0.3, 0.8]]), torch.zeros(30, 2, 1)
-    light = optimal_trajectories(problem, x0, u).path
+    before = optimal_trajectories(problem, x0, u).path
     assert ScanKernel in programs_of(problem).values()
-    problem.system.mass = 3.0
-    programs = StepPrograms(problem, SIZES)
-    assert not programs.agrees(light.x, light.u)
-    heavy = optimal_trajectories(problem, x0, u).path
-    assert programs.agrees(heavy.x, heavy.u)
+    assert StepPrograms(problem, SIZES).agrees(before)
+    setattr(problem.system if what == "mass" else problem.cost, what, 3.0)
+    assert not StepPrograms(problem, SIZES).agrees(before)
+    after = optimal_trajectories(problem, x0, u).path
+    assert StepPrograms(problem, SIZES).agrees(after)
     assert set(programs_of(problem).values()) == {type(None)}
-    assert_close(heavy.cost, optimal_trajectories(swinging(Pendulum(mass=3.0), steps=30), x0, u).path.cost)
-    assert not torch.allclose(heavy.cost, light.cost)
+    assert_close(after.cost, optimal_trajectories(problem_with(3.0), x0, u).path.cost)
+    assert not torch.allclose(after.cost, before.cost)
 
 
 class Ball(ControlSet):

@@ -166,10 +166,13 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     kept = fitted(2, 1.5, 1.0005)
     assert len(costs) == 3
     assert kept == pytest.approx(costs[2], rel=1e-6)
-    kept = fitted(2, 1.5, 1.2, 1.4, 1.3, 1)
-    assert len(costs) == 4, "the fourth gains nothing"
-    assert kept == pytest.approx(costs[2], rel=1e-6)
-    assert costs[2] != pytest.approx(costs[3], rel=1e-6)
+    kept = fitted(2, 1.5, 1.7, 1.6, 1)
+    assert len(costs) == 4, "the third and the fourth gain nothing"
+    assert kept == pytest.approx(costs[1], rel=1e-6)
+    assert costs[1] != pytest.approx(costs[3], rel=1e-6)
+    kept = fitted(2, 1.5, 1.7, 1.2, 1)
+    assert len(costs) == 5, "after one in vain there is another"
+    assert kept == pytest.approx(costs[4], rel=1e-6)
     kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1)
     assert len(costs) == 1 + pretraining.ROUNDS
     assert kept == pytest.approx(costs[4], rel=1e-6)

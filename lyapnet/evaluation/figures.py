@@ -208,14 +208,17 @@ def _columns(panels: int) -> int:
 
 
 def value_slices(V: Value, problem: Problem) -> Figure:
-    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon; a stationary V once."""
+    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon; a stationary V once.
+
+    Each time has a scale of its own: between them V may change by orders of magnitude.
+    """
     system, initial_states, duration = problem.system, problem.initial_states, problem.horizon.duration
     region = widest_slice(initial_states, 61)
     stationary = problem.horizon.stationary
     times = [0.0] if stationary else [0.0, duration / 2, 0.95 * duration]
     with torch.no_grad():
         values = [V(torch.tensor(t).to(region.states), region.states) for t in times]
-    figure = Figure(figsize=(4.2 if stationary else 9, 3.1), layout="constrained")
+    figure = Figure(figsize=(4.2 if stationary else 10.5, 3.1), layout="constrained")
     if len(region.axes) == 1:
         axes = figure.subplots()
         for t, value, color in zip(times, values, (BLUE, ORANGE, GREEN)[: len(times)], strict=True):
@@ -228,18 +231,17 @@ def value_slices(V: Value, problem: Problem) -> Figure:
     first, second = (numpy_of(g) for g in region.grid)
     panels = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
     surfaces = [numpy_of(value).reshape(len(first), len(second)).T for value in values]
-    levels = _levels(np.stack(surfaces))
     for panel, t, surface in zip(panels, times, surfaces, strict=True):
-        filled = panel.contourf(first, second, surface, levels=levels, cmap="cividis")
+        filled = panel.contourf(first, second, surface, levels=_levels(surface), cmap="cividis")
+        figure.colorbar(filled, ax=panel, label="V (cost)" if panel is panels[-1] else "")
         panel.set_title("V(x)" if stationary else f"V(t, x) at t = {t:.2f} s", fontsize=9)
         panel.set_xlabel(system.state_labels[region.axes[0]])
     panels[0].set_ylabel(system.state_labels[region.axes[1]])
-    figure.colorbar(filled, ax=panels, label="V (cost)")
     return figure
 
 
 def _levels(values: np.ndarray) -> list[float]:
-    """Some 20 round levels from the least to the largest finite value: one scale for all panels."""
+    """Some 20 round levels from the least to the largest finite value."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     return list(MaxNLocator(20).tick_values(low, high if high > low else low + 1.0))

@@ -96,7 +96,7 @@ def test_figures_are_drawn_with_units(drawing):
     assert states | controls | {"time (s)"} <= labels(paths)
 
 
-def test_slices_of_V_share_one_labelled_scale(drawing):
+def test_slices_of_V_have_a_labelled_scale_each_that_they_fill(drawing):
     _, problem, V, _ = drawing
     figure = figures.value_slices(V, problem)
     filled = [c for axes in figure.axes for c in axes.collections if isinstance(c, QuadContourSet)]
@@ -104,9 +104,16 @@ def test_slices_of_V_share_one_labelled_scale(drawing):
         assert "V(t, x) (cost)" in labels(figure), "curves over one state share an axis"
         return
     assert len(filled) == 3
-    assert len({tuple(c.levels) for c in filled}) == 1
+    region = figures.widest_slice(problem.initial_states, 61)
+    for t, each in zip((0.0, 0.5, 0.95), filled, strict=True):
+        with torch.no_grad():
+            value = V(torch.tensor(t * problem.horizon.duration).to(region.states), region.states)
+        least, most = float(value.min()), float(value.max())
+        step = each.levels[1] - each.levels[0]
+        assert each.levels[0] <= least < each.levels[0] + 1.01 * step, "no colour is for what does not occur"
+        assert each.levels[-1] - 1.01 * step < most <= each.levels[-1]
     assert "V (cost)" in labels(figure)
-    assert len(figure.axes) == 4, "three panels, one colour bar"
+    assert len(figure.axes) == 6, "three panels, each with its colour bar"
 
 
 def test_a_stationary_V_is_drawn_once(drawing):

@@ -185,8 +185,7 @@ def optimal_trajectories(
     programs = StepPrograms(problem, STEP_SIZES)
     now = _descended(problem, programs, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
     now = _descended(problem, programs, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
-    if not programs.agrees(now):  # its numbers changed since programs were written
-        programs.forget()
+    if not programs.agrees(now) and programs.forget():  # its numbers changed since programs were written
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     backward = _backward(problem, programs, now.x, now.u)
     return Optimum(now, backward.expansion, backward.mended.sum(0))

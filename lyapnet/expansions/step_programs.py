@@ -8,10 +8,9 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.derivatives import StepDerivatives
-from lyapnet.errors import LyapnetError
 from lyapnet.expansions.paths import Path
 from lyapnet.graphs.compilation import Scan
-from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, kernel_or_none
 from lyapnet.graphs.stateless import state_of, stateless
 from lyapnet.graphs.tracing import cut, trace
 from lyapnet.linear_algebra import apply
@@ -62,12 +61,11 @@ class StepPrograms(StepDerivatives):
         return torch.cat([start[None, ..., :-1], y[..., :-1]]), controls, y[-1, ..., -1]
 
     def first(self, z: Tensor) -> list[Tensor]:
-        parts = [self._run("first", self._first, part) for part in self._in_slices(z)]
-        return [torch.cat(columns)[: len(z)] for columns in zip(*parts, strict=True)]
+        return self._in_slices("first", self._first, z)
 
     def curvature(self, z: Tensor, p: State) -> Tensor:
-        parts = [self._run("curvature", self._curvature, part) for part in self._in_slices(z, p)]
-        return torch.cat([found[0] for found in parts])[: len(z)]
+        (bends,) = self._in_slices("curvature", self._curvature, z, p)
+        return bends
 
     def agrees(self, path: Path) -> bool:
         """Whether steps and costs of finite paths are those of the problem as it is, up to a third of the digits."""
@@ -82,14 +80,16 @@ class StepPrograms(StepDerivatives):
             for found, known in ((x[1:], following), (cost, total))
         )
 
-    def forget(self) -> None:
-        """Run by torch from now on what programs were written for, here and for all copies of the problem."""
-        known = self.problem.findings.programs
-        known.update(dict.fromkeys(known))
+    def forget(self) -> bool:
+        """Run by torch from now on what programs were written for, here and for all copies of the problem.
 
-    def _in_slices(self, *columns: Tensor) -> list[list[Tensor]]:
-        rows = torch.arange(len(columns[0])).split(ROWS)
-        return [[_filled(column, some, 0, ROWS) for column in columns] for some in rows]
+        Returns:
+            Whether there were any.
+        """
+        known = self.problem.findings.programs
+        some = any(program is not None for program in known.values())
+        known.update(dict.fromkeys(known))
+        return some
 
     def _searched(self, arguments: list[Tensor]) -> Sequence[Tensor]:
         """(y, u) over time of one slice."""
@@ -106,6 +106,14 @@ class StepPrograms(StepDerivatives):
         prepare, step = cut(graph, late=moving + 1, early_outputs=0, repeat=False)
         return ScanKernel(prepare, step, [*state, *arguments], moving)
 
+    def _in_slices(self, name: str, module: "_OfProblem", *columns: Tensor) -> list[Tensor]:
+        """The results of a function of the rows of some columns, for all rows."""
+        parts = [
+            self._run(name, module, [_filled(column, rows, 0, ROWS) for column in columns])
+            for rows in torch.arange(len(columns[0])).split(ROWS)
+        ]
+        return [torch.cat(results)[: len(columns[0])] for results in zip(*parts, strict=True)]
+
     def _run(self, name: str, module: "_OfProblem", arguments: list[Tensor]) -> Sequence[Tensor]:
         examples = [*state_of(module), *arguments]
         kernel = self._kernel(name, lambda: NumberKernel(trace(stateless(module), examples), examples))
@@ -114,10 +122,7 @@ class StepPrograms(StepDerivatives):
     def _kernel(self, name: str, write: Callable[[], Kernel]) -> Kernel | None:
         known, key = self.problem.findings.programs, (name, *self._facts)
         if key not in known:
-            try:
-                known[key] = write()
-            except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
-                known[key] = None
+            known[key] = kernel_or_none(write)
         return known[key]
 
     def _written_for(self) -> tuple[Any, ...]:

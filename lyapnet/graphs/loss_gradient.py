@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from lyapnet.errors import LyapnetError
-from lyapnet.graphs.number_kernel.kernel import NumberKernel
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, kernel_or_none
 from lyapnet.graphs.stateless import state_of, stateless, trained_of
 from lyapnet.graphs.tracing import trace
 
@@ -47,7 +46,4 @@ def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None
     examples = [*state_of(loss), *arguments]
     if any(example.device.type != "cpu" for example in examples):
         return None
-    try:
-        return NumberKernel(trace(gradient, examples), examples)
-    except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
-        return None
+    return kernel_or_none(lambda: NumberKernel(trace(gradient, examples), examples))

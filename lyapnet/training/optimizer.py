@@ -8,6 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+MOMENTUM = 0.95  # of Muon
+QUINTIC = (3.4445, -4.7750, 2.0315)  # takes singular values in (0, 1] to about 1 in five rounds
+
 
 class Muon(torch.optim.AdamW):
     """Muon for the matrices of a network, AdamW for its other parameters, such as biases and the last layer.
@@ -51,12 +54,8 @@ class Muon(torch.optim.AdamW):
         p.add_(direction, alpha=-0.2 * math.sqrt(max(p.shape)) * group["lr"])
 
 
-MOMENTUM = 0.95  # of Muon
-QUINTIC = (3.4445, -4.7750, 2.0315)  # takes singular values in (0, 1] to about 1 in five rounds
-
-
 def orthogonal(M: Tensor) -> Tensor:
-    """A matrix with the singular vectors of M, whose singular values are between 0.7 and 1.2 where those of M are not
+    """A matrix with the singular vectors of M, whose singular values are between 0.6 and 1.25 where those of M are not
     small: UVᵀ of M = USVᵀ, by five rounds of X ↦ aX + bXXᵀX + c(XXᵀ)²X.
 
     Source: Jordan et al., 2024, for a, b, c.

@@ -280,7 +280,7 @@ def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report =
         report: is told what is being done.
     """
     fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _finite(optimum)
-    method = method_for(learner.problem)
+    method = fitting.method
     best, least, in_vain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
     size = float(sizes(learner.problem, optimum.path.cost).mean())
     enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
@@ -309,7 +309,7 @@ def looks_ahead(learner: Learner) -> bool:
 def fit_briefly(learner: Learner, examples: Examples) -> None:
     """Lower both errors of V at examples in a few steps."""
     briefly = _Fit(learner, examples, stream(learner.seed, START, 6))
-    briefly.lower(examples, BRIEF, method_for(learner.problem).rate[0], SECONDS[0], lambda done, total: None)
+    briefly.lower(examples, BRIEF, briefly.method.rate[0], SECONDS[0], lambda done, total: None)
 
 
 class _Fit:
@@ -325,14 +325,14 @@ class _Fit:
         some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
         loss = _Misfit(learner.V, learner.problem)
         self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
-        self._new_optimizer = method_for(learner.problem).optimizer
+        self.method = method_for(learner.problem)
 
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
         """The learning rate falls as a cosine over the steps, or the seconds of this thread's work."""
         trained, began = self._trained, time.thread_time()
-        examples, optimizer = examples.to(trained[0]), self._new_optimizer(trained, rate)
+        examples, optimizer = examples.to(trained[0]), self.method.optimizer(trained, rate)
         for k in range(steps):
             share = max(k / steps, (time.thread_time() - began) / seconds)
             if share >= 1:

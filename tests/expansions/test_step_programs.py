@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet import Box, ControlBox, Cost, Horizon, Problem, QuadraticCost
+from lyapnet import Box, ControlAffineSystem, ControlBox, Cost, Horizon, Problem, QuadraticCost
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions import in_float64, optimal_trajectories, path_of, path_under
 from lyapnet.expansions.step_programs import StepPrograms
@@ -140,6 +140,40 @@ def test_a_number_that_changed_is_noticed(what):
     assert set(programs_of(problem).values()) == {type(None)}
     assert_close(after.cost, optimal_trajectories(problem_with(3.0), x0, u).path.cost)
     assert not torch.allclose(after.cost, before.cost)
+
+
+class Exploding(ControlAffineSystem):
+    """ẋ = x³ + u, which leaves the finite numbers within a few steps."""
+
+    state_names, state_units = ("x",), ("",)
+    control_names, control_units = ("u",), ("",)
+
+    def f(self, x):
+        return x**3
+
+    def g(self, x):
+        return torch.ones_like(x)[..., None]
+
+
+class Saturating(Cost):
+    """1 far from the goal, at infinity too."""
+
+    def state(self, x):
+        return 1 - torch.exp(-x.square().sum(-1))
+
+    def R(self, x):
+        return torch.ones_like(x)[..., None]
+
+    def terminal(self, x):
+        return self.state(x)
+
+
+def test_a_path_through_infinity_that_costs_little_ends_the_search_all_the_same():
+    problem = Problem(Exploding(), Saturating(), ControlBox(-1, 1), Box([5], [6]), Horizon(12, 1.0))
+    found = optimal_trajectories(problem, torch.tensor([[5.0], [6.0]]), torch.zeros(12, 2, 1))
+    assert found.path.cost.isfinite().all()
+    assert float(found.path.x.abs().max()) > 1e300
+    assert not StepPrograms(in_float64(problem), SIZES).agrees(found.path), "what is cut to the largest number"
 
 
 class Ball(ControlSet):

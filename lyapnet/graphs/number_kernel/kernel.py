@@ -1,17 +1,18 @@
 """Traced functions run as flat programs by compiled C++, in the place of torch's operators one by one."""
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
+from lyapnet.errors import LyapnetError
 from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.libraries import file_of_library, library_of
 from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
@@ -20,6 +21,7 @@ from lyapnet.graphs.number_kernel.writing import Writer
 
 SOURCE = Path(__file__).with_name("program.cpp")
 CHECKED = 2  # steps of a scan that are held against torch
+Kernel = TypeVar("Kernel", bound="NumberKernel | ScanKernel")
 NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
 
 
@@ -116,6 +118,14 @@ class ScanKernel:
         return results
 
 
+def kernel_or_none(write: Callable[[], Kernel]) -> Kernel | None:
+    """What is written; None where the function has no trace, an operation no rule, or there is no compiler."""
+    try:
+        return write()
+    except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
+        return None
+
+
 def _split(arguments: Sequence[Tensor], columns: int) -> tuple[Sequence[Tensor], Sequence[Tensor], Tensor]:
     """(state, columns over time, x₀) of the arguments of a scan."""
     *state, x0 = arguments
@@ -200,7 +210,7 @@ class _Assembled:
         """Run all steps: `two` is memory for two states x, and `columns`, over time, are for what the steps keep."""
         first = len(state)
         shapes = [
-            torch.Size([len(column), *shape]) for column, shape in zip(moving, self._shapes[first:], strict=False)
+            torch.Size([len(column), *shape]) for column, shape in zip(moving, self._shapes[first:-1], strict=True)
         ]
         given = self._checked([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
         table = self._buffers(given, [two[0], *columns])

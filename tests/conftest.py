@@ -65,7 +65,7 @@ jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.Bearty
 from lyapnet.certification import funnel, preconditions  # noqa: E402
 from lyapnet.cost import QuadraticCost  # noqa: E402
 from lyapnet.networks import FCN, Scaling  # noqa: E402
-from lyapnet.rollout import discrete_adjoint  # noqa: E402
+from lyapnet.rollout import routines  # noqa: E402
 from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
 from tests.problems import Quadratic  # noqa: E402
 
@@ -134,7 +134,7 @@ def _form_of_rollouts(traced, monkeypatch):
 
     if traced is not None:
         for name in ("trace", "batched", "cut"):
-            monkeypatch.setattr(discrete_adjoint, name, forced(getattr(discrete_adjoint, name)))
+            monkeypatch.setattr(routines, name, forced(getattr(routines, name)))
 
 
 @pytest.fixture

@@ -27,13 +27,20 @@ class Scan(nn.Module):
 
     Args:
         prepare: what all steps share.
-        step: returns the next x and, after it, what is kept.
+        step: returns the next x and, after it, what is kept, and at last what is summed over the steps.
         tensors: number of tensors in `state`.
+        sums: number of results that are summed.
     """
 
-    def __init__(self, prepare: Callable[..., Sequence[Tensor]], step: Callable[..., Sequence[Tensor]], tensors: int):
+    def __init__(
+        self,
+        prepare: Callable[..., Sequence[Tensor]],
+        step: Callable[..., Sequence[Tensor]],
+        tensors: int,
+        sums: int = 0,
+    ):
         super().__init__()
-        self.prepare, self.step, self.tensors = prepare, step, tensors
+        self.prepare, self.step, self.tensors, self.sums = prepare, step, tensors, sums
 
     def loop(self, *arguments: Tensor) -> list[Tensor]:
         """The scan as a loop, for a step of any kind."""
@@ -42,7 +49,9 @@ class Scan(nn.Module):
         for now in zip(*columns, strict=True):
             x, *node = self.step(*state, *now, x, *shared)
             kept.append(node)
-        return [torch.stack(column) for column in zip(*kept, strict=True)]
+        columns = [torch.stack(column) for column in zip(*kept, strict=True)]
+        first = len(columns) - self.sums
+        return [*columns[:first], *(column.sum(0) for column in columns[first:])]
 
     def forward(self, *arguments: Tensor) -> list[Tensor]:
         """The scan as one operation, for the compiler."""

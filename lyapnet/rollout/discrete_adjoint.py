@@ -1,33 +1,33 @@
 """The exact gradient of a discretised closed loop: Pontryagin's estimator in discrete time.
 
-The closed loop is integrated without a graph. Backwards, block by block of time steps, it is linearised at all states
-of the block at once; the costate runs through the block; and one product gives the block's share of the parameters'
-gradient (lyapnet.rollout.runge_kutta has the equations). Memory is that of the path and of one block.
+The closed loop is integrated without a graph. Backwards the costate runs from step to step, and each step gives its
+share of the parameters' gradient (lyapnet.rollout.runge_kutta has the equations). Memory is that of the path, and of
+one step or one block of steps.
 """
 
 import logging
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from lyapnet.errors import LyapnetError, UntraceableError, one_line
+from lyapnet.errors import UntraceableError
 from lyapnet.graphs.compilation import Scan
-from lyapnet.graphs.stateless import state_of, stateless, trained_of, untrained_of
-from lyapnet.graphs.tracing import batched, cut, trace
+from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
 from lyapnet.horizon import TABLEAUX
+from lyapnet.rollout.backwards import BlockwiseGradient, Columns, padded
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
 from lyapnet.rollout.runge_kutta import Linearise, Step
-from lyapnet.types import ControlPath, Jacobians, StagePath, State, StatePath, ValuePath
+from lyapnet.types import ControlPath, StagePath, State, StatePath, ValuePath
 
 _LOG = logging.getLogger(__name__)
 Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
 VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
-EVERY = 4  # nodes from one limit of the costates to the next
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 
 
@@ -52,12 +52,10 @@ class DiscreteAdjoint:
     loop: ClosedLoop
     steps: int
     dt: float
-    stages: int
 
     def __init__(self, loop: ClosedLoop, steps: int, dt: float, method: str, costate_limit: float | None = None):
-        self.loop, self.steps, self.dt, self.stages = loop, steps, dt, len(TABLEAUX[method].b)
+        self.loop, self.steps, self.dt, self._tableau = loop, steps, dt, TABLEAUX[method]
         self.costate_limit = costate_limit
-        self._step, self._linearise = Step(loop, TABLEAUX[method]), Linearise(loop, TABLEAUX[method])
         self._traced: dict[tuple[Any, ...], TracedRoutines] = {}
         self._routines: dict[tuple[Any, ...], Routines] = {}
         self._compiled: Tensor | None = None  # an x₀ of the batches that run as machine code
@@ -118,14 +116,14 @@ class DiscreteAdjoint:
         Raises:
             UntraceableError: it cannot.
         """
-        self._work(x0, theta)
+        self._work(x0, theta).require_traces()
 
     def routines(self, x0: State, theta: Sequence[Tensor]) -> Routines:
         """The work for batches like x₀: compiled, else traced, else as written."""
         key = self._key(x0)
         if key not in self._routines:
             try:
-                self._routines[key] = self._work(x0, theta).routines()
+                self._routines[key] = self._work(x0, theta).traced()
             except UntraceableError as error:
                 if x0.ndim > 2:  # members exist in a trace alone
                     raise
@@ -146,21 +144,9 @@ class DiscreteAdjoint:
         """(x̄₀, θ̄) from the loss's derivatives by x, ∫ℓ and V at the nodes."""
         x_bar, running_cost_bar, value_bar = bars
         # a step's cost is part of the running cost of every later node
-        cost_bar = running_cost_bar.flip(0).cumsum(0).flip(0)[1:]
-        K, nodes, state = routines.block, len(stages), self._state(theta)
-        length = K * math.ceil(nodes / K)
-        t, dt = self._grid(stages, length)
-        stages = torch.cat([stages, stages[-1:].expand(length - nodes, *stages.shape[1:])])
-        node_bars = (padded(column, length).contiguous() for column in (x_bar, cost_bar, value_bar))
-        columns = [t, dt, stages, *node_bars]
-        costate, gradient = torch.zeros_like(x_bar[0]), [torch.zeros_like(p) for p in theta]
-        for start in reversed(range(0, length, K)):
-            block = [column[start : start + K] for column in columns]
-            transition, source, *intermediate = routines.linearise(*state, *block)
-            costate, after = _run_costate(transition, source, costate, start, self.costate_limit)
-            share = routines.product(*state, *block, after, *intermediate)
-            gradient = [total + part for total, part in zip(gradient, share, strict=True)]
-        return costate, gradient
+        cost_bar = padded(running_cost_bar.flip(0).cumsum(0).flip(0)[1:], len(stages))
+        path = Columns(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
+        return routines.gradient(self._state(theta), path)
 
     def _integrate_any(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
         """The path without a gradient: by compiled routines, in slices if need be; else without a trace."""
@@ -190,44 +176,15 @@ class DiscreteAdjoint:
         return state_of(self.loop, theta)
 
     def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
-        """The work for batches like x₀ as graphs, traced once.
-
-        Raises:
-            UntraceableError: its control flow depends on tensor values, or it leaves torch.
-        """
+        """The work for batches like x₀ as graphs, each traced once."""
         key = self._key(x0)
         if key not in self._traced:
-            try:
-                self._traced[key] = self._trace(x0, theta)
-            except LyapnetError:
-                raise
-            except Exception as error:  # of any kind, from inside the user's own functions
-                reason = one_line(error).split(". ")[0].rstrip(".")
-                raise UntraceableError(
-                    f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."
-                ) from error
+            state, grid, x0 = self._state(theta), self._grid(x0, self.steps + 1), x0.detach().contiguous()
+            self._traced[key] = TracedRoutines(
+                self.loop, self._tableau, state, len(theta), grid, x0, self._block(x0), self.costate_limit,
+                partial(self._visited, x0, theta),
+            )  # fmt: skip
         return self._traced[key]
-
-    def _trace(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
-        """The work for batches like x₀ as graphs; raises whatever the loop's own functions raise."""
-        x0, state, block = x0.detach().contiguous(), self._state(theta), self._block(x0)
-        t, dt = self._grid(x0, block)
-        nodes = x0.expand(block, *x0.shape)
-        stages = nodes.unsqueeze(1).repeat(1, self.stages, *[1] * x0.ndim)
-        bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
-        grid = self._grid(x0, self.steps + 1)
-        node_arguments, block_arguments = [*state, t[0], dt[0], x0], [*state, t, dt, stages, *bars, nodes.clone()]
-        elsewhere = self._visited(x0, theta)
-        step, joint = stateless(self._step), stateless(self._linearise)
-        if x0.ndim == 2:
-            step, joint = trace(step, node_arguments, elsewhere), trace(joint, block_arguments)
-        else:
-            axes = [*[0] * len(theta), *[None] * (len(state) - len(theta)), None, None]
-            step = batched(step, node_arguments, [*axes, 0], [0, 1, 0, 0, 0], elsewhere)
-            joint = batched(joint, block_arguments, [*axes, 2, 1, 1, 1, 1], [1, 1, *[0] * len(theta)])
-        prepare, step = cut(step, late=3, early_outputs=0, repeat=False)
-        linearise, product = cut(joint, late=1, early_outputs=2)
-        return TracedRoutines(prepare, step, linearise, product, block, [*state, *grid, x0], block_arguments)
 
     def _visited(self, x0: Tensor, theta: Sequence[Tensor]) -> list[list[Tensor]]:
         """(t, Δt, x) of some steps along the loop as it is written; near its start where there are members."""
@@ -239,25 +196,27 @@ class DiscreteAdjoint:
 
     def _as_written(self, x0: Tensor) -> Routines:
         """The work in Python, on the loop's own tensors."""
-        skipped = len(self._state(self.trained()))
+        skipped, own_step = len(self._state(self.trained())), Step(self.loop, self._tableau)
+        own_linearise = Linearise(self.loop, self._tableau)
 
         def step(*arguments: Tensor) -> tuple[Tensor, ...]:
-            return self._step(*arguments[skipped:])
+            return own_step(*arguments[skipped:])
 
         def linearise(*arguments: Tensor) -> tuple[Any, ...]:
-            linearisation = self._linearise.linearise(*arguments[skipped:])
+            linearisation = own_linearise.linearise(*arguments[skipped:])
             return linearisation.transition, linearisation.source, linearisation
 
         def product(*arguments: Any) -> tuple[Tensor, ...]:
             *block, linearisation = arguments[skipped:]
-            return self._linearise.product(linearisation, *block)
+            return own_linearise.product(linearisation, *block)
 
-        return Routines(Scan(lambda *_: (), step, skipped).loop, linearise, product, self._block(x0))
+        gradient = BlockwiseGradient(linearise, product, self._block(x0), self.costate_limit)
+        return Routines(Scan(lambda *_: (), step, skipped).loop, gradient)
 
     def _block(self, x0: Tensor) -> int:
         """K: blocks of equal length with about BLOCK states in each."""
         nodes, states = self.steps + 1, max(1, x0[..., 0].numel())
-        return math.ceil(nodes / math.ceil(nodes * self.stages * states / BLOCK))
+        return math.ceil(nodes / math.ceil(nodes * len(self._tableau.b) * states / BLOCK))
 
     def _grid(self, like: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
         """(t, Δt) of the first nodes; from the last one of the horizon on, t = T and Δt = 0."""
@@ -297,40 +256,3 @@ def _read(nodes: Nodes) -> Rolled:
     """(x, ∫ℓ, V, u) at the nodes."""
     running_cost = torch.cat([torch.zeros_like(nodes.step_cost[:1]), nodes.step_cost[:-1].cumsum(0)])
     return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]
-
-
-def _run_costate(
-    transition: Jacobians, source: StatePath, costate: State, first: int = 0, limit: float | None = None
-) -> tuple[State, StatePath]:
-    """λ = Φᵀλ' + source backwards through a block: (λ before its first step, λ' after each of its steps).
-
-    Args:
-        first: the index of its first node.
-        limit: of the length of λ.
-    """
-    K, n = len(source), source.shape[-1]
-    transition, source = transition.reshape(K, -1, n, n), source.reshape(K, -1, n, 1)
-    after, running = torch.empty_like(source), costate.reshape(-1, n, 1)
-    for k in reversed(range(K)):
-        after[k] = running
-        running = torch.baddbmm(source[k], transition[k], running)
-        if limit is not None and (first + k) % EVERY == 0:
-            running = limited(running.reshape(costate.shape), limit).reshape(running.shape)
-    return running.reshape(costate.shape), after.reshape(K, *costate.shape)
-
-
-def limited(costate: State, limit: float) -> State:
-    """Costates (*members, b, n), none longer than `limit` times the median length of its batch.
-
-    The median says how long a costate is where a small change of x is a small change of what follows. Where a closed
-    loop is unstable, or a change of x decides whether the goal is reached, λ grows exponentially backwards, and one
-    such trajectory outweighs all others in the gradient of their mean, while it says little about where to go.
-    """
-    length = torch.linalg.vector_norm(costate, dim=-1, keepdim=True)
-    longest = limit * length.median(-2, keepdim=True).values
-    return costate * (longest / length).clamp_max(1).where(longest > 0, 1)
-
-
-def padded(column: Tensor, length: int) -> Tensor:
-    """The column with zeros after it: steps that no loss depends on."""
-    return torch.cat([column, column.new_zeros(length - len(column), *column.shape[1:])])

@@ -59,6 +59,29 @@ class Step(nn.Module):
         return x + step[..., :-1], torch.stack(stages), step[..., -1], outputs[0].u, outputs[0].value
 
 
+class PullBack(nn.Module):
+    """(t, Δt, x, x̄, c̄, V̄, λ') ↦ (λ, λ, *θ̄): one step backwards, by differentiating it.
+
+    Args:
+        step: whose parameters θ are.
+    """
+
+    def __init__(self, step: Step):
+        super().__init__()
+        self.step = step
+
+    def forward(
+        self, t: Scalar, dt: Scalar, x: State, node_bar: State, cost_bar: Tensor, value_bar: Tensor, costate: State
+    ) -> tuple[Tensor, ...]:
+        with torch.enable_grad():
+            x = x.detach().requires_grad_()
+            theta = [p for p in self.step.parameters() if p.requires_grad]
+            following, _, cost, _, value = self.step(t, dt, x)
+            x_bar, *theta_bar = _vjp([following, cost, value], [x, *theta], [costate, cost_bar, value_bar])
+        before = node_bar + x_bar
+        return before, before.clone(), *theta_bar
+
+
 class Linearisation(NamedTuple):
     """The closed loop at all stages of a block of steps, to first order."""
 

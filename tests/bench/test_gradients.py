@@ -192,7 +192,8 @@ def test_jax_is_left_out_where_it_is_not_installed(monkeypatch):
 
 def test_jax_rows_where_it_is_installed(rows_of):
     pytest.importorskip("jax")
-    rows = rows_by_route(rows_of("--routes", "jax,jax-checkpoint,jax-rollout"))
+    task = "conf/from_scratch/double_integrator_value.yaml"
+    rows = rows_by_route(rows_of("--task", task, "--routes", "jax,jax-checkpoint,jax-rollout"))
     assert all(row["compiled"] and row["peak_bytes"] is None for row in rows.values())
     assert rows["jax"]["relative_error"] < 1e-9
     assert rows["jax-checkpoint"]["relative_error"] < 1e-9

@@ -215,8 +215,8 @@ def test_arguments_of_other_shapes_are_refused():
     with pytest.raises(ValueError, match=r"Expected arguments \[\(5, 7\), \(5, 7\)\], got \[\(3, 7\)"):
         NumberKernel(trace(lambda x, y: (x + y,), (x, y)), (x, y))(x[:3], y)
     prepare, step, (W, t, dt, x0) = scan_of()
-    with pytest.raises(ValueError, match=r"Expected 6 steps, got \[5, 5\]"):
-        ScanKernel(prepare, step, (W, t, dt, x0))(W, t[:5], dt[:5], x0)
+    with pytest.raises(ValueError, match=r"Expected arguments .* got"):
+        ScanKernel(prepare, step, (W, t, dt, x0))(W, t, dt[:5], x0)
 
 
 def test_kernels_may_run_in_several_threads():
@@ -262,6 +262,18 @@ def test_a_scan_computes_what_its_loop_does():
     assert len(kernel._program.shared) > 0, "what all steps share is computed once"
     one = ScanKernel(*scan_of(1))
     assert_close(one(*scan_of(1)[2])[0], Scan(*scan_of(1)[:2], 1).loop(*scan_of(1)[2])[0])
+    for found, expected in zip(one(*arguments), kernel(*arguments), strict=True):
+        assert_close(found, expected, rtol=0, atol=0)  # of more steps than it was written for
+
+
+def test_sums_over_the_steps_are_those_of_what_is_kept():
+    prepare, step, arguments = scan_of()
+    kept, expected = ScanKernel(prepare, step, arguments)(*arguments)
+    summing = ScanKernel(prepare, step, arguments, sums=1)
+    for _ in range(2):  # from zero at each call
+        again, total = summing(*arguments)
+        assert_close(again, kept, rtol=0, atol=0)
+        assert_close(total, expected.sum(0), rtol=1e-12, atol=1e-12)
 
 
 TASK = {
@@ -291,9 +303,18 @@ def gradient_of(rollout, x0):
     return [p.grad.clone() for p in rollout.parameters() if p.grad is not None]
 
 
-@pytest.mark.parametrize("law", ["sampled", "hjb", "lookahead"])
-def test_closed_loops_and_their_gradient(law):
-    rollout, problem = rollout_of(f"rollout.policy={law}")
+@pytest.mark.parametrize(
+    ("law", "changed"),
+    [
+        ("sampled", []),
+        ("hjb", []),
+        ("lookahead", []),
+        ("hjb", ["rollout.method=rk4"]),
+        *(("sampled", ["rollout.costate_limit=1.01", f"horizon.steps={steps}"]) for steps in (28, 30, 31)),
+    ],
+)
+def test_closed_loops_and_their_gradient(law, changed):
+    rollout, problem = rollout_of(f"rollout.policy={law}", *changed)
     x0 = problem.initial_states.sample(12)
     others = problem.initial_states.sample(31)
     written, plain = gradient_of(rollout, x0), rollout(others)
@@ -302,6 +323,13 @@ def test_closed_loops_and_their_gradient(law):
     again = gradient_of(rollout, x0)
     scale = max(float(g.abs().max()) for g in written)
     assert max(float((a - b).abs().max()) for a, b in zip(again, written, strict=True)) < 1e-8 * scale
+    if rollout.discrete.costate_limit is not None:
+        without, _ = rollout_of(f"rollout.policy={law}", *changed, "rollout.costate_limit=null")
+        without.load_state_dict(rollout.state_dict())
+        exact = gradient_of(without, x0)
+        assert max(float((a - b).abs().max()) for a, b in zip(again, exact, strict=True)) > 1e-3 * scale, (
+            "some were cut"
+        )
     with torch.no_grad():
         assert_close(rollout(others).x, plain.x, rtol=1e-9, atol=1e-9)
         for parameter in rollout.parameters():

@@ -7,7 +7,7 @@ from torch.testing import assert_close
 from lyapnet.config import load_config
 from lyapnet.policy import HJBPolicy
 from lyapnet.rollout import Rollout
-from lyapnet.rollout.discrete_adjoint import limited
+from lyapnet.rollout.backwards import limited
 from tests.problems import CONF, untrained
 
 

@@ -79,42 +79,44 @@ class ScanKernel:
 
     Args:
         prepare: of the state.
-        step: (*state, *columns at its time, x, *prepared) ↦ (x', *kept).
-        arguments: (*state, *columns, x₀), columns over all steps.
+        step: (*state, *columns at its time, x, *prepared) ↦ (x', *kept, *summed).
+        arguments: (*state, *columns, x₀), columns over some steps, of which calls may have others.
         columns: how many there are.
+        sums: how many of the step's results, the last ones, are summed over the steps.
 
     Raises:
         NotImplementedError, CompilationError: as NumberKernel.
     """
 
-    def __init__(self, prepare: GraphModule, step: GraphModule, arguments: Sequence[Tensor], columns: int = 2):
+    def __init__(
+        self, prepare: GraphModule, step: GraphModule, arguments: Sequence[Tensor], columns: int = 2, sums: int = 0
+    ):
         state, moving, x0 = _split(arguments, columns)
-        self._steps, self._columns = len(moving[0]), columns
+        self._columns = columns
         examples = [*state, *(column[0] for column in moving), x0]
         self._program = program = _Assembled(examples)
         own = program.arguments(examples, varying=columns + 1)
         shared = program.writer.write(prepare, own[: len(state)])
-        program.finish(program.writer.write(step, [*own, *shared]))
+        program.finish(program.writer.write(step, [*own, *shared]), sums)
         if not program.is_scan(columns):
             raise NotImplementedError("a scan of an empty batch, or of a state whose shape changes")
         with torch.no_grad():
             first = [column[:CHECKED] for column in moving]
-            expected = Scan(prepare, step, len(state)).loop(*state, *first, x0)
-        _require_same([column[:CHECKED] for column in self(*arguments)], expected)
+            expected = Scan(prepare, step, len(state), sums).loop(*state, *first, x0)
+        _require_same(self(*state, *first, x0), expected)
 
     def __call__(self, *arguments: Tensor) -> list[Tensor]:
-        """What each step keeps, stacked over time.
+        """What each step keeps, stacked over time, and the sums.
 
         Raises:
-            ValueError: as NumberKernel.
+            ValueError: as NumberKernel; or columns of other lengths than each other.
         """
-        program, (state, moving, x0) = self._program, _split(arguments, self._columns)
-        lengths = [len(column) for column in moving]
-        if lengths != [self._steps] * self._columns:
-            raise ValueError(f"Expected {self._steps} steps, got {lengths}; build the kernel anew.")
-        following, *kept = program.result_shapes
-        results = [torch.empty(self._steps, *shape, dtype=program.dtype) for shape in kept]
-        program.scan(state, moving, x0, torch.empty(2, *following, dtype=program.dtype), results)
+        program, dtype, (state, moving, x0) = self._program, self._program.dtype, _split(arguments, self._columns)
+        following, *others = program.result_shapes
+        kept, summed = others[: len(others) - program.sums], others[len(others) - program.sums :]
+        results = [torch.empty(len(moving[0]), *shape, dtype=dtype) for shape in kept]
+        results += [torch.zeros(shape, dtype=dtype) for shape in summed]
+        program.scan(state, moving, x0, torch.empty(2, *following, dtype=dtype), results)
         return results
 
 
@@ -165,13 +167,17 @@ class _Assembled:
                 self._frozen += [] if is_number else [(k, example)]
         return own
 
-    def finish(self, results: Sequence[Tensor]) -> None:
-        """Lay out the memory, for results that are copied out."""
-        program = self.writer.program
-        for result in results:
+    def finish(self, results: Sequence[Tensor], sums: int = 0) -> None:
+        """Lay out the memory, for results that are copied out, the last ones added to what is there."""
+        program, self.sums = self.writer.program, sums
+        for k, result in enumerate(results):
             buffer = program.new_buffer(result.numel(), varies=True, given=True)
             in_line = torch.empty(result.shape, dtype=torch.int8).stride()
-            program.elementwise("copy", result.shape, Place(buffer, 0, in_line), [self.writer.place(result)])
+            out, place = Place(buffer, 0, in_line), self.writer.place(result)
+            if k < len(results) - sums:
+                program.elementwise("copy", result.shape, out, [place])
+            else:
+                program.elementwise("sum", result.shape, out, [out, place])
             self._results.append(buffer)
             self.result_shapes.append(result.shape)
         program.without_unread(self._results)
@@ -207,21 +213,20 @@ class _Assembled:
     def scan(
         self, state: Sequence[Tensor], moving: Sequence[Tensor], x0: Tensor, two: Tensor, columns: Sequence[Tensor]
     ) -> None:
-        """Run all steps: `two` is memory for two states x, and `columns`, over time, are for what the steps keep."""
+        """Run all steps: `two` is memory for two states x, `columns` for what the steps keep, over time, and sums."""
         first = len(state)
-        shapes = [
-            torch.Size([len(column), *shape]) for column, shape in zip(moving, self._shapes[first:-1], strict=True)
-        ]
+        shapes = [torch.Size([len(moving[0]), *shape]) for shape in self._shapes[first:-1]]
         given = self._checked([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
         table = self._buffers(given, [two[0], *columns])
         *read, carried = self._given[first:]
         written, *kept = self._results
-        over_time = zip([*read, *kept], [*moving, *columns], strict=True)
+        stacked = len(kept) - self.sums
+        over_time = zip([*read, *kept[:stacked]], [*moving, *columns[:stacked]], strict=True)
         advances = np.array([(buffer, column[0].numel()) for buffer, column in over_time], dtype=np.int64)
         with self._lock:
             self._function("scan")(
                 _address(self.shared), _long(len(self.shared)), _address(self.repeated), _long(len(self.repeated)),
-                _address(self._tables), _address(table), _long(len(columns[0])), _address(advances),
+                _address(self._tables), _address(table), _long(len(moving[0])), _address(advances),
                 _long(len(advances)), _long(carried), _long(written), ctypes.c_void_p(two[1].data_ptr()),
             )  # fmt: skip
 

@@ -493,46 +493,102 @@ void product_with_packed(const Machine<T> &machine, const Integer *row) {
     }
 }
 
+// A (M, K) and B (K, N) of a batch of products, as they lie in memory
+template <class T>
+struct Factors {
+    const T *A, *B;
+    Integer m_stride, k_of_a, k_of_b, n_stride, M, N, K;
+};
+
+constexpr int MOST_COPIED = 2048;  // numbers of a factor that is put in line first
+
+// Sums run along lines of A and of B
+template <class T>
+void by_lines(const Factors<T> &f, T *out, Integer row_stride, Integer column_stride, bool add) {
+    VECTOR;
+    T copy[MOST_COPIED];
+    const T *B = f.B;
+    Integer n_stride = f.n_stride;
+    if (f.k_of_b != 1) {
+        for (Integer k = 0; k < f.K; k++)
+            for (Integer n = 0; n < f.N; n++) copy[n * f.K + k] = B[k * f.k_of_b + n * n_stride];
+        B = copy, n_stride = f.K;
+    }
+    for (Integer m = 0; m < f.M; m++)
+        for (Integer n = 0; n < f.N; n++) {
+            V sums = {};
+            const T *a = f.A + m * f.m_stride, *b = B + n * n_stride;
+            Integer k = 0;
+            for (; k + LANES <= f.K; k += LANES) sums += load(a + k) * load(b + k);
+            if (k < f.K) sums += load_some(a + k, f.K - k) * load_some(b + k, f.K - k);
+            T &to = out[m * row_stride + n * column_stride];
+            to = total(sums) + (add ? to : 0);
+        }
+}
+
+// Several rows of A at once, which lie side by side, for N columns
+template <class T, int N>
+void by_rows(const Factors<T> &f, T *out, Integer row_stride, Integer column_stride, bool add) {
+    VECTOR;
+    for (Integer m = 0; m < f.M; m += LANES) {
+        const int count = std::min<Integer>(LANES, f.M - m);
+        V sums[N] = {};
+        for (Integer k = 0; k < f.K; k++) {
+            const V a = load_some(f.A + m + k * f.k_of_a, count);
+            for (int n = 0; n < N; n++) sums[n] += a * f.B[k * f.k_of_b + n * f.n_stride];
+        }
+        for (int n = 0; n < N; n++)
+            for (int i = 0; i < count; i++) {
+                T &to = out[(m + i) * row_stride + n * column_stride];
+                to = sums[n][i] + (add ? to : 0);
+            }
+    }
+}
+
+// Several columns of B at once, which lie side by side
+template <class T>
+void by_columns(const Factors<T> &f, T *out, Integer row_stride, bool add) {
+    VECTOR;
+    for (Integer m = 0; m < f.M; m++)
+        for (Integer n = 0; n < f.N; n += LANES) {
+            const int count = std::min<Integer>(LANES, f.N - n);
+            T *to = out + m * row_stride + n;
+            V sums = {};
+            if (add) sums = load_some(to, count);
+            for (Integer k = 0; k < f.K; k++)
+                sums += (V{} + f.A[m * f.m_stride + k * f.k_of_a]) * load_some(f.B + k * f.k_of_b + n, count);
+            store_some(to, sums, count);
+        }
+}
+
 // The same for batches of small matrices, as they are
 template <class T>
 void products(const Machine<T> &machine, const Integer *row) {
-    VECTOR;
     const Integer batch = row[0], M = row[1], N = row[2], K = row[3];
     const bool add = row[4];
     const Integer *o = row + 5, *a = row + 10, *b = row + 15;  // each: buffer, offset, strides of batch, rows, columns
+    constexpr int LANES = Of<T>::LANES;
     for (Integer each = 0; each < batch; each++) {
         T *out = machine.buffers[o[0]] + o[1] + each * o[2];
-        const T *A = machine.buffers[a[0]] + a[1] + each * a[2], *B = machine.buffers[b[0]] + b[1] + each * b[2];
-        for (Integer m = 0; m < M; m++) {
-            if (K >= LANES && a[4] == 1 && b[3] == 1) {  // both in line along the sum
-                for (Integer n = 0; n < N; n++) {
-                    V sums = {};
-                    for (Integer k = 0; k < K; k += LANES) {
-                        const int count = std::min<Integer>(LANES, K - k);
-                        sums += load_some(A + m * a[3] + k, count) * load_some(B + n * b[4] + k, count);
-                    }
-                    T &to = out[m * o[3] + n * o[4]];
-                    to = total(sums) + (add ? to : 0);
-                }
-            } else if (b[4] == 1 && o[4] == 1 && N > 1) {
-                for (Integer n = 0; n < N; n += LANES) {
-                    const int count = std::min<Integer>(LANES, N - n);
-                    T *to = out + m * o[3] + n;
-                    V sums = {};
-                    if (add) sums = load_some(to, count);
-                    for (Integer k = 0; k < K; k++)
-                        sums += (V{} + A[m * a[3] + k * a[4]]) * load_some(B + k * b[3] + n, count);
-                    store_some(to, sums, count);
-                }
-            } else {
+        const Factors<T> f{machine.buffers[a[0]] + a[1] + each * a[2], machine.buffers[b[0]] + b[1] + each * b[2],
+                           a[3], a[4], b[3], b[4], M, N, K};
+        if (K >= LANES && f.k_of_a == 1 && (f.k_of_b == 1 || (M >= LANES && N * K <= MOST_COPIED)))
+            by_lines(f, out, o[3], o[4], add);
+        else if (f.m_stride == 1 && M >= LANES && N <= 4)
+            (N == 1   ? by_rows<T, 1>
+             : N == 2 ? by_rows<T, 2>
+             : N == 3 ? by_rows<T, 3>
+                      : by_rows<T, 4>)(f, out, o[3], o[4], add);
+        else if (f.n_stride == 1 && o[4] == 1 && N > 1)
+            by_columns(f, out, o[3], add);
+        else
+            for (Integer m = 0; m < M; m++)
                 for (Integer n = 0; n < N; n++) {
                     T sum = 0;
-                    for (Integer k = 0; k < K; k++) sum += A[m * a[3] + k * a[4]] * B[k * b[3] + n * b[4]];
+                    for (Integer k = 0; k < K; k++) sum += f.A[m * a[3] + k * a[4]] * f.B[k * b[3] + n * b[4]];
                     T &to = out[m * o[3] + n * o[4]];
                     to = sum + (add ? to : 0);
                 }
-            }
-        }
     }
 }
 

@@ -15,6 +15,7 @@ from lyapnet.graphs.compilation import Scan, has_compiler
 from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.kernel import SOURCE, NumberKernel, ScanKernel
 from lyapnet.graphs.number_kernel.program import OPERATIONS
+from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.tracing import trace
 from lyapnet.networks import FCN, NETWORKS
 from tests.configs import objects
@@ -120,6 +121,65 @@ def test_slopes_compute_what_torch_computes():
     x, y = 0.3 - pair()[0], 2 * pair()[1]
     for found, expected in zip(kernel(x, y), function(x, y), strict=True):
         assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_tanh_is_right_to_its_last_digits(dtype):
+    sizes = torch.cat([torch.logspace(-300 if dtype == torch.float64 else -30, 2, 3000), torch.linspace(0, 1, 3001)])
+    x = torch.cat([sizes, -sizes]).to(dtype)
+    (found,) = NumberKernel(trace(lambda x: (x.tanh(),), (x,)), (x,))(x)
+    assert_close(found, x.double().tanh().to(dtype), rtol=4 * torch.finfo(dtype).eps, atol=0)
+    assert found[len(sizes) + 3000].signbit(), "of −0"
+
+
+def tanh_for_torch(a):
+    return 2 * torch.sigmoid(2 * a) - 1
+
+
+@pytest.mark.parametrize(
+    ("function", "known"),
+    [
+        (tanh_for_torch, True),
+        (lambda a: torch.sigmoid(2 * a) * 2 - 1, True),
+        (lambda a: 2 * torch.sigmoid(2 * a) - 1.5, True),  # its derivative is that of tanh
+        (lambda a: 2 * torch.sigmoid(3 * a) - 1, False),
+        (lambda a: 1 - 2 * torch.sigmoid(2 * a), True),
+        (lambda a: torch.sigmoid(a), False),
+        (lambda a: tanh_for_torch(a) + torch.sigmoid(2 * a), True),
+        (lambda a: tanh_for_torch(a) ** 1 * tanh_for_torch(2 * a), True),
+    ],
+)
+def test_what_networks_have_for_tanh_is_one_operation(function, known):
+    def with_slopes(a):
+        with torch.enable_grad():
+            a = a.detach().requires_grad_()
+            value = function(a)
+            (slope,) = torch.autograd.grad(value.sum(), a, create_graph=True)
+            (bend,) = torch.autograd.grad((slope**2).sum(), a)
+        return value.detach(), slope.detach(), bend
+
+    a = torch.linspace(-4, 4, 101, dtype=torch.float64)
+    graph = trace(with_slopes, (a,))
+    written = rewritten(graph)
+    names = {node.target for node in written.graph.nodes}
+    assert (torch.ops.aten.tanh.default in names) is known
+    assert len(written.graph.nodes) < len(graph.graph.nodes) or not known
+    for found, of_rewritten, expected in zip(NumberKernel(graph, (a,))(a), written(a), with_slopes(a), strict=True):
+        assert_close(of_rewritten, expected, rtol=1e-12, atol=1e-13)
+        assert_close(found, expected, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("columns", [1, 2, 3, 4, 5, 17])
+@pytest.mark.parametrize(("rows", "inner"), [(3, 5), (9, 21), (19, 300)])
+def test_products_of_any_shape_and_layout(rows, inner, columns):
+    A, B = torch.randn(rows, inner).double(), torch.randn(inner, columns).double()
+
+    def function(A, B, A_turned, B_turned):
+        return *(a @ b for a in (A, A_turned.mT) for b in (B, B_turned.mT)), (B_turned @ A_turned).mT
+
+    given = [A, B, A.mT.contiguous(), B.mT.contiguous()]
+    for found in NumberKernel(trace(function, given), given)(*given):
+        assert_close(found, A @ B, rtol=1e-12, atol=1e-12)
 
 
 def test_each_operation_has_its_place_in_the_kernel():

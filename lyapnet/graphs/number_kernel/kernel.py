@@ -16,6 +16,7 @@ from lyapnet.errors import LyapnetError
 from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.libraries import file_of_library, library_of
 from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
+from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
 
@@ -58,7 +59,7 @@ class NumberKernel:
 
     def __init__(self, graph: GraphModule, arguments: Sequence[Tensor], handed: int = 0):
         self._program = program = _Assembled(arguments, handed)
-        results = program.writer.write(graph, program.arguments(arguments, varying=len(arguments)))
+        results = program.writer.write(rewritten(graph), program.arguments(arguments, varying=len(arguments)))
         program.finish(results)
         program.run(program.shared, arguments, program.new_results())  # of constants alone: there from now on
         _require_same(self(*arguments), results)
@@ -96,8 +97,8 @@ class ScanKernel:
         examples = [*state, *(column[0] for column in moving), x0]
         self._program = program = _Assembled(examples)
         own = program.arguments(examples, varying=columns + 1)
-        shared = program.writer.write(prepare, own[: len(state)])
-        program.finish(program.writer.write(step, [*own, *shared]), sums)
+        shared = program.writer.write(rewritten(prepare), own[: len(state)])
+        program.finish(program.writer.write(rewritten(step), [*own, *shared]), sums)
         if not program.is_scan(columns):
             raise NotImplementedError("a scan of an empty batch, or of a state whose shape changes")
         with torch.no_grad():

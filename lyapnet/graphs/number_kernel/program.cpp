@@ -125,7 +125,22 @@ T remainder_like(T x, T y) {  // with the sign of y, as torch has it
 template <class T, class V>
 inline V absolute(V x) { return x < 0 ? -x : x + V{}; }
 
-// eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2, by the series of eʳ
+// eʳ − 1 for |r| ≤ ½ log 2, by its series
+inline Of<double>::V exponential_less_one(Of<double>::V r) {
+    Of<double>::V tail = Of<double>::V{} + 1 / 6227020800.0;
+    const double over[] = {479001600, 39916800, 3628800, 362880, 40320, 5040, 720, 120, 24, 6, 2};
+    for (double factorial : over) tail = tail * r + 1 / factorial;
+    return r + r * r * tail;
+}
+
+inline Of<float>::V exponential_less_one(Of<float>::V r) {
+    Of<float>::V tail = Of<float>::V{} + 1 / 5040.0f;
+    const float over[] = {720, 120, 24, 6, 2};
+    for (float factorial : over) tail = tail * r + 1 / factorial;
+    return r + r * r * tail;
+}
+
+// eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2
 inline Of<double>::V exponential(Of<double>::V x) {
     typedef Of<double>::V V;
     typedef Of<double>::M M;
@@ -134,11 +149,8 @@ inline Of<double>::V exponential(Of<double>::V x) {
     const V inside = x < low ? low : (x > high ? high : x);
     const V shifted = inside * 1.4426950408889634 + SHIFT, k = shifted - SHIFT;
     const V r = (inside - k * LOG2_HIGH) - k * LOG2_LOW;
-    V tail = V{} + 1 / 6227020800.0;
-    const double over[] = {479001600, 39916800, 3628800, 362880, 40320, 5040, 720, 120, 24, 6, 2};
-    for (double factorial : over) tail = tail * r + 1 / factorial;
-    const V p = r + r * r * tail, scale = (V)(((M)shifted + 1023) << 52);  // the low bits of `shifted` are k
-    const V y = scale + scale * p;
+    const V scale = (V)(((M)shifted + 1023) << 52);  // the low bits of `shifted` are k
+    const V y = scale + scale * exponential_less_one(r);
     return x > high ? V{} + INFINITY : (x < low ? V{} : (x != x ? x : y));
 }
 
@@ -150,11 +162,8 @@ inline Of<float>::V exponential(Of<float>::V x) {
     const V inside = x < low ? low : (x > high ? high : x);
     const V shifted = inside * 1.44269504f + SHIFT, k = shifted - SHIFT;
     const V r = (inside - k * LOG2_HIGH) - k * LOG2_LOW;
-    V tail = V{} + 1 / 5040.0f;
-    const float over[] = {720, 120, 24, 6, 2};
-    for (float factorial : over) tail = tail * r + 1 / factorial;
-    const V p = r + r * r * tail, scale = (V)(((M)shifted + 127) << 23);
-    const V y = scale + scale * p;
+    const V scale = (V)(((M)shifted + 127) << 23);
+    const V y = scale + scale * exponential_less_one(r);
     return x > high ? V{} + INFINITY : (x < low ? V{} : (x != x ? x : y));
 }
 
@@ -221,14 +230,12 @@ struct Sigmoid {
 };
 
 template <class T>
-struct Tanh {  // by the exponential away from 0, where that loses no digits, else by the C library
+struct Tanh {  // (1 − u)/(1 + u) with u = e^(−2|x|), and where that loses digits e/(e + 2) with e = e^(2|x|) − 1
     typedef typename Of<T>::V V;
     static V of(V x) {
-        const V size = absolute<T, V>(x), u = exponential(-2 * size), t = (1 - u) / (1 + u);
-        V y = x < 0 ? -t : t;
-        for (int i = 0; i < Of<T>::LANES; i++)
-            if (!(size[i] > T(0.25))) y[i] = std::tanh(x[i]);
-        return y;
+        const V size = absolute<T, V>(x), u = exponential(-2 * size), e = exponential_less_one(2 * size);
+        const V t = (size > T(0.17) ? 1 - u : e) / (size > T(0.17) ? 1 + u : e + 2);
+        return x < 0 ? -t : (x == 0 ? x : t);  // which keeps the sign of −0
     }
 };
 

@@ -3,11 +3,8 @@
 from lyapnet.expansions.dynamic_programming import (
     FLOOR,
     TRIES,
-    Expansion,
     Optimum,
-    at_rest,
-    greedy_law,
-    held_control,
+    follow_expansions,
     optimal_trajectories,
     penalty_of_one_step,
     regulator,
@@ -15,6 +12,7 @@ from lyapnet.expansions.dynamic_programming import (
     sizes,
     without_penalty,
 )
+from lyapnet.expansions.laws import Expansion, at_rest, greedy_law, held_control
 from lyapnet.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 
 __all__ = [
@@ -26,6 +24,7 @@ __all__ = [
     "at_rest",
     "cheapest",
     "exchanged",
+    "follow_expansions",
     "greedy_law",
     "held_control",
     "in_float64",

@@ -23,12 +23,13 @@ from torch import Tensor
 
 from lyapnet.cost import PenaltyCost, spread
 from lyapnet.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
+from lyapnet.expansions.laws import Expansion
 from lyapnet.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 from lyapnet.expansions.step_programs import StepPrograms
-from lyapnet.linear_algebra import apply, is_positive_definite, multiply, solve
-from lyapnet.problem import Problem, Response
+from lyapnet.linear_algebra import is_positive_definite, solve
+from lyapnet.problem import Problem
 from lyapnet.sets import Unbounded
-from lyapnet.types import Control, ControlPath, PerState, State, StatePath, ValuePath
+from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
@@ -36,30 +37,6 @@ NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second deriv
 HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
 ROUNDING = 1e-12  # of the largest eigenvalue of Q_uu, below which the others are lost in it
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
-
-
-class Expansion(NamedTuple):
-    """V(t_n, x̄_n + δ) ≈ c_n + p_nᵀδ + ½ δᵀH_nδ at the nodes of the horizon, in float64; *batch for several."""
-
-    x: StatePath  # x̄
-    value: ValuePath  # c
-    gradient: StatePath  # p
-    hessian: Tensor  # H (N + 1, *batch, n, n), symmetric
-
-    def member(self, i: int | Tensor) -> "Expansion":
-        """One of several, or those with some indices."""
-        return Expansion(*(part[:, i] for part in self))
-
-    def restricted_to(self, kept: list[int]) -> "Expansion":
-        """As a function of some of the states alone."""
-        return Expansion(
-            self.x[..., kept], self.value, self.gradient[..., kept], self.hessian[..., kept, :][..., :, kept]
-        )
-
-    def initially(self, x0: State) -> PerState:
-        """V(0, x₀) as a single expansion has it."""
-        delta = x0 - self.x[0]
-        return self.value[0] + ((self.gradient[0] + apply(self.hessian[0], delta) / 2) * delta).sum(-1)
 
 
 class Optimum(NamedTuple):
@@ -73,42 +50,6 @@ class Optimum(NamedTuple):
         """Those with some indices."""
         x, u, cost = self.path
         return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows), self.mended[rows])
-
-
-def held_control(problem: Problem, free: Response, V_x: State, H: Tensor) -> Control:
-    """u held for Δt: the minimiser of ∫ℓ + V(F(x, u)) for V of gradient V_x at F(x, 0) and curvature H.
-
-    It is the minimiser of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x + ℓ_u)ᵀu over U, with B = F_u/Δt: without limits,
-    −(ℓ_uu + Δt BᵀHB)⁻¹(BᵀV_x + ℓ_u). With Euler steps F(x, 0) = x + Δt f, B = g, ℓ_u = 0 and ℓ_uu = 2R; with others q
-    pays for u within the step too. About a target, u is counted from u*, and f is f + gu*.
-
-    Args:
-        free: the step with the control that costs nothing.
-    """
-    B = free.by_control
-    weight = free.curvature + problem.horizon.dt * multiply(B.mT, multiply(H, B))
-    b = apply(B.mT, V_x) + free.slope
-    if problem.controls.limited:
-        return problem.controls.minimise(weight / 2, problem.cost.about_rest(weight / 2, b))
-    u = -solve(weight, b[..., None])[..., 0]
-    return u if problem.cost.rest is None else u + problem.cost.rest
-
-
-def greedy_law(problem: Problem, expansion: Expansion) -> Callable[[int, State], Control]:
-    """(n, x_n) ↦ u_n: the held control for V as one expansion has it."""
-
-    def law(n: int, x: State) -> Control:
-        H, free = expansion.hessian[n + 1], problem.response(x)
-        V_x = expansion.gradient[n + 1] + apply(H, free.x - expansion.x[n + 1])
-        return held_control(problem, free, V_x, H)
-
-    return law
-
-
-def at_rest(problem: Problem) -> Callable[[int, State], Control]:
-    """(n, x_n) ↦ the control that costs nothing, or the one of U that is closest to it."""
-    u = problem.controls.project(problem.rest)
-    return lambda _, x: u.to(x).expand(*x.shape[:-1], -1)
 
 
 class _Backward(NamedTuple):
@@ -189,6 +130,20 @@ def optimal_trajectories(
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     backward = _backward(problem, programs, now.x, now.u)
     return Optimum(now, backward.expansion, backward.mended.sum(0))
+
+
+def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
+    """Where each of a batch of states is led by the law that an expansion of its own asks for.
+
+    Args:
+        problem: in float64, on the CPU.
+        expansion: one for each state of x0 (b, n).
+    """
+    programs = StepPrograms(problem, STEP_SIZES)
+    path = path_of(problem, *programs.follow(expansion, x0))
+    if not programs.agrees(path) and programs.forget():  # its numbers changed since programs were written
+        return follow_expansions(problem, expansion, x0)
+    return path
 
 
 def _descended(

@@ -1,13 +1,13 @@
-"""Line searches along the steps of a problem, and their derivatives, as programs of lyapnet's kernel."""
+"""Closed loops along expansions and line searches, and derivatives of steps, as programs of lyapnet's kernel."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from lyapnet.derivatives import StepDerivatives
+from lyapnet.expansions.laws import Expansion, held_control
 from lyapnet.expansions.paths import Path
 from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, kernel_or_none
@@ -15,9 +15,9 @@ from lyapnet.graphs.stateless import state_of, stateless
 from lyapnet.graphs.tracing import cut, trace
 from lyapnet.linear_algebra import apply
 from lyapnet.problem import Problem
-from lyapnet.types import Control, ControlPath, State, StatePath
+from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
-TRAJECTORIES, ROWS = 16, 512  # in one call of a program: of a line search, and of derivatives
+TRAJECTORIES, ROWS = 16, 512  # in one call of a program: of closed loops, and of derivatives
 Kernel = NumberKernel | ScanKernel
 
 
@@ -51,14 +51,13 @@ class StepPrograms(StepDerivatives):
         Returns:
             x (N + 1, sizes, b, n), u (N, sizes, b, m), and ∫ℓ over all of it (sizes, b).
         """
-        along, sizes = [x[:-1], u, k, K], len(self._search.step_sizes)
-        start = torch.cat([x[0], torch.zeros_like(x[0, :, :1])], -1).expand(sizes, -1, -1)
-        parts = [
-            self._searched([_filled(column, rows, 1, TRAJECTORIES) for column in (*along, start)])
-            for rows in torch.arange(x.shape[1]).split(TRAJECTORIES)
-        ]
-        y, controls = (torch.cat(columns, 2)[:, :, : x.shape[1]] for columns in zip(*parts, strict=True))
-        return torch.cat([start[None, ..., :-1], y[..., :-1]]), controls, y[-1, ..., -1]
+        start = _without_cost(x[0]).expand(len(self._search.step_sizes), -1, -1)
+        return self._along("search", self._search, [x[:-1], u, k, K], start)
+
+    def follow(self, expansion: Expansion, x0: State) -> tuple[StatePath, ControlPath, PerState]:
+        """Closed loops from x₀ (b, n) under the held controls for V as the expansion of each has it: x, u and ∫ℓ."""
+        columns = [expansion.x[1:], expansion.gradient[1:], expansion.hessian[1:]]
+        return self._along("follow", _FollowStep(self.problem), columns, _without_cost(x0))
 
     def first(self, z: Tensor) -> list[Tensor]:
         return self._in_slices("first", self._first, z)
@@ -91,20 +90,20 @@ class StepPrograms(StepDerivatives):
         known.update(dict.fromkeys(known))
         return some
 
-    def _searched(self, arguments: list[Tensor]) -> Sequence[Tensor]:
-        """(y, u) over time of one slice."""
-        kernel = self._kernel("search", partial(self._written_search, arguments))
-        if kernel is None:
-            return Scan(lambda: (), self._search, 0).loop(*arguments)
-        return kernel(*state_of(self._search), *arguments)
+    def _along(self, name: str, step: nn.Module, columns: list[Tensor], start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(x, u, ∫ℓ) of steps (*columns (N, b, …) at its time, y (…, b, n + 1)) ↦ (y', y', u), for slices of b."""
 
-    def _written_search(self, arguments: list[Tensor]) -> Kernel:
-        *columns, y = arguments
-        state, moving = state_of(self._search), len(columns)
-        middle = [column[len(column) // 2] for column in columns]
-        graph = trace(stateless(self._search), [*state, *(column[0] for column in columns), y], [[*middle, y]])
-        prepare, step = cut(graph, late=moving + 1, early_outputs=0, repeat=False)
-        return ScanKernel(prepare, step, [*state, *arguments], moving)
+        def slice_of(rows: Tensor) -> list[Tensor]:
+            return [*(_filled(each, rows, 1, TRAJECTORIES) for each in columns), _filled(start, rows, -2, TRAJECTORIES)]
+
+        b, one = start.shape[-2], slice_of(torch.arange(min(TRAJECTORIES, start.shape[-2])))
+        kernel = self._kernel(name, lambda: _scan_kernel(step, one))
+        if kernel is None:
+            y, u = Scan(lambda: (), step, 0).loop(*columns, start)
+        else:
+            parts = [kernel(*state_of(step), *slice_of(rows)) for rows in torch.arange(b).split(TRAJECTORIES)]
+            y, u = (torch.cat(parts, -2)[..., :b, :] for parts in zip(*parts, strict=True))
+        return torch.cat([start[None, ..., :-1], y[..., :-1]]), u, y[-1, ..., -1]
 
     def _in_slices(self, name: str, module: "_OfProblem", *columns: Tensor) -> list[Tensor]:
         """The results of a function of the rows of some columns, for all rows."""
@@ -152,6 +151,23 @@ class _SearchStep(nn.Module):
         return y, y, u
 
 
+class _FollowStep(nn.Module):
+    """(x̄', p', H', y) ↦ (y', y', u), y = (x, ∫ℓ): one step under the held control for V' of an expansion."""
+
+    def __init__(self, problem: Problem):
+        super().__init__()
+        self.problem = problem
+
+    @torch.no_grad()
+    def forward(self, center: State, p: State, H: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
+        x = y[..., :-1]
+        free = self.problem.response(x)
+        u = held_control(self.problem, free, p + apply(H, free.x - center), H)
+        following, paid = self.problem.step(x, u)
+        y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
+        return y, y, u
+
+
 class _OfProblem(nn.Module):
     """A function of tensors, made of a problem."""
 
@@ -162,6 +178,21 @@ class _OfProblem(nn.Module):
     def forward(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         result = self.function(*arguments)
         return (result,) if isinstance(result, Tensor) else tuple(result)
+
+
+def _scan_kernel(step: nn.Module, arguments: list[Tensor]) -> ScanKernel:
+    """The steps of one slice as a program."""
+    *columns, y = arguments
+    state, moving = state_of(step), len(columns)
+    middle = [column[len(column) // 2] for column in columns]
+    graph = trace(stateless(step), [*state, *(column[0] for column in columns), y], [[*middle, y]])
+    prepare, repeated = cut(graph, late=moving + 1, early_outputs=0, repeat=False)
+    return ScanKernel(prepare, repeated, [*state, *arguments], moving)
+
+
+def _without_cost(x: State) -> Tensor:
+    """(x, 0)."""
+    return torch.cat([x, torch.zeros_like(x[..., :1])], -1)
 
 
 def _filled(column: Tensor, rows: Tensor, axis: int, count: int) -> Tensor:

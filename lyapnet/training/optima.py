@@ -16,6 +16,7 @@ from lyapnet.expansions import (
     at_rest,
     cheapest,
     exchanged,
+    follow_expansions,
     greedy_law,
     in_float64,
     optimal_trajectories,
@@ -151,7 +152,7 @@ def _followed(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
 
 def _along(exact: Problem, optimum: Optimum, which: Tensor, x0: State) -> Path:
     """From each of some states under the law of one of the optima."""
-    return path_under(exact, greedy_law(exact, optimum.expansion.member(which)), x0)
+    return follow_expansions(exact, optimum.expansion.member(which), x0)
 
 
 def nearest(x0: Tensor, others: Tensor, itself: bool = True) -> Tensor:

@@ -8,7 +8,15 @@ from torch.testing import assert_close
 
 from lyapnet import Box, ControlAffineSystem, ControlBox, Cost, Horizon, Problem, QuadraticCost
 from lyapnet.derivatives import StepDerivatives
-from lyapnet.expansions import in_float64, optimal_trajectories, path_of, path_under
+from lyapnet.expansions import (
+    Expansion,
+    follow_expansions,
+    greedy_law,
+    in_float64,
+    optimal_trajectories,
+    path_of,
+    path_under,
+)
 from lyapnet.expansions.step_programs import StepPrograms
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel
 from lyapnet.sets import ControlSet
@@ -61,6 +69,24 @@ def test_line_searches_are_closed_loops_of_their_law(system, kernel, b):
     for mine, other in zip(found, expected, strict=True):
         assert_close(mine, other, rtol=1e-10, atol=1e-10)
     assert not torch.allclose(found.cost[0], found.cost[1]), "the step sizes lead elsewhere"
+
+
+@pytest.mark.parametrize("b", [1, 16, 37])
+@pytest.mark.parametrize(("system", "kernel"), [(Pendulum, ScanKernel), (Looking, type(None))])
+def test_each_state_follows_the_law_of_an_expansion_of_its_own(system, kernel, b):
+    problem, generator = swinging(system()), torch.Generator().manual_seed(0)
+    N = problem.horizon.steps
+    x, p = (torch.randn(N + 1, b, 2, generator=generator, dtype=torch.float64) for _ in range(2))
+    root = torch.randn(N + 1, b, 2, 2, generator=generator, dtype=torch.float64)
+    expansion = Expansion(x, x[..., 0], p, root @ root.mT)
+    expected = path_under(problem, greedy_law(problem, expansion), x[0])
+    found = follow_expansions(problem, expansion, x[0])
+    assert programs_of(problem) == {"follow": kernel}
+    for mine, other in zip(found, expected, strict=True):
+        assert_close(mine, other, rtol=1e-10, atol=1e-10)
+    if b > 1:
+        turned = expansion.member(torch.arange(b).roll(1))
+        assert not torch.allclose(follow_expansions(problem, turned, x[0]).cost, found.cost), "the twin: of another"
 
 
 @pytest.mark.parametrize("rows", [1, 512, 700])
@@ -130,11 +156,15 @@ def test_a_number_that_changed_is_noticed(what):
 
     problem = problem_with(1.0)
     x0, u = torch.tensor([[0.5, 0.0], [-0.3, 0.8]]), torch.zeros(30, 2, 1)
-    before = optimal_trajectories(problem, x0, u).path
-    assert ScanKernel in programs_of(problem).values()
+    found = optimal_trajectories(problem, x0, u)
+    before = found.path
+    follow_expansions(problem, found.expansion, x0)
+    assert {programs_of(problem)[name] for name in ("search", "follow")} == {ScanKernel}
     assert StepPrograms(problem, SIZES).agrees(before)
     setattr(problem.system if what == "mass" else problem.cost, what, 3.0)
     assert not StepPrograms(problem, SIZES).agrees(before)
+    followed = follow_expansions(problem, found.expansion, x0)
+    assert_close(followed, path_under(problem, greedy_law(problem, found.expansion), x0))
     after = optimal_trajectories(problem, x0, u).path
     assert StepPrograms(problem, SIZES).agrees(after)
     assert set(programs_of(problem).values()) == {type(None)}

@@ -133,7 +133,7 @@ def _form_of_rollouts(traced, monkeypatch):
         return run
 
     if traced is not None:
-        for name in ("trace", "batched", "cut"):
+        for name in ("trace", "cut"):
             monkeypatch.setattr(routines, name, forced(getattr(routines, name)))
 
 

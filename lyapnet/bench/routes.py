@@ -98,7 +98,7 @@ def _entry(case: Case, x0: State, route: str, rollout: Rollout, compile_seconds:
     if route != FLOOR:
         return Entry(route, compiled, partial(case.gradient, rollout, x0), flat, compile_seconds)
     if rollout.discrete is not None:  # traced, as under the gradient of discrete, whose floor it is
-        rollout.discrete.routines(x0, rollout.discrete.trained())
+        rollout.discrete.routines(x0)
     return Entry(route, compiled, partial(_without_gradient, rollout, x0), None, compile_seconds)
 
 

@@ -1,4 +1,4 @@
-"""Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter, batched."""
+"""Functions of tensors as flat graphs of tensor operations: traced once, cut where late arguments enter."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch._decomp import core_aten_decompositions, get_decompositions
-from torch.func import functionalize, vmap
+from torch.func import functionalize
 from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.node import map_arg
@@ -170,28 +170,6 @@ NO_VALUES = re.compile(r"tensor subclasses|data pointer|'meta' device|Cannot cop
 """What torch says of code that asks a tensor without values for them."""
 
 
-def batched(
-    function: Callable[..., Tensors],
-    arguments: Sequence[Tensor],
-    axes: Sequence[int | None],
-    out_axes: Sequence[int],
-    elsewhere: Sequence[Sequence[Tensor]] = (),
-) -> GraphModule:
-    """The trace of a function over an axis of some of its arguments: each of its operations on all members at once."""
-    one, other = (_first_member(arguments, axes), [_first_member(o, axes[len(axes) - len(o) :]) for o in elsewhere])
-    # traced before it is batched: by then no autograd is left that vmap could not enter
-    return trace(vmap(_of_any_layout(trace(function, one, other)), tuple(axes), tuple(out_axes)), arguments)
-
-
-def _of_any_layout(graph_module: GraphModule) -> GraphModule:
-    """A graph with reshape for view: over an axis that is not the first, members are not contiguous."""
-    for node in graph_module.graph.nodes:
-        if node.target is torch.ops.aten.view.default:
-            node.target = torch.ops.aten.reshape.default
-    graph_module.recompile()
-    return graph_module
-
-
 def cut(
     graph_module: GraphModule, late: int, early_outputs: int, repeat: bool = True
 ) -> tuple[GraphModule, GraphModule]:
@@ -247,10 +225,6 @@ def _repeatable(nodes: Sequence[Node], cheap: set[str]) -> set[Node]:
         if node.op in ("placeholder", "get_attr")
         or (node.op == "call_function" and (is_view(node.target) or name_of(node.target) in cheap))
     }
-
-
-def _first_member(arguments: Sequence[Tensor], axes: Sequence[int | None]) -> list[Tensor]:
-    return [a if axis is None else a.select(axis, 0).clone() for a, axis in zip(arguments, axes, strict=True)]
 
 
 def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> None:

@@ -27,6 +27,7 @@ from lyapnet.types import ControlPath, StagePath, State, StatePath, ValuePath
 
 _LOG = logging.getLogger(__name__)
 Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
+FEW = 3  # nodes for which code that is shared is held against the loop that takes it
 VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 
@@ -38,8 +39,6 @@ class DiscreteAdjoint:
     system, the cost and V are arguments of what is traced and may change between rollouts; what else f, g and V read is
     frozen. A loop that cannot be traced, since its control flow depends on tensor values or leaves torch, runs eagerly;
     the log says why.
-
-    With an axis of members before the batch, x₀ (E, b, n) and parameters (E, *shape), it is E closed loops at once.
 
     Args:
         loop: the closed loop.
@@ -66,21 +65,13 @@ class DiscreteAdjoint:
         """Without the work, which belongs to these very tensors: a copy does its own."""
         return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None, "_compiled_key": None}
 
-    def __call__(self, x0: State, theta: Sequence[Tensor] | None = None) -> Rolled:
-        """(x, ∫ℓ, V, u) at the nodes.
-
-        Args:
-            x0: (b, n), or (E, b, n) with members.
-            theta: the members' parameters, in the order of `trained`; None for the loop's own.
+    def __call__(self, x0: State) -> Rolled:
+        """(x, ∫ℓ, V, u) at the nodes, from x₀ (b, n).
 
         Raises:
-            ValueError: parameters without an axis of members in x₀.
             UsageError: the loop draws random numbers, which the way back could not repeat.
         """
-        if theta is not None and x0.ndim != 3:
-            raise ValueError(f"Expected x0 (E, b, n) with the members' parameters, got {tuple(x0.shape)}; stack them.")
-        x0 = x0.contiguous()  # as machine code takes it, which does not check
-        theta = self.trained() if theta is None else theta
+        x0, theta = x0.contiguous(), self.trained()  # contiguous as machine code takes it, which does not check
         if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
             x, running_cost, value, u = _Rollout.apply(self, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
             return x, running_cost, value, u
@@ -90,7 +81,7 @@ class DiscreteAdjoint:
         """The loop's parameters that ask for a gradient."""
         return trained_of(self.loop)
 
-    def compile(self, x0: State, theta: Sequence[Tensor] | None = None) -> None:
+    def compile(self, x0: State) -> None:
         """Have batches like x₀ run as machine code, and others, where no gradient is asked for, in slices of that size.
 
         Raises:
@@ -98,35 +89,58 @@ class DiscreteAdjoint:
             CompilationError: as TracedRoutines.compiled.
         """
         if self._compiled_key != self._key(x0):
-            self._routines[self._key(x0)] = self._work(x0, self.trained() if theta is None else theta).compiled()
-            self._compiled, self._compiled_key = x0.detach(), self._key(x0)
+            self._take_compiled(self._work(x0).compiled(), x0)
 
     def compile_like(self, other: "DiscreteAdjoint") -> None:
-        """Have batches run as machine code where another loop has them; of one member, where that has several.
+        """Have batches run as machine code where another loop has them.
 
         Raises:
             UntraceableError, CompilationError: as compile.
         """
         if other._compiled is not None:
-            self.compile(other._compiled if other._compiled.ndim == 2 else other._compiled[0])
+            self.compile(other._compiled)
 
-    def require_trace(self, x0: State, theta: Sequence[Tensor]) -> None:
-        """Hold that the loop can be traced for batches like x₀.
+    def share_code(self, other: "DiscreteAdjoint") -> bool:
+        """Run by the machine code of a loop that differs in tensors alone, if it has some and agrees on a few steps.
 
-        Raises:
-            UntraceableError: it cannot.
+        What a trace has frozen, a number or a tensor that no buffer holds, may be another one here: both are asked for
+        FEW steps from states around x₀ and for their gradient.
         """
-        self._work(x0, theta).require_traces()
+        x0 = other._compiled
+        routines = None if x0 is None else other._routines.get(other._key(x0))
+        if x0 is None or routines is None or other._key(x0) != self._key(x0):
+            return False
+        theta, spread = self.trained(), torch.linspace(0.9, 1.1, x0.numel()).to(x0).reshape(x0.shape)
+        first = spread * x0 + 0.1 * (spread - 1)
+        results = [self._few_steps(each, first, theta) for each in (routines, self._as_written(x0))]
+        half = torch.finfo(x0.dtype).eps ** 0.5
+        for found, expected in zip(*results, strict=True):
+            scale = float(expected.nan_to_num(0, 0, 0).abs().max()) if expected.numel() else 0.0
+            if not torch.allclose(found, expected, rtol=half, atol=half * scale, equal_nan=True):
+                return False
+        self._take_compiled(routines, x0)
+        return True
 
-    def routines(self, x0: State, theta: Sequence[Tensor]) -> Routines:
+    def _few_steps(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> list[Tensor]:
+        """The first FEW nodes from x₀, and the gradient of the sum of their x, ∫ℓ and V."""
+        t, dt = (column[:FEW] for column in self._grid(x0, self.steps + 1))
+        with torch.no_grad():
+            nodes = Nodes(*routines.integrate(*self._state(theta), t, dt, x0))
+        ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
+        x0_bar, theta_bar = routines.gradient(self._state(theta), Columns(t, dt, nodes.stages, *ones))
+        return [*nodes, x0_bar, *theta_bar]
+
+    def _take_compiled(self, routines: Routines, x0: State) -> None:
+        self._routines[self._key(x0)] = routines
+        self._compiled, self._compiled_key = x0.detach(), self._key(x0)
+
+    def routines(self, x0: State) -> Routines:
         """The work for batches like x₀: compiled, else traced, else as written."""
         key = self._key(x0)
         if key not in self._routines:
             try:
-                self._routines[key] = self._work(x0, theta).traced()
+                self._routines[key] = self._work(x0).traced()
             except UntraceableError as error:
-                if x0.ndim > 2:  # members exist in a trace alone
-                    raise
                 if not self._told:
                     _LOG.warning("%s It runs as it is written, which is slower.", error)
                     self._told = True
@@ -156,14 +170,13 @@ class DiscreteAdjoint:
             not x0.numel()
             or self._compiled is None
             or self._key(self._compiled) not in self._routines  # other parameters were trained then
-            or self._key(self._compiled[..., 0, :]) != self._key(x0[..., 0, :])
+            or self._key(self._compiled[0]) != self._key(x0[0])
         ):
-            routines = self._as_written(x0) if x0.ndim == 2 else self.routines(x0, theta)
-            return self.integrate(routines, x0, theta)
-        size, batch = self._compiled.shape[-2], x0.shape[-2]
-        full = torch.cat([x0, x0[..., -1:, :].expand(*x0.shape[:-2], -batch % size, x0.shape[-1])], -2)
+            return self.integrate(self._as_written(x0), x0, theta)
+        size, batch = len(self._compiled), len(x0)
+        full = torch.cat([x0, x0[-1:].expand(-batch % size, -1)])
         routines = self._routines[self._key(self._compiled)]
-        paths = [self.integrate(routines, part.contiguous(), theta) for part in full.split(size, -2)]
+        paths = [self.integrate(routines, part.contiguous(), theta) for part in full.split(size)]
         columns = zip(zip(*paths, strict=True), BATCH_AXES, strict=True)
         return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
 
@@ -175,23 +188,21 @@ class DiscreteAdjoint:
         """The tensors that the loop is made of, the trained ones first."""
         return state_of(self.loop, theta)
 
-    def _work(self, x0: Tensor, theta: Sequence[Tensor]) -> TracedRoutines:
+    def _work(self, x0: Tensor) -> TracedRoutines:
         """The work for batches like x₀ as graphs, each traced once."""
         key = self._key(x0)
         if key not in self._traced:
-            state, grid, x0 = self._state(theta), self._grid(x0, self.steps + 1), x0.detach().contiguous()
+            state, grid, x0 = self._state(self.trained()), self._grid(x0, self.steps + 1), x0.detach().contiguous()
+            visited = partial(self._visited, x0)
             self._traced[key] = TracedRoutines(
-                self.loop, self._tableau, state, len(theta), grid, x0, self._block(x0), self.costate_limit,
-                partial(self._visited, x0, theta),
-            )  # fmt: skip
+                self.loop, self._tableau, state, grid, x0, self._block(x0), self.costate_limit, visited
+            )
         return self._traced[key]
 
-    def _visited(self, x0: Tensor, theta: Sequence[Tensor]) -> list[list[Tensor]]:
-        """(t, Δt, x) of some steps along the loop as it is written; near its start where there are members."""
+    def _visited(self, x0: Tensor) -> list[list[Tensor]]:
+        """(t, Δt, x) of some steps along the loop as it is written."""
         t, dt = self._grid(x0, self.steps + 1)
-        if x0.ndim > 2:
-            return [[t[1], dt[0], 0.9 * x0 + 0.1 * torch.linspace(-1, 1, x0.numel()).to(x0).reshape(x0.shape)]]
-        path = self.integrate(self._as_written(x0), x0, theta).stages[:, 0]
+        path = self.integrate(self._as_written(x0), x0, self.trained()).stages[:, 0]
         return [[t[k], dt[k], path[k]] for k in torch.linspace(0, self.steps, VISITED).long()]
 
     def _as_written(self, x0: Tensor) -> Routines:
@@ -215,7 +226,7 @@ class DiscreteAdjoint:
 
     def _block(self, x0: Tensor) -> int:
         """K: blocks of equal length with about BLOCK states in each."""
-        nodes, states = self.steps + 1, max(1, x0[..., 0].numel())
+        nodes, states = self.steps + 1, max(1, len(x0))
         return math.ceil(nodes / math.ceil(nodes * len(self._tableau.b) * states / BLOCK))
 
     def _grid(self, like: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
@@ -230,7 +241,7 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, adjoint: DiscreteAdjoint, x0: Tensor, *theta: Tensor) -> tuple[Tensor, ...]:
-        routines = adjoint.routines(x0, theta)
+        routines = adjoint.routines(x0)
         path = adjoint.integrate(routines, x0, theta)
         result = _read(path)
         ctx.adjoint, ctx.routines = adjoint, routines

@@ -1,6 +1,6 @@
 """Closed-loop integration of the state and its running cost, differentiable in the parameters of V."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -151,26 +151,6 @@ class Rollout(nn.Module):
         """Whether it goes from node to node as Problem.step does, with u held."""
         held = self.stepped is not self.closed_loop
         return self.method == self.problem.horizon.method and (held or self.method == "euler")
-
-    def together(self, x0: State, theta: Sequence[Tensor]) -> Iterator[Trajectory]:
-        """E closed loops in one batch, each with parameters of its own; for gradient discrete.
-
-        Args:
-            x0: (E, b, n).
-            theta: the trained parameters (E, *shape), in the order of `discrete.trained()`.
-
-        Raises:
-            DivergenceError: as forward, when it is that closed loop's turn.
-        """
-        assert self.discrete is not None
-        t = self.horizon.times(x0)
-        x, running_cost, value, u = self.discrete(x0, theta)
-        terminal_cost = self.closed_loop.cost.terminal(x[-1])
-        columns = (x.unbind(1), u.unbind(1), running_cost.unbind(1), terminal_cost.unbind(0), value.unbind(1))
-        for member in zip(*columns, strict=True):
-            trajectory = Trajectory(t, *member)
-            _require_finite(trajectory.x, trajectory.running_cost, t)
-            yield trajectory
 
     def _discretely(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
         """(x, ∫ℓ, V, u) at the nodes, by the route with the discrete costate."""

@@ -12,8 +12,8 @@ from torch.fx import GraphModule
 from lyapnet.errors import CompilationError, LyapnetError, UntraceableError, one_line
 from lyapnet.graphs.compilation import Scan, compilation_errors, compiled
 from lyapnet.graphs.number_kernel.kernel import ScanKernel
-from lyapnet.graphs.stateless import stateless
-from lyapnet.graphs.tracing import batched, cut, trace
+from lyapnet.graphs.stateless import stateless, trained_of
+from lyapnet.graphs.tracing import cut, trace
 from lyapnet.horizon import ButcherTableau
 from lyapnet.rollout.backwards import BlockwiseGradient, Columns, StepwiseGradient
 from lyapnet.rollout.closed_loop import ClosedLoop
@@ -45,9 +45,9 @@ class TracedRoutines:
 
     Args:
         loop, tableau: the closed loop, and its steps.
-        state, trained: the tensors that it is made of, and how many of them, the first ones, are trained.
+        state: the tensors that it is made of, the trained ones first.
         grid: t and Δt at all nodes.
-        x0: a batch, (b, n) or, of members with trained tensors of their own, (E, b, n).
+        x0: a batch (b, n).
         block: K, nodes in a block.
         limit: of the costates.
         visited: gives (t, Δt, x) at which the trace of a step is held against the loop itself.
@@ -58,7 +58,6 @@ class TracedRoutines:
         loop: ClosedLoop,
         tableau: ButcherTableau,
         state: list[Tensor],
-        trained: int,
         grid: tuple[Times, Times],
         x0: State,
         block: int,
@@ -67,21 +66,13 @@ class TracedRoutines:
     ):
         self.state, self.grid, self.x0, self.block, self.limit = state, grid, x0, block, limit
         self._step, self._linearise = Step(loop, tableau), Linearise(loop, tableau)
-        self._visited, self._trained, self._stages = visited, trained, len(tableau.b)
-
-    def require_traces(self) -> None:
-        """Hold that the loop can be traced, forwards and backwards.
-
-        Raises:
-            UntraceableError: its control flow depends on tensor values, or it leaves torch.
-        """
-        _ = self._forwards, self._backwards
+        self._visited, self._trained, self._stages = visited, len(trained_of(loop)), len(tableau.b)
 
     def traced(self) -> Routines:
         """The graphs, replayed operation by operation.
 
         Raises:
-            UntraceableError: as require_traces.
+            UntraceableError: control flow that depends on tensor values, or code that leaves torch.
         """
         return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
 
@@ -89,7 +80,7 @@ class TracedRoutines:
         """The graphs as machine code: on a CPU run by lyapnet's own kernel, on a GPU compiled for this task.
 
         Raises:
-            UntraceableError: as require_traces.
+            UntraceableError: as traced.
             CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
         """
         with compilation_errors():
@@ -105,7 +96,7 @@ class TracedRoutines:
 
     def _by_kernel(self) -> Routines:
         (t, dt), x0 = self.grid, self.x0
-        nodes, per_node = x0.expand(len(t), *x0.shape), torch.ones_like(x0[..., 0]).expand(len(t), *x0.shape[:-1])
+        nodes, per_node = x0.expand(len(t), *x0.shape), torch.ones_like(x0[:, 0]).expand(len(t), -1)
         columns = [t, dt, nodes, nodes, per_node, per_node]
         try:
             integrate = ScanKernel(*self._forwards, [*self.state, *self.grid, x0])
@@ -124,47 +115,35 @@ class TracedRoutines:
         arguments = [*self.state, t[0], dt[0], self.x0]
         with _tracing():
             elsewhere = self._visited()
-        graph = self._trace(self._step, arguments, [None, None, 0], [0, 1, 0, 0, 0], elsewhere)
-        return cut(graph, late=3, early_outputs=0, repeat=False)
+        return cut(self._trace(self._step, arguments, elsewhere), late=3, early_outputs=0, repeat=False)
 
     @cached_property
     def _backwards(self) -> tuple[GraphModule, GraphModule]:
         """(what all steps share, a step pulled back)."""
         (t, dt), x0 = self.grid, self.x0
-        late = [t[0], dt[0], x0, x0.clone(), torch.ones_like(x0[..., 0]), torch.ones_like(x0[..., 0]), x0.clone()]
-        results = [0] * (2 + self._trained)
-        graph = self._trace(PullBack(self._step), [*self.state, *late], [None, None, *[0] * 5], results)
-        return cut(graph, late=len(late), early_outputs=0, repeat=False)
+        late = [t[0], dt[0], x0, x0.clone(), torch.ones_like(x0[:, 0]), torch.ones_like(x0[:, 0]), x0.clone()]
+        return cut(
+            self._trace(PullBack(self._step), [*self.state, *late]), late=len(late), early_outputs=0, repeat=False
+        )
 
     @cached_property
     def _block_pieces(self) -> tuple[GraphModule, GraphModule]:
         """(linearise, product) of a block."""
-        arguments = self._block_arguments()
-        axes, results = [None, None, 2, 1, 1, 1, 1], [1, 1, *[0] * self._trained]
-        return cut(self._trace(self._linearise, arguments, axes, results), late=1, early_outputs=2)
+        return cut(self._trace(self._linearise, self._block_arguments()), late=1, early_outputs=2)
 
     def _block_arguments(self) -> list[Tensor]:
         """What the pieces of a block are traced on."""
         (t, dt), x0 = self.grid, self.x0
         nodes = x0.expand(self.block, *x0.shape)
-        stages = nodes.unsqueeze(1).repeat(1, self._stages, *[1] * x0.ndim)
+        stages = nodes[:, None].repeat(1, self._stages, 1, 1)
         bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
         return [*self.state, t[: self.block], dt[: self.block], stages, *bars, nodes.clone()]
 
     def _trace(
-        self,
-        module: nn.Module,
-        arguments: list[Tensor],
-        axes: list[int | None],
-        result_axes: list[int],
-        elsewhere: Sequence[Sequence[Tensor]] = (),
+        self, module: nn.Module, arguments: list[Tensor], elsewhere: Sequence[Sequence[Tensor]] = ()
     ) -> GraphModule:
-        """The trace of a piece; over the members, where there are some, along an axis of arguments and results."""
         with _tracing():
-            if self.x0.ndim == 2:
-                return trace(stateless(module), arguments, elsewhere)
-            of_state = [*[0] * self._trained, *[None] * (len(self.state) - self._trained)]
-            return batched(stateless(module), arguments, [*of_state, *axes], result_axes, elsewhere)
+            return trace(stateless(module), arguments, elsewhere)
 
 
 @contextmanager

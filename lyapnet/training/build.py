@@ -28,7 +28,7 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
         module = ValueModule(problem, one.V, one.program, one.rollout, one.pointwise, options, config.seed)
     else:
         members = [build_learner(each, problem, parts, label_of(each)) for each in configs_of_seeds(config)]
-        module = EnsembleModule(members, config.training.batch_size, options)
+        module = EnsembleModule(members, options)
     module.metadata = {"config": to_plain(config), "problem": problem.record()}
     return module
 

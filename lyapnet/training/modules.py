@@ -1,6 +1,6 @@
 """The LightningModules: what they compute stands in programs/; what is shown, logged and saved, in callbacks.
 
-One V is trained by a ValueModule; several seeds that train as one batch, by an EnsembleModule.
+One V is trained by a ValueModule; several seeds, by an EnsembleModule.
 """
 
 import math
@@ -19,12 +19,12 @@ from lyapnet import __version__
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cost import PenaltyCost
-from lyapnet.errors import CheckpointError, CompilationError, DivergenceError, UsageError
+from lyapnet.errors import CheckpointError, DivergenceError, UsageError
 from lyapnet.policy import HJBPolicy, known_law
 from lyapnet.problem import Problem
 from lyapnet.programs import PointwiseCondition, Program
 from lyapnet.random_streams import POINTS
-from lyapnet.rollout import ADAPTIVE_METHODS, DiscreteAdjoint, Rollout, Trajectory
+from lyapnet.rollout import ADAPTIVE_METHODS, Rollout, Trajectory
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.learner import Learner
@@ -53,9 +53,13 @@ class TrainingModule(L.LightningModule):
     def save_member(self, member: Learner, path: Path) -> None:
         """Write a checkpoint that `lyapnet.load` takes for that of the member's own run."""
 
-    @abstractmethod
     def compile_for(self, batch_size: int) -> None:
-        """Have training batches of this size run as machine code; see DiscreteAdjoint.compile."""
+        """Have training batches of this size run as machine code, which members share; see DiscreteAdjoint.compile."""
+        first, *others = [member.rollout.discrete for member in self.members]
+        x0 = self.members[0].problem.initial_states.center.expand(batch_size, -1).contiguous()
+        for loop in (first, *others):
+            if loop is not None and (loop is first or first is None or not loop.share_code(first)):
+                loop.compile(x0)
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
         """One evaluation of each member's program on its initial states."""
@@ -281,50 +285,29 @@ class ValueModule(TrainingModule):
     def save_member(self, member: Learner, path: Path) -> None:
         self.trainer.save_checkpoint(path)
 
-    def compile_for(self, batch_size: int) -> None:
-        if self.rollout.discrete is not None:
-            self.rollout.discrete.compile(self._any_batch(batch_size))
-
-    def _any_batch(self, batch_size: int) -> Tensor:
-        return self.problem.initial_states.center.expand(batch_size, -1).contiguous()
-
     def _stored_name(self, key: str) -> str:
         return key.removeprefix("members.0.")
 
 
 class EnsembleModule(TrainingModule):
-    """Several seeds' runs as one batch: each equals the run of its seed alone, up to rounding.
+    """Several seeds' runs side by side, each as the run of its seed alone.
 
     Args:
-        members: of one problem, with networks of one shape; each rollout by the gradient's discrete route.
-        batch_size: initial states of each member in a training batch.
+        members: of one problem, with networks of one shape.
         optimizer: how the weights move.
-
-    Raises:
-        UsageError: the gradient's route has no batch of closed loops; or the members' closed loops differ in more than
-            trained weights.
     """
 
-    def __init__(self, members: Sequence[Learner], batch_size: int, optimizer: OptimizerOptions | None = None):
+    def __init__(self, members: Sequence[Learner], optimizer: OptimizerOptions | None = None):
         super().__init__(members, optimizer or OptimizerOptions())
-        gradient = members[0].rollout.gradient
-        if gradient != "discrete":
-            raise UsageError(
-                f"Expected rollout.gradient=discrete for seeds={len(members)}, got {gradient}; set it, or train the "
-                "seeds one by one."
-            )
-        self._require_one_batch(batch_size)
 
     def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
-        return self.members[0].rollout.together(x0, self._weights())
+        for member, own in zip(self.members, x0, strict=True):
+            yield member.rollout(own)
 
     def save_member(self, member: Learner, path: Path) -> None:
         weights = {f"V.{name}": tensor for name, tensor in member.V.state_dict().items()}
         kept = {**member.metadata, **self._state()}
         write_checkpoint({"state_dict": weights, "global_step": self.global_step, KEY: kept}, path)
-
-    def compile_for(self, batch_size: int) -> None:
-        self._discrete(0).compile(self._any_batch(batch_size), self._weights())
 
     def configure_gradient_clipping(
         self,
@@ -339,43 +322,7 @@ class EnsembleModule(TrainingModule):
             for member in self.members:
                 clip(member.V.parameters(), gradient_clip_val)
 
-    def _weights(self) -> list[Tensor]:
-        """The members' trained parameters, (E, *shape) each."""
-        trained = [self._discrete(k).trained() for k in range(len(self.members))]
-        return [torch.stack(parameters) for parameters in zip(*trained, strict=True)]
-
-    def _discrete(self, k: int) -> DiscreteAdjoint:
-        discrete = self.members[k].rollout.discrete
-        assert discrete is not None
-        return discrete
-
-    def _any_batch(self, batch_size: int) -> Tensor:
-        center = self.members[0].problem.initial_states.center
-        return center.expand(len(self.members), batch_size, -1).contiguous()
-
-    def _require_one_batch(self, batch_size: int) -> None:
-        """Hold the members against what one batch can serve: the same function of their trained weights."""
-        remedy = "train the seeds one by one"
-        first, *others = self.members
-        for other in others:
-            for name, tensor in _frozen(first.V).items():
-                if not torch.equal(tensor, _frozen(other.V)[name]):
-                    raise UsageError(
-                        f"Expected seeds to differ in trained weights alone, got another {name} in {other.label}; "
-                        f"{remedy}."
-                    )
-        try:
-            self._discrete(0).require_trace(self._any_batch(batch_size), self._weights())
-        except CompilationError as error:
-            raise UsageError(f"{error}, for seeds={len(self.members)}; {remedy}.") from error
-
 
 def labelled(name: str, label: str) -> str:
     """The name of one member's share of something; the name itself where there is but one."""
     return f"{name}/{label}" if label else name
-
-
-def _frozen(module: nn.Module) -> dict[str, Tensor]:
-    """What a module is made of besides its trained parameters."""
-    untrained = {name: p for name, p in module.named_parameters() if not p.requires_grad}
-    return {**untrained, **dict(module.named_buffers())}

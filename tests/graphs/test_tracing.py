@@ -1,4 +1,4 @@
-"""Traced graphs compute what their functions do: as they are, cut in two, and over an axis of members."""
+"""Traced graphs compute what their functions do: as they are, and cut in two."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.errors import UntraceableError, UsageError
-from lyapnet.graphs.tracing import batched, cut, trace
+from lyapnet.graphs.tracing import cut, trace
 
 
 def function(weight, x, late):
@@ -19,8 +19,8 @@ def function(weight, x, late):
     return hidden.sum(-1), slope, (hidden * late).mT @ slope, torch.exp(hidden).mT
 
 
-def draw(*members):
-    return torch.randn(*members, 3, 2), torch.randn(*members, 4, 2), torch.randn(*members, 4, 3)
+def draw():
+    return torch.randn(3, 2), torch.randn(4, 2), torch.randn(4, 3)
 
 
 def agree(results, expected):
@@ -106,36 +106,30 @@ LEAVING = {
 }
 
 
-@pytest.mark.parametrize("members", [(), (2,)], ids=["one", "members"])
 @pytest.mark.parametrize("way", LEAVING)
-def test_code_that_reads_values_is_refused_where_it_does(way, members):
+def test_code_that_reads_values_is_refused_where_it_does(way):
     """Whatever the values are: at these arguments most of them come to the same at any other near by."""
     function = LEAVING[way]
 
     def leaves(weight, x):
         return (weight * function(x),)
 
-    weight, x = torch.randn(2, *members, 4).unbind()
+    weight, x = torch.randn(2, 4).unbind()
     with pytest.raises(UntraceableError) as refused:
-        tracer_of(members)(leaves, (weight, x))
+        trace(leaves, (weight, x))
     message = str(refused.value)
     assert "read" in message
-    assert way in ("mask", "item") or "test_tracing.py" in message or members, "it names the line"
+    assert way in ("mask", "item") or "test_tracing.py" in message, "it names the line"
     assert len(message.splitlines()) == 1
     assert "pytorch" not in message
 
 
-def tracer_of(members):
-    return (lambda f, given: batched(f, given, (0, 0), (0,))) if members else trace
-
-
-@pytest.mark.parametrize("members", [(), (2,)], ids=["one", "members"])
-def test_code_that_stays_in_torch_is_traced(members):
+def test_code_that_stays_in_torch_is_traced():
     def stays(weight, x):
         return (weight * torch.sin(x) * torch.tensor([1.0, 2.0, 3.0, 4.0]) * float(np.pi) + TABLE.sum(),)
 
-    weight, x, other = torch.randn(3, *members, 4).unbind()
-    agree(tracer_of(members)(stays, (weight, x))(weight, other), stays(weight, other))
+    weight, x, other = torch.randn(3, 4).unbind()
+    agree(trace(stays, (weight, x))(weight, other), stays(weight, other))
 
 
 def test_a_function_of_more_than_its_arguments_is_found_out_on_other_values():
@@ -188,26 +182,3 @@ def test_the_rest_may_need_nothing_early_and_views_are_not_handed_over():
 def test_an_early_result_that_needs_a_late_argument_is_refused(early_outputs):
     with pytest.raises(KeyError):
         cut(trace(function, draw()), late=1, early_outputs=early_outputs)
-
-
-# Batched
-
-
-def test_members_at_once_are_members_one_by_one():
-    """With a weight of its own for each, and without."""
-    weights, x, late = draw(5)
-    for weight, axis in ((weights, 0), (weights[0], None)):
-        graph = batched(function, (weight, x, late), (axis, 0, 0), (0, 0, 1, 0))
-        one_by_one = [function(weight[i] if axis == 0 else weight, x[i], late[i]) for i in range(5)]
-        expected = [torch.stack(y, out) for y, out in zip(zip(*one_by_one, strict=True), (0, 0, 1, 0), strict=True)]
-        agree(graph(weight, x, late), expected)
-        with pytest.raises(AssertionError):
-            agree(graph(weight, x.roll(1, 0), late), expected)
-
-
-def test_a_batched_graph_is_cut_like_any_other():
-    arguments = draw(5)
-    early, rest = cut(batched(function, arguments, (0, 0, 0), (0, 0, 0, 0)), late=1, early_outputs=2)
-    first, second, *handed = early(*arguments[:-1])
-    expected = torch.func.vmap(trace(function, [y[0] for y in arguments]))(*arguments)
-    agree((first, second, *rest(*arguments, *handed)), expected)

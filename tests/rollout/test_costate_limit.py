@@ -1,4 +1,4 @@
-"""The limit of the costates: what it cuts, what it leaves alone to the last bit, and each member's own median."""
+"""The limit of the costates: what it cuts, and what it leaves alone to the last bit."""
 
 import pytest
 import torch
@@ -53,27 +53,6 @@ def test_long_ones_are_cut_to_a_multiple_of_the_median(pendulum):
     assert length.max() > 2 * length.median(), "else there is nothing to cut"
     assert shorter.max() <= 1.2 * shorter.median() * (1 + 1e-12)
     assert sum(p.norm() for p in less) < sum(p.norm() for p in weights)
-
-
-@pytest.mark.parametrize("traced", [True], ids=["traced"])
-def test_members_have_medians_of_their_own(pendulum):
-    rollout = pendulum(2.0)
-    near, far = (
-        torch.tensor([[0.01, 0.0], [0.012, 0.0], [2.5, 3.0]]),
-        torch.tensor([[2.0, 1.0], [2.2, 1.0], [0.01, 0.0]]),
-    )
-    assert rollout.discrete.trained()
-    theta = [torch.stack([p, 1.1 * p]).detach().requires_grad_() for p in rollout.discrete.trained()]
-    leaf = torch.stack([near, far]).requires_grad_()
-    together = sum(trajectory.cost.mean() for trajectory in rollout.together(leaf, theta))
-    gradient = torch.autograd.grad(together, [leaf, *theta])
-    for k, x0 in enumerate((near, far)):
-        for parameter, own in zip(rollout.discrete.trained(), theta, strict=True):
-            parameter.data.copy_(own[k].detach())
-        of_x0, of_weights = slopes(rollout, x0)
-        assert_close(gradient[0][k], of_x0, rtol=1e-9, atol=1e-12)
-        for mine, alone in zip(gradient[1:], of_weights, strict=True):
-            assert_close(mine[k], alone, rtol=1e-8, atol=1e-10)
 
 
 @pytest.mark.parametrize(("gradient", "limit"), [("adjoint", 5.0), ("backprop", 5.0), ("discrete", 0.9)])

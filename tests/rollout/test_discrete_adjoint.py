@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import nn
 from torch.autograd.graph import saved_tensors_hooks
-from torch.nn.utils import vector_to_parameters
 from torch.testing import assert_close
 
 from lyapnet.calculus import ValueFunction
@@ -336,23 +335,6 @@ def test_single_precision_stays_and_agrees(system, cost, policy, x0):
     assert 1e-9 < error(gradient, expected) < 1e-4
 
 
-@double_integrator
-@in_trace
-def test_members_are_closed_loops_of_their_own(system, cost, policy):
-    """Two members with parameters and states of their own: at once, and one after the other by backpropagation."""
-    discrete, backprop = routes(system, cost, policy)
-    x0, parameters = torch.randn(2, 3, system.n), list(policy.parameters())
-    theta = [torch.stack([p, 1.1 * p]).detach() for p in parameters]
-    leaves = [y.clone().requires_grad_() for y in (x0, *theta)]
-    x, running_cost, value, _ = discrete.discrete(leaves[0], leaves[1:])
-    both = torch.autograd.grad((x**2).sum() + (running_cost * value).sum(), leaves)
-    for i in range(2):
-        vector_to_parameters(torch.cat([y[i].flatten() for y in theta]), parameters)
-        alone = slopes(backprop, x0[i], lambda y: (y.x**2).sum() + (y.running_cost * y.value).sum())
-        assert error([y[i] for y in both], alone) < EXACT
-        assert error([y[1 - i] for y in both], alone) > 1e-3
-
-
 # Systems of users
 
 
@@ -510,13 +492,6 @@ class Dropping(ValueFunction):
 
     def forward(self, t, x):
         return self.dropout(self.V(t, x)[..., None])[..., 0]
-
-
-@double_integrator
-def test_members_parameters_need_members(system, cost, policy, x0):
-    discrete, _ = routes(system, cost, policy)
-    with pytest.raises(ValueError, match=r"Expected x0 \(E, b, n\)"):
-        discrete.discrete(x0, discrete.discrete.trained())
 
 
 @in_either_form

@@ -1,30 +1,31 @@
-"""Several seeds as one batch: each member is the run of its seed, and what a user sees of them."""
+"""Several seeds side by side: each member is the run of its seed, and what a user sees of them."""
 
 import dataclasses
 import json
 import math
 import os
 import signal
+from contextlib import suppress
 
 import pytest
 import torch
 from matplotlib.figure import Figure
+from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.calculus import ValueFunction
 from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
 from lyapnet.config import load_config
-from lyapnet.errors import CheckpointError, DivergenceError, UsageError
+from lyapnet.errors import CheckpointError, DivergenceError, UntraceableError
 from lyapnet.evaluation.states import StateTable
 from lyapnet.networks import FCN, NETWORKS
-from lyapnet.rollout.discrete_adjoint import DiscreteAdjoint
+from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import DoubleIntegrator
 from lyapnet.training import figure_logger
 from lyapnet.training.build import build_module
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.training.modules import ValueModule
 from lyapnet.training.progress import about_means, mean_and_range
 from tests.problems import problem_of
 from tests.runs import MEASURED_TIME, SMALL, Desk, differences, logged, values, without_figures
@@ -72,7 +73,7 @@ def single(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """An ensemble, built once: that traces its closed loop."""
+    """An ensemble, built once."""
     return build_module(config_of(tmp_path_factory.mktemp("built")))
 
 
@@ -99,7 +100,7 @@ def distance(one, other):
 
 def test_member_is_the_run_of_its_seed(ensemble, single):
     alone = single.best()
-    assert distance(ensemble.best("seed_4"), alone) < 1e-9
+    assert distance(ensemble.best("seed_4"), alone) == 0
     assert read_checkpoint(ensemble.best("seed_4"))["lyapnet"] == read_checkpoint(alone)["lyapnet"]
     for wrong in ("seed_3", "seed_5"):
         assert distance(ensemble.best(wrong), alone) > 1e-3
@@ -304,12 +305,11 @@ def test_divergence_names_the_seed(call, module):
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
-        (("rollout.gradient=adjoint",), "rollout.gradient=discrete"),
         (("trainer.devices=2",), "trainer.devices=1"),
         (("seeds=0",), "seeds ≥ 1"),
     ],
 )
-def test_what_one_batch_cannot_do_is_refused_before_there_is_a_folder(overrides, named, tmp_path, capsys, monkeypatch):
+def test_what_seeds_cannot_do_is_refused_before_there_is_a_folder(overrides, named, tmp_path, capsys, monkeypatch):
     desk = desk_of(tmp_path)
     monkeypatch.chdir(tmp_path)
     assert main(["train", "--config", "experiment.yaml", *overrides]) == 2
@@ -338,22 +338,47 @@ class Branching(ValueFunction):
         return self.inner(t, x) if x.sum() < 1e9 else x.sum(-1)
 
 
-@pytest.mark.parametrize(("network", "named"), [(RandomFeatures, "frequencies in seed_4"), (Branching, "one by one")])
-def test_network_that_one_batch_cannot_hold_is_refused(network, named, tmp_path, monkeypatch):
+@pytest.mark.parametrize("network", [RandomFeatures, Branching])
+def test_networks_with_more_of_the_seed_in_them_than_weights(network, tmp_path, monkeypatch):
+    """And those whose control flow depends on values: each member is a closed loop of its own."""
     monkeypatch.setitem(NETWORKS, "fcn", network)
-    config = config_of(tmp_path, "network.name=fcn", "network.hidden=[4]")
-    with pytest.raises(UsageError, match=named):
-        build_module(config)
-    build_module(dataclasses.replace(config, seeds=1))
+    config = config_of(tmp_path, "network.name=fcn", "network.hidden=[4]", "rollout.compile=auto")
+    module, alone = (build_module(dataclasses.replace(config, **own)) for own in ({}, {"seed": SEED + 1, "seeds": 1}))
+    x0 = torch.stack([module.members[0].problem.initial_states.sample(4) for _ in range(SEEDS)])
+    with suppress(UntraceableError):
+        module.compile_for(4)
+    second = [*module.trajectories(x0)][1]
+    assert_close(second.cost, next(alone.trajectories(x0[1])).cost, rtol=1e-9, atol=0)
+    assert not torch.allclose(second.cost, next(module.trajectories(x0)).cost)
 
 
-@pytest.mark.parametrize("seeds", [1, SEEDS])
-def test_compilation_is_for_the_batch_of_all_seeds(seeds, built, monkeypatch):
-    one = built.members[0]
-    alone = ValueModule(one.problem, one.V, one.program, one.rollout)
-    module, asked = built if seeds > 1 else alone, []
-    monkeypatch.setattr(DiscreteAdjoint, "compile", lambda _, x0, theta=None: asked.append((x0, theta)))
-    module.compile_for(7)
-    ((x0, theta),) = asked
-    assert x0.shape == ((seeds, 7, 2) if seeds > 1 else (7, 2))
-    assert theta is None if seeds == 1 else all(len(p) == seeds for p in theta)
+class Frozen(FCN):
+    """A network with a tensor that no buffer holds, so that a trace keeps it as it is."""
+
+    def __init__(self, scaling, hidden=(4,)):
+        super().__init__(scaling, hidden)
+        self.slopes = torch.randn(2)
+
+    def forward(self, t, x):
+        return super().forward(t, x * self.slopes)
+
+    value_and_state_gradient = ValueFunction.value_and_state_gradient
+
+
+@pytest.mark.parametrize(("network", "shared"), [(FCN, True), (RandomFeatures, True), (Frozen, False)])
+def test_members_share_code_where_they_are_one_function_of_their_tensors(network, shared, tmp_path, monkeypatch):
+    monkeypatch.setitem(NETWORKS, "fcn", network)
+    module = build_module(config_of(tmp_path, "network.name=fcn", "network.hidden=[4]"))
+    module.compile_for(4)
+    x0 = torch.stack([module.members[0].problem.initial_states.sample(4) for _ in range(SEEDS)])
+    first, second, _ = (member.rollout.discrete.routines(x0[0]) for member in module.members)
+    assert (first is second) is shared
+    for member, own, trajectory in zip(module.members, x0, module.trajectories(x0), strict=True):
+        written = Rollout(member.problem, member.rollout.closed_loop.policy, gradient="backprop")(own)
+        assert_close(trajectory.x, written.x, rtol=1e-9, atol=1e-9)
+        assert_close(slopes_of(member, trajectory), slopes_of(member, written), rtol=1e-8, atol=1e-8)
+
+
+def slopes_of(member, trajectory):
+    slopes = torch.autograd.grad(trajectory.cost.sum(), [*member.V.parameters()], materialize_grads=True)
+    return torch.cat([slope.flatten() for slope in slopes])

@@ -261,7 +261,7 @@ class Config:
     experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
     logs: str = option("logs", "The folder of all runs.")
     seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0, below=2**63)
-    seeds: int = option(1, "Runs trained together as one batch, with the seeds seed, seed + 1, …", at_least=1)
+    seeds: int = option(1, "Runs trained side by side, with the seeds seed, seed + 1, …", at_least=1)
     program: ProgramConfig = field(default_factory=ProgramConfig)
     pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
     system: SystemConfig = field(default_factory=SystemConfig)

@@ -71,7 +71,7 @@ def gradient(
     All routes of one task and batch are warmed up, then timed in turns.
     Memory is the peak beyond the model; errors are relative, against
     backprop in float64. Compiled is by lyapnet's kernel on a CPU, and by
-    torch.compile on a GPU; rollout.compile=off leaves it out.
+    CUDA graphs on a GPU; rollout.compile=off leaves it out.
 
     lyapnet bench --task double_integrator,reacher --batch 12,64 --json
     lyapnet bench --batch 1,8,64,512,4096 --routes rollout,discrete --figures out

@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions.laws import Expansion, held_control
 from lyapnet.expansions.paths import Path
-from lyapnet.graphs.compilation import Scan
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, kernel_or_none
+from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, stateless
 from lyapnet.graphs.tracing import cut, trace
 from lyapnet.linear_algebra import apply

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import nn
 from torch.fx import GraphModule, Node
 
 from lyapnet.errors import ExportError, LyapnetError, one_line
 from lyapnet.export.law import Law
 from lyapnet.export.verification import Evaluate
-from lyapnet.graphs.compilation import one_number_at_a_time
 from lyapnet.graphs.tracing import name_of
 
 RESULTS = ["u", "V"]
@@ -43,7 +43,7 @@ def program_of(law: Law) -> torch.export.ExportedProgram:
         ExportError: it has operations that torch.export does not take.
     """
     with _quiet("torch.export does not take"), torch.no_grad():
-        graph = one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
+        graph = _one_number_at_a_time(_with_exact_numbers(law.both, law.arguments["x"].dtype))
         return torch.export.export(graph, tuple(law.arguments.values()))
 
 
@@ -177,3 +177,21 @@ def run_onnx(path: Path, law: Law) -> Evaluate:
         return np.stack(u), np.stack(V)
 
     return evaluate
+
+
+def _one_number_at_a_time(module: nn.Module) -> nn.Module:
+    """A copy with torch.where for g[2, 0] = 1, which the compiler refuses for a single number."""
+    module, aten = copy.deepcopy(module), torch.ops.aten
+    for graph_module in (each for each in module.modules() if isinstance(each, GraphModule)):
+        graph = graph_module.graph
+        for node in graph.find_nodes(op="call_function", target=aten.select_scatter.default):
+            into, number, _, index = node.args
+            row = into.meta["val"]
+            if row.ndim == 1:
+                with graph.inserting_before(node):
+                    places = graph.call_function(aten.arange.default, (len(row),), {"device": row.device})
+                    chosen = graph.call_function(aten.eq.Scalar, (places, index % len(row)))
+                    node.replace_all_uses_with(graph.call_function(aten.where.self, (chosen, number, into)))
+                graph.erase_node(node)
+        graph_module.recompile()
+    return module

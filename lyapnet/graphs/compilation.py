@@ -1,126 +1,77 @@
-"""Traced functions as machine code, kept on disk from run to run (torch.export and AOTInductor)."""
+"""lyapnet's own C++, compiled once for a machine and kept on disk; and the folder where such things are kept."""
 
-import copy
+import ctypes
 import hashlib
 import logging
 import os
 import platform
 import stat
+import subprocess
 import sys
 import tempfile
-import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.errors import CompilationError, LyapnetError, one_line
 from lyapnet.files import digest_of_file, write_atomically
 
+FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
 
-class Scan(nn.Module):
-    """(*state, *columns, x₀) ↦ what step(*state, *columns at n, x_n, *prepare(*state)) keeps at each step, over time.
+
+def library_of(name: str, sources: tuple[Path, ...], *definitions: str) -> ctypes.CDLL:
+    """Compiled C++, from disk, or compiled now: one file for each machine.
 
     Args:
-        prepare: what all steps share.
-        step: returns the next x and, after it, what is kept, and at last what is summed over the steps.
-        tensors: number of tensors in `state`.
-        sums: number of results that are summed.
-    """
-
-    def __init__(
-        self,
-        prepare: Callable[..., Sequence[Tensor]],
-        step: Callable[..., Sequence[Tensor]],
-        tensors: int,
-        sums: int = 0,
-    ):
-        super().__init__()
-        self.prepare, self.step, self.tensors, self.sums = prepare, step, tensors, sums
-
-    def loop(self, *arguments: Tensor) -> list[Tensor]:
-        """The scan as a loop, for a step of any kind."""
-        state, (*columns, x) = arguments[: self.tensors], arguments[self.tensors :]
-        shared, kept = self.prepare(*state), []
-        for now in zip(*columns, strict=True):
-            x, *node = self.step(*state, *now, x, *shared)
-            kept.append(node)
-        columns = [torch.stack(column) for column in zip(*kept, strict=True)]
-        first = len(columns) - self.sums
-        return [*columns[:first], *(column.sum(0) for column in columns[first:])]
-
-    def forward(self, *arguments: Tensor) -> list[Tensor]:
-        """The scan as one operation, for the compiler."""
-        from torch._higher_order_ops.scan import scan
-
-        state, (*columns, x0) = arguments[: self.tensors], arguments[self.tensors :]
-        shared = self.prepare(*state)
-
-        def body(x: Tensor, now: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
-            following, *kept = self.step(*state, *now, x, *shared)
-            return following, tuple(kept)
-
-        return list(scan(body, x0, tuple(columns))[1])
-
-
-def compiled(module: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., Sequence[Tensor]]:
-    """The function of a traced module for arguments like these, from disk, or compiled now.
-
-    What is on disk is run only where nobody else can have written it, and where its digest holds.
+        name: the file's name begins with.
+        sources: the last one includes the others.
+        definitions: of macros, as "NAME=value".
 
     Raises:
-        CompilationError: there is no C++ compiler; or the cache is not the user's own.
-        Exception: of torch or the compiler, of any kind.
+        CompilationError: there is no compiler, or it fails; or the cache is not the user's own.
     """
-    from torch._inductor import aoti_compile_and_package, aoti_load_package
-
-    path = file_of(module, arguments)
+    path, folder = file_of_library(name, sources, *definitions), cache_folder()
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    require_own(folder)
     digest = path.with_suffix(".sha256")
-    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    require_own(path.parent)
     if path.is_file():
-        try:
-            require_own(path)
-            if digest.read_text(encoding="ascii") == digest_of_file(path):
-                return aoti_load_package(str(path))
-            reason = "another digest than what was compiled"
-        except Exception as error:  # of any kind: a file that was cut short or exchanged
-            reason = one_line(error)[:200]
-        logging.getLogger(__name__).warning("note: compiling again what is in %s: got %s.", path, reason)
-        path.unlink(missing_ok=True)
+        require_own(path)
+        if digest.is_file() and digest.read_text(encoding="ascii") == digest_of_file(path):
+            return ctypes.CDLL(str(path))
+        logging.getLogger(__name__).warning("note: compiling again what is in %s: got another digest.", path)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".new_") as draft:
+        file = Path(draft) / path.name
+        _compile(sources[-1], file, definitions)
+        write_atomically(digest, digest_of_file(file).encode())
+        file.replace(path)
+    return ctypes.CDLL(str(path))
+
+
+def _compile(source: Path, file: Path, definitions: Sequence[str]) -> None:
+    from torch._inductor.cpp_builder import get_cpp_compiler
+
     if not has_compiler():
         raise CompilationError("Expected a C++ compiler ($CXX, g++ or clang++), got none")
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".new_") as draft, torch.no_grad():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, about itself
-            program = torch.export.export(one_number_at_a_time(module), tuple(arguments))
-            package = aoti_compile_and_package(program, package_path=f"{draft}/function.pt2")
-        Path(package).chmod(0o600)
-        write_atomically(digest, digest_of_file(Path(package)).encode())
-        Path(package).replace(path)
-    return aoti_load_package(str(path))
+    command = [get_cpp_compiler(), *FLAGS, *(f"-D{each}" for each in definitions), str(source), "-o", str(file)]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", None) or str(error)
+        reason = one_line(RuntimeError(said))[:200]
+        raise CompilationError(f"Expected {source.name} to compile, got {reason}") from error
+    file.chmod(0o600)
 
 
-def one_number_at_a_time(module: nn.Module) -> nn.Module:
-    """A copy with torch.where for g[2, 0] = 1, which the compiler refuses for a single number."""
-    module, aten = copy.deepcopy(module), torch.ops.aten
-    for graph_module in (each for each in module.modules() if isinstance(each, GraphModule)):
-        graph = graph_module.graph
-        for node in graph.find_nodes(op="call_function", target=aten.select_scatter.default):
-            into, number, _, index = node.args
-            row = into.meta["val"]
-            if row.ndim == 1:
-                with graph.inserting_before(node):
-                    places = graph.call_function(aten.arange.default, (len(row),), {"device": row.device})
-                    chosen = graph.call_function(aten.eq.Scalar, (places, index % len(row)))
-                    node.replace_all_uses_with(graph.call_function(aten.where.self, (chosen, number, into)))
-                graph.erase_node(node)
-        graph_module.recompile()
-    return module
+def file_of_library(name: str, sources: Sequence[Path], *definitions: str) -> Path:
+    """Where machine code is kept: by its source, how it is compiled, and the instructions of the CPU."""
+    capabilities = sorted(torch.cpu.get_capabilities().items())
+    parts = [platform.machine(), capabilities, FLAGS, definitions, *(source.read_bytes() for source in sources)]
+    return cache_folder() / f"{name}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
 
 
 def require_own(path: Path) -> None:
@@ -169,21 +120,3 @@ def constants_of(graph: GraphModule) -> list[tuple[str, Any]]:
     """Name and entries of every tensor that a graph holds."""
     constants = {**vars(graph), **dict(graph.named_buffers())}
     return [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]
-
-
-def file_of(module: nn.Module, arguments: Sequence[Tensor]) -> Path:
-    """Where machine code is kept: one file for each function, shapes of arguments, machine and torch."""
-    parts = [
-        torch.__version__, platform.machine(), _processors(arguments), torch.get_num_threads(), type(module).__name__,
-        *((tuple(a.shape), a.stride(), a.dtype, a.device.type) for a in arguments),
-    ]  # fmt: skip
-    for graph in module.modules():
-        if isinstance(graph, GraphModule):
-            parts += [graph.code, *constants_of(graph)]
-    return cache_folder() / f"{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.pt2"
-
-
-def _processors(arguments: Sequence[Tensor]) -> list[Any]:
-    """What machine code is written for: the instructions of the CPU, and of each GPU that holds an argument."""
-    devices = {argument.device for argument in arguments if argument.device.type == "cuda"}
-    return [sorted(torch.cpu.get_capabilities().items()), *map(torch.cuda.get_device_capability, devices)]

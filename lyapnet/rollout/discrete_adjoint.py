@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lyapnet.errors import UntraceableError
-from lyapnet.graphs.compilation import Scan
+from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
 from lyapnet.horizon import TABLEAUX
 from lyapnet.rollout.backwards import BlockwiseGradient, Columns, padded
@@ -30,6 +30,7 @@ Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u
 FEW = 3  # nodes for which code that is shared is held against the loop that takes it
 VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
+ON_GPU = 131_072  # states linearised at once there
 
 
 class DiscreteAdjoint:
@@ -227,7 +228,8 @@ class DiscreteAdjoint:
     def _block(self, x0: Tensor) -> int:
         """K: blocks of equal length with about BLOCK states in each."""
         nodes, states = self.steps + 1, max(1, len(x0))
-        return math.ceil(nodes / math.ceil(nodes * len(self._tableau.b) * states / BLOCK))
+        most = BLOCK if x0.device.type == "cpu" else ON_GPU
+        return math.ceil(nodes / math.ceil(nodes * len(self._tableau.b) * states / most))
 
     def _grid(self, like: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
         """(t, Δt) of the first nodes; from the last one of the horizon on, t = T and Δt = 0."""

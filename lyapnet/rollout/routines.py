@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 
 from lyapnet.errors import CompilationError, LyapnetError, UntraceableError, one_line
-from lyapnet.graphs.compilation import Scan, compilation_errors, compiled
+from lyapnet.graphs.compilation import compilation_errors
+from lyapnet.graphs.cuda_graphs import RecordedFunction, Replay, record
 from lyapnet.graphs.number_kernel.kernel import ScanKernel
+from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import stateless, trained_of
 from lyapnet.graphs.tracing import cut, trace
 from lyapnet.horizon import ButcherTableau
@@ -77,22 +79,34 @@ class TracedRoutines:
         return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
 
     def compiled(self) -> Routines:
-        """The graphs as machine code: on a CPU run by lyapnet's own kernel, on a GPU compiled for this task.
+        """The graphs on a CPU by lyapnet's own kernel, on a GPU with all kernels of a piece launched at once.
 
         Raises:
             UntraceableError: as traced.
             CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
         """
         with compilation_errors():
-            if self.x0.device.type == "cpu":
-                return self._by_kernel()
-            arguments = self._block_arguments()
-            linearise, product = self._block_pieces
-            with torch.no_grad():
-                intermediate = linearise(*arguments[:-1])[2:]
-            by_blocks = compiled(linearise, arguments[:-1]), compiled(product, [*arguments, *intermediate])
-            integrate = compiled(self._scan(), [*self.state, *self.grid, self.x0])
-        return Routines(integrate, BlockwiseGradient(*by_blocks, self.block, self.limit))
+            return self._by_kernel() if self.x0.device.type == "cpu" else self.recorded()
+
+    def recorded(self, record: Callable[..., Replay] = record) -> Routines:
+        """The graphs, with the kernels of the whole path and of the whole gradient recorded."""
+        by_blocks, tensors = BlockwiseGradient(*self._block_pieces, self.block, self.limit), len(self.state)
+        integrate = RecordedFunction(self._scan().loop, [*self.state, *self.grid, self.x0], record)
+        (t, dt), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
+        stages = nodes[:, None].expand(-1, self._stages, -1, -1)
+        path = Columns(t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0]))
+
+        def backwards(*arguments: Tensor) -> list[Tensor]:
+            costate, share = by_blocks(arguments[:tensors], Columns(*arguments[tensors:]))
+            return [costate, *share]
+
+        gradient = RecordedFunction(backwards, [*self.state, *path], record)
+
+        def unpacked(state: Sequence[Tensor], path: Columns) -> tuple[State, list[Tensor]]:
+            costate, *share = gradient(*state, *path)
+            return costate, share
+
+        return Routines(integrate, unpacked)
 
     def _by_kernel(self) -> Routines:
         (t, dt), x0 = self.grid, self.x0

@@ -8,7 +8,7 @@ from lyapnet.certification.branch_and_bound import Budget
 from lyapnet.certification.condition import DecreaseCondition
 from lyapnet.certification.proof import prove
 from lyapnet.errors import CompilationError
-from lyapnet.graphs import bounds, compilation, libraries
+from lyapnet.graphs import bounds, compilation
 from lyapnet.graphs.bound_kernel import kernel as machine_code
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.taylor import box_form
@@ -161,9 +161,9 @@ def another_library(tmp_path, monkeypatch):
 @pytest.mark.parametrize("reason", ["no compiler", "a compiler that fails"])
 def test_without_machine_code_a_note_says_so_once(reason, another_library, monkeypatch, caplog):
     if reason == "no compiler":
-        monkeypatch.setattr(libraries, "has_compiler", lambda: False)
+        monkeypatch.setattr(compilation, "has_compiler", lambda: False)
     else:
-        monkeypatch.setattr(libraries, "FLAGS", ("--no-such-flag",))
+        monkeypatch.setattr(compilation, "FLAGS", ("--no-such-flag",))
     monkeypatch.setattr(bounds, "MANY", 0)
     function, (lower, upper) = graph_of(CASES[aten.sin.default], 0), random_boxes(60, 0)
     for _ in range(2):
@@ -178,7 +178,7 @@ def test_without_machine_code_a_note_says_so_once(reason, another_library, monke
 def test_machine_code_that_was_exchanged_is_compiled_again(another_library, caplog):
     machine_code.library()
     machine_code.library.cache_clear()
-    path = libraries.file_of_library("bounds", machine_code.SOURCES)
+    path = compilation.file_of_library("bounds", machine_code.SOURCES)
     path.unlink()  # the code that runs here keeps its file
     path.write_bytes(b"another")
     assert machine_code.elementary(0, torch.zeros(3)).tolist() == [1, 1, 1]

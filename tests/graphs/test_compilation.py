@@ -1,8 +1,6 @@
-"""Machine code for one task, as on a GPU: the same numbers, once per machine; without a compiler, none."""
+"""C++ compiled once for a machine; without a compiler, none; and what is not the user's own is not run."""
 
-import json
-import subprocess
-import sys
+import ctypes
 from pathlib import Path
 
 import pytest
@@ -11,9 +9,8 @@ import torch
 from lyapnet.build import build_problem, build_rollout, build_value_function
 from lyapnet.config import load_config
 from lyapnet.errors import CompilationError, UntraceableError
-from lyapnet.graphs import compilation, libraries
+from lyapnet.graphs import compilation
 from lyapnet.graphs.number_kernel import kernel
-from lyapnet.graphs.tracing import trace
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -28,8 +25,14 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def no_compiler(monkeypatch):
-    monkeypatch.setattr(compilation, "has_compiler", lambda: False)
+def source(tmp_path):
+    """C++ with one function, 7 unless a macro says otherwise."""
+    path = tmp_path / "seven.cpp"
+    path.write_text('#ifndef NUMBER\n#define NUMBER 7\n#endif\nextern "C" int number() { return NUMBER; }\n')
+    return path
+
+
+needs_compiler = pytest.mark.skipif(not compilation.has_compiler(), reason="needs a C++ compiler")
 
 
 def rollout_of(*overrides):
@@ -38,85 +41,36 @@ def rollout_of(*overrides):
     return build_rollout(config, problem, build_value_function(config, problem))
 
 
-needs_compiler = pytest.mark.skipif(not compilation.has_compiler(), reason="needs a C++ compiler")
-
-
-def measured():
-    """What this file prints as a script: in a process of its own, since shape checks are not for a compiler."""
-    command = [sys.executable, __file__]
-    return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+@needs_compiler
+def test_a_file_for_each_source_and_its_macros(source, cache, monkeypatch):
+    assert compilation.library_of("some", (source,)).number() == 7
+    assert compilation.library_of("some", (source,), "NUMBER=8").number() == 8
+    assert len(list(cache.glob("some_*.so"))) == 2
+    monkeypatch.setattr(compilation, "has_compiler", lambda: False)
+    assert compilation.library_of("some", (source,)).number() == 7, "from disk"
+    source.write_text(source.read_text() + "// changed")
+    with pytest.raises(CompilationError, match=r"C\+\+ compiler"):
+        compilation.library_of("some", (source,))
 
 
 @needs_compiler
-@pytest.mark.slow
-def test_a_scan_as_machine_code_computes_the_same(cache):
-    """x ↦ sin(wx) + t, three times, with what all steps share computed once."""
-    found = measured()
-    assert found["before"] is False
-    assert found["after"] is True
-    assert found["error"] < 1e-12
-    assert found["difference_with_another_weight"] > 1e-3
-    assert len(list(cache.glob("*.pt2"))) == 1
-    assert found["twice"] is True
-    assert found["refused"] == dict.fromkeys(("flipped", "exchanged", "writable", "without a digest"), True)
-    assert "only you can write" in found["folder"]
-
-
-def assigned(w):
-    """As in g of many systems: one number written into zeros."""
-    numbers = torch.zeros_like(w)
-    numbers[-1] = 0.25
-    return numbers
-
-
-def measure_scan():
-    """What the test above needs to know."""
-    w, t, dt, x = (torch.tensor(y).double() for y in ([1.5, 0.5], [0.0, 1.0, 2.0], [1.0] * 3, [1.0] * 2))
-    prepare = trace(lambda w: (2 * w + assigned(w),), (w,))
-    step = trace(lambda w, t, dt, x, shared: (torch.sin(shared * x) + t * dt, 2 * x, w + x), (w, t[0], dt[0], x, w))
-    scan, arguments = compilation.Scan(prepare, step, 1), [w, t, dt, x]
-    before = compilation.file_of(scan, arguments).is_file()
-    with torch.no_grad():
-        code = compilation.compiled(scan, arguments)
-        error, difference = (
-            max(float((a - b).abs().max()) for a, b in zip(code(*given), scan.loop(*arguments), strict=True))
-            for given in (arguments, [2 * w, t, dt, x])
-        )
-    after = compilation.file_of(scan, arguments).is_file()
-    found = {"before": before, "after": after, "error": error, "difference_with_another_weight": difference}
-    print(json.dumps({**found, **measure_what_is_refused(compilation.file_of(scan, arguments), scan, arguments)}))
-
-
-def measure_what_is_refused(path, scan, arguments):
-    """Whether a changed file is taken for missing, where there is no compiler to replace it; and a folder's refusal."""
-    whole, digest = path.read_bytes(), path.with_suffix(".sha256").read_text()
-    compilation.has_compiler = lambda: False
-
-    def refusal():
-        try:
-            compilation.compiled(scan, arguments)
-        except CompilationError as error:
-            return str(error)
-        return ""
-
-    middle = len(whole) // 2
-    changes = {
-        "flipped": lambda: path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :]),
-        "exchanged": lambda: path.write_bytes(b"PK evil"),
-        "writable": lambda: path.chmod(0o620),
-        "without a digest": lambda: path.with_suffix(".sha256").unlink(),
-    }
-    found: dict = {"twice": refusal() == "", "refused": {}}
-    for name, change in changes.items():
-        change()
-        found["refused"][name] = "compiler" in refusal() and not path.exists()
-        path.write_bytes(whole)
-        path.chmod(0o600)
-        path.with_suffix(".sha256").write_text(digest)
-        assert refusal() == "", "the twin"
-    path.parent.chmod(0o770)
-    found["folder"] = refusal()
-    return found
+@pytest.mark.parametrize("change", ["cut short", "exchanged", "without a digest"])
+def test_a_file_that_changed_is_compiled_again(change, source, cache, caplog):
+    path = compilation.file_of_library("some", (source,))
+    compilation.library_of("some", (source,))
+    whole = path.read_bytes()
+    path.unlink()  # the code that runs here keeps its file
+    path.write_bytes({"cut short": whole[:100], "exchanged": b"another", "without a digest": whole}[change])
+    path.chmod(0o600)
+    if change == "without a digest":
+        path.with_suffix(".sha256").unlink()
+    assert compilation.library_of("some", (source,)).number() == 7
+    assert path.read_bytes()[:4] == whole[:4]
+    (note,) = (record.getMessage() for record in caplog.records if record.name.startswith("lyapnet"))
+    assert str(path) in note
+    caplog.clear()
+    assert ctypes.CDLL(str(path)).number() == compilation.library_of("some", (source,)).number() == 7
+    assert not caplog.records, "the twin: as it is now"
 
 
 def test_a_loop_that_cannot_be_traced_says_so(monkeypatch):
@@ -132,57 +86,24 @@ def test_a_loop_that_cannot_be_traced_says_so(monkeypatch):
 
 
 def test_without_a_compiler_there_is_no_machine_code(monkeypatch):
-    monkeypatch.setattr(libraries, "has_compiler", lambda: False)
+    monkeypatch.setattr(compilation, "has_compiler", lambda: False)
     kernel.library.cache_clear()
     with pytest.raises(CompilationError, match="got none"):
         rollout_of().discrete.compile(torch.zeros(3, 2))
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o720, 0o702])
-def test_folder_that_others_can_write_is_refused(mode, cache):
-    graph = trace(lambda x: (torch.sin(x),), (torch.zeros(3),))
+def test_folder_that_others_can_write_is_refused(mode, source, cache):
     cache.mkdir()
     cache.chmod(mode)
     with pytest.raises(CompilationError, match="only you can write") as raised:
-        compilation.compiled(graph, [torch.zeros(3)])
+        compilation.library_of("some", (source,))
     assert str(cache) in str(raised.value)
     assert "chmod go-w" in str(raised.value)
 
 
-def test_folder_of_another_user_is_refused(cache, monkeypatch):
-    graph = trace(lambda x: (torch.sin(x),), (torch.zeros(3),))
+def test_folder_of_another_user_is_refused(source, cache, monkeypatch):
     cache.mkdir(mode=0o700)
     monkeypatch.setattr(compilation.os, "getuid", lambda: cache.stat().st_uid + 1)
     with pytest.raises(CompilationError, match="only you can write"):
-        compilation.compiled(graph, [torch.zeros(3)])
-
-
-def test_a_file_of_machine_code_that_was_cut_short_is_replaced(cache, no_compiler, caplog):
-    """Without a compiler, it is missed instead."""
-    x = torch.zeros(3)
-    graph = trace(lambda x: (torch.sin(x),), (x,))
-    cache.mkdir(mode=0o700)
-    path = compilation.file_of(graph, [x])
-    path.write_bytes(b"PK\x03\x04 cut short")
-    with pytest.raises(CompilationError, match=r"C\+\+ compiler"):
-        compilation.compiled(graph, [x])
-    assert not path.exists()
-    (note,) = (record.getMessage() for record in caplog.records if record.name.startswith("lyapnet"))
-    assert str(path) in note
-    assert "\n" not in note
-
-
-@pytest.mark.parametrize("change", ["constant", "operation", "shape", "dtype"])
-def test_other_functions_and_arguments_have_files_of_their_own(change, cache):
-    def file(weight=2.0, operation=torch.sin, x=torch.zeros(3)):  # noqa: B008
-        weight = torch.tensor(weight)
-        return compilation.file_of(trace(lambda x: (operation(x) * weight.to(x),), (x,)), [x])
-
-    others = {"constant": {"weight": 3.0}, "operation": {"operation": torch.cos}, "shape": {"x": torch.zeros(4)},
-              "dtype": {"x": torch.zeros(3).float()}}  # fmt: skip
-    assert file() == file()
-    assert file() != file(**others[change])
-
-
-if __name__ == "__main__":
-    measure_scan()
+        compilation.library_of("some", (source,))

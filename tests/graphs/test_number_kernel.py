@@ -11,11 +11,12 @@ from torch.testing import assert_close
 import lyapnet
 from lyapnet.calculus import ValueFunction
 from lyapnet.config import config_from_plain
-from lyapnet.graphs.compilation import Scan, has_compiler
+from lyapnet.graphs.compilation import has_compiler
 from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.kernel import SOURCE, NumberKernel, ScanKernel
 from lyapnet.graphs.number_kernel.program import OPERATIONS
 from lyapnet.graphs.number_kernel.rewriting import rewritten
+from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
 from lyapnet.networks import FCN, NETWORKS
 from tests.configs import objects

@@ -13,7 +13,7 @@ from rich.console import Console
 from lyapnet.calculus import ValueFunction
 from lyapnet.cli import main
 from lyapnet.errors import CompilationError
-from lyapnet.graphs import libraries
+from lyapnet.graphs import compilation
 from lyapnet.graphs.number_kernel import kernel
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.training.compilation import Compilation
@@ -33,7 +33,7 @@ def _cache(tmp_path, monkeypatch):
 
 
 def test_without_a_compiler_a_run_says_so_and_goes_on(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(libraries, "has_compiler", lambda: False)
+    monkeypatch.setattr(compilation, "has_compiler", lambda: False)
     kernel.library.cache_clear()
     arguments = ["train", "--config", str(CONFIG), *SHORT, f"logs={tmp_path}", "rollout.compile=on"]
     assert main(arguments) == 0
@@ -50,7 +50,7 @@ def machine_code(monkeypatch):
 
     asked = Asked()
 
-    def compile(self, x0, theta=None):
+    def compile(self, x0):
         asked.append(tuple(x0.shape))
         if asked.failure:
             raise CompilationError(asked.failure)

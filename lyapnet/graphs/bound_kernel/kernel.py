@@ -15,7 +15,7 @@ from torch import Tensor
 from lyapnet.errors import CompilationError
 from lyapnet.graphs.bound_kernel.program import Entry, Program, Support
 from lyapnet.graphs.bound_kernel.writing import written
-from lyapnet.graphs.libraries import library_of
+from lyapnet.graphs.compilation import library_of
 from lyapnet.graphs.taylor import TaylorForm
 from lyapnet.types import Corners
 

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.errors import LyapnetError
-from lyapnet.graphs.compilation import Scan
-from lyapnet.graphs.libraries import file_of_library, library_of
+from lyapnet.graphs.compilation import file_of_library, library_of
 from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
 from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
+from lyapnet.graphs.scan import Scan
 
 SOURCE = Path(__file__).with_name("program.cpp")
 CHECKED = 2  # steps of a scan that are held against torch

@@ -83,7 +83,12 @@ class ContinuedValue(ValueFunction):
 
     def forward(self, t: Time, x: State) -> PerState:
         late = is_after(t, self.sequel.duration)
-        return self.at_any_time(t, x) if late.any() else self.V(t, x)
+        if not late.any():
+            return self.V(t, x)
+        if late.all() and self.sequel.beyond == "riccati":
+            assert self.sequel.regulator is not None
+            return self.sequel.regulator.cost(x)
+        return self.at_any_time(t, x)
 
     def at_any_time(self, t: Time, x: State) -> PerState:
         """The same by one course for all t, to be traced."""
@@ -120,10 +125,14 @@ class ContinuedPolicy(ValuePolicy):
         return self.sequel.beyond
 
     def forward(self, t: Time, x: State) -> Control:
-        if not is_at_end(t, self.sequel.duration).any():
+        late = is_at_end(t, self.sequel.duration)
+        if not late.any():
             return self.policy(t, x)
         if bool(is_after(t, self.sequel.duration).any()):
             self.sequel.note_once()
+        if late.all() and self.beyond == "riccati":
+            assert self.sequel.regulator is not None
+            return self.sequel.regulator(x)
         return self.at_any_time(t, x)
 
     def at_any_time(self, t: Time, x: State) -> Control:

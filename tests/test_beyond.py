@@ -89,6 +89,25 @@ def test_a_horizon_that_recedes_begins_at_every_step(law, logged):
     assert not logged()
 
 
+def test_after_the_end_the_regulator_alone_is_asked():
+    asked, problem = [], problem_of(DoubleIntegrator())
+
+    def value(t, x):
+        asked.append(float(t.detach().max()))
+        return (2 - t) * (x**2).sum(-1)
+
+    V = Formula(value)
+    own = Controller(problem, V, Rollout(problem, HJBPolicy(problem, V), gradient="backprop"), beyond="riccati")
+    own.rollout(X, steps=3 * problem.horizon.steps)
+    assert asked
+    assert max(asked) <= T
+    asked.clear()
+    times = torch.tensor([0.5, 2.0])
+    assert_close(own.law(times, X)[1], own.law(times[1], X[1]))
+    assert_close(own.law(times, X)[0], own.law(times[0], X[0]))
+    assert asked, "one of the times is before T"
+
+
 def test_an_error_where_one_is_asked_for():
     own = controller("error")
     own.policy(T, X)

@@ -105,30 +105,39 @@ class DiscreteAdjoint:
         """Run by the machine code of a loop that differs in tensors alone, if it has some and agrees on a few steps.
 
         What a trace has frozen, a number or a tensor that no buffer holds, may be another one here: both are asked for
-        FEW steps from states around x₀ and for their gradient.
+        FEW steps from states around x₀ and, where something is trained, for their gradient. A loop of which nothing is
+        trained takes the code of one of which everything is: its tensors are in the same order.
         """
         x0 = other._compiled
         routines = None if x0 is None else other._routines.get(other._key(x0))
-        if x0 is None or routines is None or other._key(x0) != self._key(x0):
+        if x0 is None or routines is None:
             return False
-        theta, spread = self.trained(), torch.linspace(0.9, 1.1, x0.numel()).to(x0).reshape(x0.shape)
-        first = spread * x0 + 0.1 * (spread - 1)
-        results = [self._few_steps(each, first, theta) for each in (routines, self._as_written(x0))]
+        flags, of_other = ([p.requires_grad for p in each.loop.parameters()] for each in (self, other))
+        if flags != of_other and (any(flags) or not all(of_other)):
+            return False
+        spread = torch.linspace(0.9, 1.1, x0.numel()).to(x0).reshape(x0.shape)
+        start = spread * x0 + 0.1 * (spread - 1)
+        try:
+            found, expected = (self._few_steps(each, start) for each in (routines, self._as_written(x0)))
+        except (RuntimeError, ValueError):  # tensors of other shapes, or on another device
+            return False
         half = torch.finfo(x0.dtype).eps ** 0.5
-        for found, expected in zip(*results, strict=True):
-            scale = float(expected.nan_to_num(0, 0, 0).abs().max()) if expected.numel() else 0.0
-            if not torch.allclose(found, expected, rtol=half, atol=half * scale, equal_nan=True):
+        for mine, theirs in zip(expected, found, strict=True):
+            scale = float(mine.nan_to_num(0, 0, 0).abs().max()) if mine.numel() else 0.0
+            if not torch.allclose(theirs, mine, rtol=half, atol=half * scale, equal_nan=True):
                 return False
         self._take_compiled(routines, x0)
         return True
 
-    def _few_steps(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> list[Tensor]:
-        """The first FEW nodes from x₀, and the gradient of the sum of their x, ∫ℓ and V."""
-        t, dt = (column[:FEW] for column in self._grid(x0, self.steps + 1))
+    def _few_steps(self, routines: Routines, x0: State) -> list[Tensor]:
+        """The first FEW nodes from x₀ and, of what is trained, the gradient of the sum of their x, ∫ℓ and V."""
+        state, (t, dt) = self._state(self.trained()), (column[:FEW] for column in self._grid(x0, self.steps + 1))
         with torch.no_grad():
-            nodes = Nodes(*routines.integrate(*self._state(theta), t, dt, x0))
+            nodes = Nodes(*routines.integrate(*state, t, dt, x0))
+        if not self.trained():
+            return [*nodes]
         ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
-        x0_bar, theta_bar = routines.gradient(self._state(theta), Columns(t, dt, nodes.stages, *ones))
+        x0_bar, theta_bar = routines.gradient(state, Columns(t, dt, nodes.stages, *ones))
         return [*nodes, x0_bar, *theta_bar]
 
     def _take_compiled(self, routines: Routines, x0: State) -> None:

@@ -19,6 +19,7 @@ from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
 from lyapnet.networks import FCN, NETWORKS
+from lyapnet.rollout import Rollout
 from tests.configs import objects
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
@@ -396,6 +397,39 @@ def test_closed_loops_and_their_gradient(law, changed):
         for parameter in rollout.parameters():
             parameter.mul_(1.1)
         assert float((rollout(others).x - plain.x).abs().max()) > 1e-6, "the twin: weights are read at each call"
+
+
+def freeze(*parameters):
+    for parameter in parameters:
+        parameter.requires_grad_(False)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "change", "shared"),
+    [
+        ([], lambda loop: None, True),
+        ([], lambda loop: freeze(*loop.parameters()), True),
+        ([], lambda loop: freeze(next(loop.parameters())), False),
+        (["cost.R=[0.2]"], lambda loop: None, True),
+        (["system.parameters.length=0.8"], lambda loop: None, False),
+        (["rollout.policy=sampled"], lambda loop: None, False),
+        (["network.hidden=[8]"], lambda loop: None, False),
+    ],
+)
+def test_a_loop_takes_the_code_of_one_that_differs_in_tensors_alone(overrides, change, shared):
+    (rollout, problem), (other, _) = rollout_of(), rollout_of(*overrides)
+    x0 = problem.initial_states.sample(12)
+    rollout.discrete.compile(x0)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.mul_(1.1)
+    change(other.discrete.loop)
+    assert other.discrete.share_code(rollout.discrete) is shared
+    written = Rollout(other.problem, other.closed_loop.policy, gradient="backprop")
+    with torch.no_grad():
+        for start in (x0, 0.5 * x0[:5]):
+            assert_close(other(start).x, written(start).x, rtol=1e-9, atol=1e-9)
+        assert float((rollout(x0).x - other(x0).x).abs().max()) > 1e-6, "the twin: they are two loops"
 
 
 class Sorting(FCN):

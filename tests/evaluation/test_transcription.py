@@ -13,10 +13,11 @@ from lyapnet.build import build_problem
 from lyapnet.config import load_config
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import OracleError
-from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of
-from lyapnet.evaluation.oracles.multistart import EXPLORED, Candidate, MultiStart
+from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of, transcription
+from lyapnet.evaluation.oracles.multistart import AGAIN, EXPLORED, Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.horizon import Horizon
+from lyapnet.sets import Box
 from lyapnet.systems import Cartpole, DoubleIntegrator, Linear, Reacher
 from tests.problems import problem_of
 
@@ -215,6 +216,33 @@ def test_where_the_first_states_have_one_minimum_the_others_follow_their_neighbo
     assert {candidate.cost for candidate in search.best} == {1.0 if basins == 2 else 2.0}
     assert all(count == 1 for i, count in tried.items() if i >= EXPLORED) is (basins == 1)
     assert all(tried[i] > 1 for i in range(EXPLORED))
+
+
+def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch):
+    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    oracle, box = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
+    counts, minimise, tried = Counter(), Transcription.minimise, 0
+
+    def counted(self, *arguments):
+        counts[tried] += 1
+        return minimise(self, *arguments)
+
+    monkeypatch.setattr(Transcription, "minimise", counted)
+    batches = [box.sample(20, torch.Generator().manual_seed(seed)) for seed in (0, 1)]
+    for x0 in batches:
+        optima = oracle.solve(x0)
+        tried += 1
+    assert counts[1] <= counts[0] - (EXPLORED - AGAIN)
+    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    monkeypatch.setenv("LYAPNET_CACHE", f"{oracle.cache.folder}_empty")
+    again, _ = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
+    assert_close(again.solve(batches[1]).cost, optima.cost, rtol=1e-7, atol=0)
+    assert counts[2] == pytest.approx(counts[0], abs=2 * EXPLORED), "the twin: explored anew"
+    assert counts[2] > counts[1]
+    narrower = oracle.problem.replaced(initial_states=Box(0.5 * box.lower, 0.5 * box.upper))
+    tried += 1
+    Transcription(narrower).solve(0.5 * batches[0])
+    assert counts[3] > counts[1], "of another X₀"
 
 
 def test_known_controls_that_cost_less_are_tried_from_any_state():

@@ -13,6 +13,7 @@ from lyapnet.evaluation.oracles.base import Report
 HOPELESS = 8  # failures from the first states on, after which there is nothing to be expected for the others
 SECONDS = 15.0  # of the starts of one state, after which no further one is made
 EXPLORED = 16  # first states on which all starts are tried, before it is judged whether there are several minima
+AGAIN = 4  # the same, where an earlier batch of the same X₀ has shown one minimum from each of its states
 NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
 SAME = 1e-6  # relative difference of two costs that are the same
 
@@ -36,8 +37,8 @@ class MultiStart:
     """The best candidate of each initial state, improved start by start.
 
     Which local minimum a start leads to is luck, but the least cost is continuous in x₀: what was found from one state
-    is the first start of those after it that are near. Of the first EXPLORED states all starts are tried, and what was
-    found from the states around. Where none of them improves on a minimum that is known, the other states have that
+    is the first start of those after it that are near. Of the first `explored` states all starts are tried, and what
+    was found from the states around. Where none of them improves on a minimum that is known, the other states have that
     first start alone, and those that cost less than where it led. Else they have all of them too, and in the end what
     was found from one state is tried from the states around it, and from theirs, as long as that improves any.
 
@@ -45,6 +46,7 @@ class MultiStart:
         x0: (b, n).
         best: what is known already, one entry for each state.
         minimise: (x₀, start, briefly) ↦ the local minimum, or why there is none; briefly where one is known already.
+        explored: how many of the first states are explored.
     """
 
     def __init__(
@@ -52,8 +54,9 @@ class MultiStart:
         x0: np.ndarray,
         best: Sequence[Candidate | None],
         minimise: Callable[[np.ndarray, Candidate, bool], Candidate | str],
+        explored: int = EXPLORED,
     ):
-        self.x0, self.best, self.minimise = x0, list(best), minimise
+        self.x0, self.best, self.minimise, self.explored = x0, list(best), minimise, explored
         self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
         self.several = False  # whether a start has improved on a minimum that was known
         self._tried = dict[tuple[int, int], Candidate]()  # by state and identity, as no start is tried twice
@@ -76,7 +79,7 @@ class MultiStart:
             began, solved = time.monotonic(), [j for j in starts if j != i and self.best[j] is not None]
             if solved:  # the optimum of the nearest of them, from where IPOPT most often has the shortest way
                 self._try(i, self.best[solved[int(self._distances(i)[solved].argmin())]])
-            is_enough = done >= EXPLORED and not self.several and self.best[i] is not None
+            is_enough = done >= self.explored and not self.several and self.best[i] is not None
             for start in own:
                 if not is_enough or is_better(start, self.best[i]):
                     self._try(i, start)
@@ -84,8 +87,8 @@ class MultiStart:
                     break
             failures = failures + 1 if self.best[i] is None and failures == done else -1
             last = self.reasons[i]
-            if done == min(EXPLORED, len(starts)) - 1:
-                explored = [*starts][:EXPLORED]
+            if done == min(self.explored, len(starts)) - 1:
+                explored = [*starts][: self.explored]
                 self._exchange(explored, explored)
         if self.several and time.thread_time() <= until:
             self._exchange(starts, range(len(self.x0)))

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr
 from io import StringIO
+from typing import Any
 
 import casadi
 import numpy as np
@@ -19,7 +20,7 @@ from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
-from lyapnet.evaluation.oracles.multistart import EXPLORED, SAME, Candidate, MultiStart, is_better
+from lyapnet.evaluation.oracles.multistart import AGAIN, EXPLORED, SAME, Candidate, MultiStart, is_better
 from lyapnet.evaluation.oracles.scales import Scales
 from lyapnet.problem import Problem
 from lyapnet.types import ControlPath, PerState, State, StatePath
@@ -33,6 +34,7 @@ INVALID = "IPOPT: Invalid_Number_Detected"
 WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
 BRIEF = 150  # iterations of further starts, where one has led to a minimum
+_WITH_ONE_MINIMUM = set[tuple[Any, ...]]()  # tasks and their X₀, of which this process has explored a batch
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each
 
 
@@ -68,6 +70,8 @@ class Transcription(Oracle):
         system, horizon = self.problem.system, self.problem.horizon
         self.task = CasadiTask(self.problem)
         self.cache = OptimaCache(self.task.graphs, horizon.steps, system.m, self.problem.controls)
+        box = self.problem.initial_states
+        self._where = self.cache.folder.name, *box.lower.tolist(), *box.upper.tolist()
         self._stopped = False
         limits = self.problem.controls.limits
         domain = self.problem.domain
@@ -109,13 +113,18 @@ class Transcription(Oracle):
         stored = self._replayed(states, [self.cache.read(x) for x in states])
         within = None if known is None else self.problem.controls.project(known.detach().double().cpu())
         given = self._replayed(states, nothing if within is None else within.unbind(1))
-        search = MultiStart(states.numpy(), stored, self.minimise)
+        explored = AGAIN if self._where in _WITH_ONE_MINIMUM else EXPLORED
+        search = MultiStart(states.numpy(), stored, self.minimise, explored)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
-            explored = [pending[len(pending) * k // EXPLORED] for k in range(min(EXPLORED, len(pending)))]
-            pending = [*explored, *(i for i in pending if i not in explored)]
+            first = [pending[len(pending) * k // explored] for k in range(min(explored, len(pending)))]
+            pending = [*first, *(i for i in pending if i not in first)]
             starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
             self._search(search, starts, progress, time.thread_time() + seconds)
+            if search.several:
+                _WITH_ONE_MINIMUM.discard(self._where)
+            elif len(pending) >= EXPLORED and all(search.best[i] is not None for i in pending[:explored]):
+                _WITH_ONE_MINIMUM.add(self._where)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:

@@ -110,7 +110,7 @@ class DiscreteAdjoint:
         """
         x0 = other._compiled
         routines = None if x0 is None else other._routines.get(other._key(x0))
-        if x0 is None or routines is None:
+        if x0 is None or routines is None or self.costate_limit != other.costate_limit:
             return False
         flags, of_other = ([p.requires_grad for p in each.loop.parameters()] for each in (self, other))
         if flags != of_other and (any(flags) or not all(of_other)):

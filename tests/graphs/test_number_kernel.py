@@ -414,6 +414,8 @@ def freeze(*parameters):
         (["system.parameters.length=0.8"], lambda loop: None, False),
         (["rollout.policy=sampled"], lambda loop: None, False),
         (["network.hidden=[8]"], lambda loop: None, False),
+        (["rollout.method=rk4"], lambda loop: None, False),
+        (["rollout.costate_limit=5"], lambda loop: None, False),
     ],
 )
 def test_a_loop_takes_the_code_of_one_that_differs_in_tensors_alone(overrides, change, shared):

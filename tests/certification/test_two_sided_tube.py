@@ -17,6 +17,8 @@ from tests.certification.test_least_cost import optimum, problem
 from tests.problems import Formula
 from tests.runs import tiny_checkpoint
 
+pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+
 BETA, DELTA = 0.98, 0.005
 
 

@@ -7,7 +7,7 @@ one step or one block of steps.
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -135,8 +135,12 @@ class DiscreteAdjoint:
 
     def integrate(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> Nodes:
         """The path from x₀; its last node takes a step of length zero, which makes it a node like the others."""
+        return self._nodes(routines.integrate, x0, theta)
+
+    def _nodes(self, path: Callable[..., Sequence[Tensor]], x0: State, theta: Sequence[Tensor]) -> Nodes:
+        """What the `integrate` of routines leaves."""
         with torch.no_grad():
-            return Nodes(*routines.integrate(*self._state(theta), *self._grid(x0, self.steps + 1), x0))
+            return Nodes(*path(*self._state(theta), *self._grid(x0, self.steps + 1), x0))
 
     def gradient(
         self, routines: Routines, theta: Sequence[Tensor], stages: StagePath, bars: Sequence[Tensor]
@@ -158,8 +162,8 @@ class DiscreteAdjoint:
             or self._key(self._compiled) not in self._routines  # other parameters were trained then
             or self._key(self._compiled[..., 0, :]) != self._key(x0[..., 0, :])
         ):
-            routines = self._as_written(x0) if x0.ndim == 2 else self.routines(x0, theta)
-            return self.integrate(routines, x0, theta)
+            path = self._as_written(x0).integrate if x0.ndim == 2 else self._work(x0, theta).forwards()
+            return self._nodes(path, x0, theta)
         size, batch = self._compiled.shape[-2], x0.shape[-2]
         full = torch.cat([x0, x0[..., -1:, :].expand(*x0.shape[:-2], -batch % size, x0.shape[-1])], -2)
         routines = self._routines[self._key(self._compiled)]

@@ -77,13 +77,21 @@ class TracedRoutines:
         """
         _ = self._forwards, self._backwards
 
+    def forwards(self) -> Callable[..., Sequence[Tensor]]:
+        """`integrate` of the graphs, for what asks for no gradient: nothing is traced backwards.
+
+        Raises:
+            UntraceableError: its control flow depends on tensor values, or it leaves torch.
+        """
+        return self._scan().loop
+
     def traced(self) -> Routines:
         """The graphs, replayed operation by operation.
 
         Raises:
             UntraceableError: as require_traces.
         """
-        return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
+        return Routines(self.forwards(), BlockwiseGradient(*self._block_pieces, self.block, self.limit))
 
     def compiled(self) -> Routines:
         """The graphs as machine code: on a CPU run by lyapnet's own kernel, on a GPU compiled for this task.

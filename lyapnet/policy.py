@@ -179,6 +179,8 @@ class LookaheadPolicy(SampledPolicy):
             u = super().forward(t, x)
             for _ in range(DESCENTS if self.problem.constraints is None else STEEP):
                 u = step.descended(u, H)
+        if not torch.is_grad_enabled():
+            return u
         moved = step.newton(u, H)
         return u + (moved - moved.detach())
 

@@ -8,7 +8,7 @@ import operator
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import field
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar, get_args
@@ -117,7 +117,7 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
                     raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
         written, given = layers
         layers = [_without_other_kinds(written, given, schema), given]
-        merged = OmegaConf.merge(OmegaConf.structured(schema), *(OmegaConf.create(layer) for layer in layers))
+        merged = OmegaConf.merge(_defaults(schema), *(OmegaConf.create(layer) for layer in layers))
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise UsageError(_explain(error, schema)) from error
@@ -129,6 +129,12 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
         raise UsageError(f"Expected a YAML value after =, got {one_line(' '.join(overrides))!r}; quote it.") from error
     assert isinstance(config, schema)
     return config
+
+
+@cache
+def _defaults(schema: type) -> Any:
+    """The fields of a schema with their types and defaults, which what is merged into is a copy of."""
+    return OmegaConf.structured(schema)
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:

@@ -1,6 +1,7 @@
 """Shared by all tests: shapes checked, float64, fixed seeds, every registered system and its task."""
 
 import functools
+import gc
 import importlib
 import inspect
 import logging
@@ -52,6 +53,8 @@ def _of_any_size(arguments):
     """Whether one of them is a batch whose size has no value, which jaxtyping would ask for."""
     return any(isinstance(each, torch.Tensor) and torch.SymInt in map(type, each.shape) for each in arguments)
 
+
+gc.set_threshold(10_000, 10, 5)  # by default a tenth of all time goes to the search for garbage
 
 # What lyapnet imports first within its own modules would be compiled, and kept on disk, once more for the hook below.
 for library in ("beartype.typing", "scipy.integrate", "scipy.linalg", "scipy.optimize", "torch._dynamo"):
@@ -186,6 +189,12 @@ LONG = (
 def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that no process is left alone with one of them."""
     items.sort(key=lambda item: item.path.name not in LONG)
+
+
+def pytest_collection_finish():
+    """What was imported stays, and is not searched for garbage."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")

@@ -49,7 +49,7 @@ _server.set_forkserver_preload(
 
 def tiny_checkpoint(folder):
     """The best checkpoint of a double integrator that was trained for two iterations."""
-    changes = [f"logs={folder}", "network.hidden=[8]", *TINY]
+    changes = [f"logs={folder}", "network.hidden=[8]", "rollout.gradient=backprop", *TINY]
     assert main(["train", "--config", "conf/from_scratch/double_integrator.yaml", *changes]) == 0
     return folder / "double_integrator_from_scratch/version_0/checkpoints/best.ckpt"
 

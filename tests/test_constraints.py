@@ -38,7 +38,7 @@ INTEGRATOR = {
     "horizon": {"steps": 40, "dt": 0.05},
 }
 SPEED = {"lower": {"velocity": -0.5}, "upper": {"velocity": 0.5}}
-BRIEF = ["training.iterations=2", "training.validate_every=1", "rollout.compile=off", "evaluation.test_states=8",
+BRIEF = ["training.iterations=2", "training.validate_every=1", "rollout.gradient=backprop", "evaluation.test_states=8",
          "evaluation.validation_states=4"]  # fmt: skip
 
 

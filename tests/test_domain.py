@@ -239,7 +239,7 @@ def written_to(tmp_path, **changes):
 
 
 def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
-    assert main(["train", "--config", written_to(tmp_path), "rollout.compile=off"]) == 0
+    assert main(["train", "--config", written_to(tmp_path), "rollout.gradient=backprop"]) == 0
     result = json.loads((tmp_path / "logs/economy/version_0/evaluation.json").read_text())
     assert 0 <= result["left_domain_fraction"] <= 1
     assert result["cost_mean"] < 0, "none goes far"

@@ -116,7 +116,7 @@ def test_it_trains_and_comes_back(tmp_path, monkeypatch):
     shorten_fits(monkeypatch, 260, 140)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
-             "rollout.compile=off"]  # fmt: skip
+             "rollout.gradient=backprop"]  # fmt: skip
     run = lyapnet.train({**made(periodic=["angle"], obstacles=[BUMP]), "logs": str(tmp_path)}, brief)
     assert run.evaluation["cost_ratio"] < 1.1
     controller = lyapnet.load(run.best)

@@ -27,6 +27,10 @@ CHAIN = {
     "initial_states": {"lower": [-1, -1, -1], "upper": [1, 1, 1]},
     "horizon": {"steps": 200, "dt": 0.05, "stationary": True},
 }
+QUICK = [
+    *("training.iterations=1", "rollout.compile=off", "loggers=[csv]", "evaluation.optimum=false"),
+    *("evaluation.validation_states=4", "evaluation.test_states=4"),
+]
 PENDULUM = CHAIN | {
     "system": {"name": "pendulum", "parameters": {"damping": 0.1}},
     "cost": {"Q": [1, 0.1], "R": 0.5, "huber": 1.0},
@@ -220,6 +224,7 @@ def test_any_other_network_is_read_at_one_time():
     assert isinstance(build_value_function(config, build_problem(config)), Timeless)
 
 
+@pytest.mark.usefixtures("few_optima")
 def test_the_regulator_of_a_linear_system_is_known_before_training():
     (learner,) = build_module(config_from_plain(CHAIN)).members
     start = choose_start([learner])
@@ -271,7 +276,7 @@ def few_optima(monkeypatch):
 @pytest.mark.usefixtures("few_optima")
 def test_a_checkpoint_is_loaded_with_its_tail(tmp_path):
     own = CHAIN | {"logs": str(tmp_path), "trainer": {"accelerator": "cpu"}}
-    run = train(config_from_plain(own, ["training.iterations=1", "training.warmup=0", "rollout.compile=off"]))
+    run = train(config_from_plain(own, [*QUICK, "training.warmup=0"]))
     controller = load(run.best)
     assert controller.horizon.stationary
     assert controller.after_horizon() == AfterHorizon("hold", 64, 64), "one law for ever"

@@ -196,7 +196,7 @@ def test_fine_tuning_to_another_target_is_no_silent_matter(tmp_path, monkeypatch
     shorten_fits(monkeypatch, 130, 70)
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
     brief = ["training.iterations=1", "evaluation.test_states=2", "evaluation.validation_states=2", "loggers=[csv]",
-             "rollout.compile=off", "evaluation.optimum=false"]  # fmt: skip
+             "rollout.gradient=backprop", "evaluation.optimum=false"]  # fmt: skip
     task = {**MINE, "logs": str(tmp_path)}
     run = lyapnet.train(task, brief)
 

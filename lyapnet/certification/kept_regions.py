@@ -31,11 +31,26 @@ class KeptRegion(NamedTuple):
     rho: float  # the level that is proved, as it says
     seconds: float  # of the search
 
-    def require(self, decay: float, states: Box, disturbance: State | None, parameters: Sequence[str] = ()) -> None:
-        """Refuse another λ, D, P or w than those of the file.
+    def require(self, decay: float, disturbance: State | None, n: int, parameters: Sequence[str] = ()) -> None:
+        """Refuse another λ, w or other parameters than those of the file: before anything is traced.
 
         Args:
-            states, disturbance: beside the ends of P, and zeros.
+            disturbance: of n states, beside zeros.
+            parameters: their names.
+        """
+        if self.parameters.keys() != {*parameters}:
+            raise UsageError(f"Expected the parameters of {str(self.path)!r}, got others; {NEW_FILE}.")
+        if self.decay != decay:
+            raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
+        kept, given = (None if w is None else w.tolist() for w in (self.disturbance, disturbance))
+        if kept != (given and given[:n]):
+            raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
+
+    def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
+        """Refuse another D or P than those of the file.
+
+        Args:
+            states: beside the ends of P.
             parameters: their names, in order.
         """
         n = states.dimension - len(parameters)
@@ -43,12 +58,8 @@ class KeptRegion(NamedTuple):
                 for part in (slice(None, n), slice(n, None)))  # fmt: skip
         if self.parameters != dict(zip(parameters, map(list, zip(*P, strict=True)), strict=True)):
             raise UsageError(f"Expected the parameters of {str(self.path)!r}, got others; {NEW_FILE}.")
-        if self.decay != decay or [self.states.lower.tolist(), self.states.upper.tolist()] != D:
+        if [self.states.lower.tolist(), self.states.upper.tolist()] != D:
             raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
-        disturbance = None if disturbance is None else disturbance[:n]
-        kept, given = (None if w is None else w.tolist() for w in (self.disturbance, disturbance))
-        if kept != given:
-            raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
 
     def level(self, contracts: bool, rim: float) -> float:
         """The level that was tried, where V is above it on the boundary of D.

@@ -247,11 +247,13 @@ def region_claim(
         states, w = states and plants.around(states), None if w is None else plants.pushed(w)
     condition = RecedingDecrease(loop, decay, w, names)
     goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
+    if kept is not None:
+        kept.require(decay, w, n, names)
     setting = setting_of(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:
-        kept.require(decay, D, w, names)
+        kept.require_set(D, names)
     rim = _rim(condition.V, problem.constraints, domain, sides, for_levels(budget))
     contraction, slowest, level = _open(condition, goal, setting, seen, rim, budget, kept)
     proof, rho, set_up = None, -math.inf, budget.elapsed

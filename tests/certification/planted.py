@@ -1,5 +1,7 @@
 """What several tests of proofs share: a closed loop whose condition is known to hold, and violations planted in it."""
 
+from functools import cache
+
 import torch
 from scipy.linalg import solve_continuous_are
 
@@ -30,6 +32,11 @@ class Planted(DecreaseCondition):
 
 def riccati():
     """P of V = xᵀPx, the optimum of the double integrator on an infinite horizon."""
+    return _riccati().copy()  # as nobody may change it for the others
+
+
+@cache
+def _riccati():
     return solve_continuous_are([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], Q, [[1.0]])
 
 

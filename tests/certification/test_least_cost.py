@@ -26,6 +26,8 @@ from tests.certification.planted import X0, Q, riccati, stationary
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
+pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+
 DURATION, STEPS = 2.0, 200
 D = Box([-1.5, -2.5], [1.5, 2.5]).double()
 

@@ -24,6 +24,8 @@ from lyapnet.systems import ControlAffineSystem, DoubleIntegrator, Pendulum
 from tests.certification.planted import cost, riccati, stationary
 from tests.problems import Formula, problem_of
 
+pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+
 LAMBDA = 0.01 / 2  # 1 % of 1/T
 K0 = 2.0  # u = −K0 x of V = x² with R = ½, g = 1
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from functools import cache
 
 import pytest
@@ -25,6 +26,8 @@ from tests.certification.planted import Q, riccati, stationary
 from tests.certification.test_region import D, claimed, loop_of, plain_claim, problem
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
+
+pytestmark = pytest.mark.usefixtures("batch_sizes_once")
 
 W = torch.tensor([0.0, 0.2], dtype=torch.float64)
 LAMBDA = 0.01 / 2  # 1 % of 1/T
@@ -52,19 +55,20 @@ def highest_rise(w):
 
 def pushed(x, push, seconds=6.0, dt=2e-3, kind="worst"):
     """(the highest V, V in the end) of closed loops under u(0, x), by Euler steps, with pushes on the velocity."""
-    about, t, V = problem(), torch.zeros(()), stationary(riccati())
-    law, generator, highest = HJBPolicy(about, V), torch.Generator().manual_seed(0), -math.inf
+    about, t, V, X = problem(), torch.zeros(()), stationary(riccati()), P()
+    generator, highest = torch.Generator().manual_seed(0), torch.tensor(-math.inf)
+    assert torch.allclose(HJBPolicy(about, V)(t, x), -(x @ X)[:, 1:]), "the law in closed form"
     with torch.no_grad():
         for k in range(int(seconds / dt)):
-            highest = max(highest, float(V(t, x).max()))
-            w = {
-                "worst": (x @ P())[:, 1].sign(),
-                "constant": torch.ones(len(x)),
-                "resonant": torch.full((len(x),), math.copysign(1.0, math.sin(3.0 * k * dt))),
-                "random": 2 * torch.rand(len(x), generator=generator) - 1,
-            }[kind]
-            x = x + dt * (about.system.dynamics(x, law(t, x)) + w[:, None] * push)
-    return highest, V(t, x)
+            slope = x @ X
+            highest = torch.maximum(highest, (slope * x).sum(-1).max())
+            w = torch.full((len(x),), 1.0 if kind == "constant" else math.copysign(1.0, math.sin(3.0 * k * dt)))
+            if kind == "worst":
+                w = slope[:, 1].sign()
+            elif kind == "random":
+                w = 2 * torch.rand(len(x), generator=generator) - 1
+            x = x + dt * (about.system.dynamics(x, -slope[:, 1:]) + w[:, None] * push)
+    return float(highest), V(t, x)
 
 
 def start(claim):
@@ -215,17 +219,21 @@ def kept_at(path, w=W):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    path = tmp_path_factory.mktemp("kept") / "pushed.proof"
-    kept_at(path)
-    return path.read_bytes()
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kept")
+    kept_at(folder / "pushed.proof")
+    claimed(keep=folder / "plain.proof")
+    return folder
 
 
 @pytest.fixture
-def kept(whole, tmp_path):
-    path = tmp_path / "pushed.proof"
-    path.write_bytes(whole)
-    return path
+def kept(files, tmp_path):
+    return shutil.copy(files / "pushed.proof", tmp_path / "pushed.proof")
+
+
+@pytest.fixture
+def plain(files, tmp_path):
+    return shutil.copy(files / "plain.proof", tmp_path / "plain.proof")
 
 
 def checked(path):
@@ -258,16 +266,15 @@ def test_a_kept_proof_is_checked_with_its_disturbance(kept):
     assert checked(kept)["verdict"] == "certified", "the twin: what the tests compute anew is what the file says"
 
 
-def test_it_goes_on_by_the_same_disturbance_alone(kept, tmp_path):
+def test_it_goes_on_by_the_same_disturbance_alone(kept, plain):
     before = kept.read_bytes()
     for w in (0.5 * W, 2 * W, 0 * W, None):
         with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
             kept_at(kept, w)
     assert kept.read_bytes() == before
     assert kept_at(kept).rho == pushed_claim().rho
-    claimed(keep=tmp_path / "plain")
     with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
-        kept_at(tmp_path / "plain")
+        kept_at(plain)
 
 
 def set_of(**values):
@@ -319,11 +326,9 @@ def test_a_broken_file_is_refused(name, kept):
     assert "\n" not in result["reason"]
 
 
-def test_a_plain_proof_is_none_of_pushes(tmp_path):
-    path = tmp_path / "plain"
-    claimed(keep=path)
-    rewritten(path, set_of(disturbance=[0.0, 0.2]))
-    assert checked(path)["verdict"] == "refused"
+def test_a_plain_proof_is_none_of_pushes(plain):
+    rewritten(plain, set_of(disturbance=[0.0, 0.2]))
+    assert checked(plain)["verdict"] == "refused"
 
 
 # Pushes of several sizes

@@ -3,10 +3,12 @@
 import dataclasses
 import json
 import math
+from functools import partial
 
 import pytest
 import torch
 
+from lyapnet.certification import Budget
 from lyapnet.certification.tubes import two_sided
 from lyapnet.certification.tubes.two_sided import TwoSidedTube, two_sided_tube
 from lyapnet.cli import main
@@ -16,6 +18,8 @@ from tests.certification.planted import X0, riccati, stationary
 from tests.certification.test_least_cost import optimum, problem
 from tests.problems import Formula
 from tests.runs import tiny_checkpoint
+
+pytestmark = pytest.mark.usefixtures("batch_sizes_once")
 
 BETA, DELTA = 0.98, 0.005
 
@@ -55,9 +59,15 @@ def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
     assert result["optima_between"] == 1
 
 
-def test_a_value_that_is_too_high_is_no_bound(monkeypatch):
-    monkeypatch.setattr(two_sided, "FOR_TUBE", 1)  # as long as it takes: on a busy machine, more than half
-    certificate = both_sides(1.1, seconds=15)
+@pytest.fixture
+def few_boxes(monkeypatch):
+    """Of each side, whatever the seconds."""
+    monkeypatch.setattr(two_sided, "Budget", partial(Budget, boxes=300))
+
+
+@pytest.mark.usefixtures("few_boxes")
+def test_a_value_that_is_too_high_is_no_bound():
+    certificate = both_sides(1.1)
     assert certificate.claim.verdict == "certified", "the tube itself is none the worse"
     assert certificate.verdict != "certified"
     assert certificate.result["lower_reason"] is not None
@@ -83,12 +93,12 @@ def test_words_formulas_and_figure_are_about_both(riccatis):
     assert "from above / from below" in figure.get_suptitle()
 
 
-@pytest.mark.usefixtures("few_seconds_for_levels")
+@pytest.mark.usefixtures("few_seconds_for_levels", "few_boxes")
 def test_the_command(capsys, tmp_path):
     command = ["certify", "tube", str(tiny_checkpoint(tmp_path)), "--two-sided", "--beta", "0.8", "--delta", "0.5"]
     command += ["--set=-3:3,-4:4"]
     capsys.readouterr()
-    main([*command, "--seconds", "8", "--json", "--report", str(tmp_path / "r")])
+    main([*command, "--seconds", "60", "--json", "--report", str(tmp_path / "r")])
     result = json.loads(capsys.readouterr().out)
     assert result["kind"] == "tube"
     assert (result["beta"], result["delta"]) == (0.8, 0.5)

@@ -163,7 +163,13 @@ def test_the_optimum_is_not_sought_where_it_is_not_wanted(tmp_path, capsys):
 
 
 def test_disturbances_are_reported(tmp_path, capsys):
-    arguments = [*SMALL, "training.iterations=1", "training.batch_size=2", "rollout.compile=off", f"logs={tmp_path}"]
+    arguments = [
+        *SMALL,
+        "training.iterations=1",
+        "training.batch_size=2",
+        "rollout.gradient=backprop",
+        f"logs={tmp_path}",
+    ]
     assert main(["train", "--config", str(CONF / "from_scratch" / "double_integrator.yaml"), *arguments]) == 0
     path = str(tmp_path / "double_integrator_from_scratch" / "version_0" / "checkpoints" / "best.ckpt")
     capsys.readouterr()

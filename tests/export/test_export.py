@@ -37,6 +37,14 @@ KINDS = {
 }  # fmt: skip
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_steps():
+    """Of a law that looks ahead, each of which is traced and written."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lyapnet.policy.STEEP", 2)
+        yield
+
+
 def controller_of(kind, beyond=None):
     """A controller with random weights; none of them zero."""
     name, overrides = KINDS[kind]

@@ -93,14 +93,13 @@ def calls(operator, tries):
 
 def calling(operator, shape, extra, turns, constant):
     """A call on tensors of a shape; all but the first are constant, or none is."""
-    grid = torch.linspace(0.1, 0.9, torch.Size(shape).numel(), dtype=torch.float64)
+    grid = torch.linspace(0.1, 0.9, torch.Size(shape).numel(), dtype=torch.float64).reshape(shape)
+    middle, slope = 0.5 + grid, 1 - grid  # before it is traced: as few operators as there can be beside the one
+    slopes = slope, 0 * slope if constant else slope
 
     def call(t, x):
         point, positional, named = torch.cat([t[None], x]), [], {}
-        tensors = (
-            (0.5 + grid + (0.0 if constant and i else 1.0) * point[i % 3] * (1 - grid)).reshape(shape)
-            for i in itertools.count()
-        )
+        tensors = (middle + slopes[min(i, 1)] * point[i % 3] for i in itertools.count())
         for argument, turn in zip(operator._schema.arguments, turns, strict=True):
             given = argument.name == extra or not argument.has_default_value()
             value = value_of(argument, turn, tensors) if given else argument.default_value

@@ -18,7 +18,7 @@ from tests.fits import shorten_fits
 from tests.problems import Formula, problem_of
 
 FEW = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
-       "evaluation.optimum=false", "evaluation.animate=false", "rollout.compile=off"]  # fmt: skip
+       "evaluation.optimum=false", "evaluation.animate=false", "rollout.gradient=backprop"]  # fmt: skip
 
 
 TASK = {

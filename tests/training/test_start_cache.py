@@ -1,6 +1,7 @@
 """A start that was found is kept: the same task begins there at once, another one does not."""
 
 import math
+import shutil
 
 import pytest
 import torch
@@ -25,36 +26,67 @@ TASK = {
 }
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_optima():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lyapnet.training.start.OPTIMA", 6)
+        shorten_fits(patch, 20, 10)
+        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+        yield
+
+
 @pytest.fixture(autouse=True)
-def _few_optima(monkeypatch, tmp_path):
+def cache(monkeypatch, tmp_path):
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 6)
-    shorten_fits(monkeypatch, 20, 10)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    return tmp_path / "cache"
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    """The task's learners and their start, sought once, and the cache in which it is kept."""
+    folder = tmp_path_factory.mktemp("found")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LYAPNET_CACHE", str(folder))
+        return *begun(), folder
+
+
+@pytest.fixture
+def kept(found, cache):
+    """The same, with the start in the cache of a test."""
+    *begun_with, folder = found
+    shutil.copytree(folder, cache)
+    return begun_with
 
 
 @pytest.fixture
 def sought(monkeypatch):
-    """How often a start was sought."""
-    times, seek = [], start_cache.choose_start
-    monkeypatch.setattr(start_cache, "choose_start", lambda *told: times.append(1) or seek(*told))
-    return times
+    """The weights of the learners at each search for a start, which none of them finds."""
+    weights = []
+    monkeypatch.setattr(start_cache, "choose_start", lambda learners, *_: weights.append(weights_of(learners)))
+    return weights
+
+
+def weights_of(learners):
+    return [tensor.clone() for learner in learners for tensor in learner.V.state_dict().values()]
+
+
+def drawn(*overrides):
+    return list(build_module(config_from_plain(TASK, overrides)).members)
 
 
 def begun(*overrides):
-    members = list(build_module(config_from_plain(TASK, overrides)).members)
-    start = kept_or_chosen(members)
+    members = drawn(*overrides)
+    return members, kept_or_chosen(members)
+
+
+def test_the_same_task_begins_at_once_where_it_began(kept, sought):
+    (first, start), (again, at_once) = kept, begun()
     assert start is not None
-    return members, start
-
-
-def test_the_same_task_begins_at_once_where_it_began(sought):
-    (first, start), (again, kept) = begun(), begun()
-    assert len(sought) == 1
-    assert str(kept) == f"{start}; found by an earlier search"
-    assert kept.as_json() == start.as_json()
-    for one, other in zip(first[0].V.state_dict().values(), again[0].V.state_dict().values(), strict=True):
-        assert torch.equal(one, other)
+    assert not sought
+    assert str(at_once) == f"{start}; found by an earlier search"
+    assert at_once.as_json() == start.as_json()
+    assert all(map(torch.equal, weights_of(first), weights_of(again)))
+    assert not all(map(torch.equal, weights_of(drawn()), weights_of(again)))
 
 
 def test_facts_say_that_their_seconds_are_those_of_an_earlier_search():
@@ -72,23 +104,27 @@ def test_facts_say_that_their_seconds_are_those_of_an_earlier_search():
     ["seed=1", "cost.R=[0.2]", "horizon.steps=21", "controls.upper=2", "initial_states.upper=[1,0.6]",
      "system.parameters={length: 0.9}", "rollout.policy=lookahead", "network.hidden=[8]"],
 )  # fmt: skip
+@pytest.mark.usefixtures("kept")
 def test_another_one_does_not(change, sought):
     begun()
+    assert not sought
     begun(change)
-    assert len(sought) == 2
+    assert len(sought) == 1
 
 
 @pytest.mark.parametrize("damage", [b"", b"no archive", None])
+@pytest.mark.usefixtures("kept")
 def test_a_file_that_is_no_start_is_sought_again(damage, sought):
-    _, start = begun()
-    file = StartCache(list(build_module(config_from_plain(TASK)).members)).file
+    """From the weights as they were drawn."""
+    file = StartCache(drawn()).file
     assert file is not None
     file.write_bytes(file.read_bytes()[:-40] if damage is None else damage)
-    _, again = begun()
-    assert len(sought) == 2
-    assert again.chosen.cost == pytest.approx(start.chosen.cost)
+    begun()
+    (weights,) = sought
+    assert all(map(torch.equal, weights, weights_of(drawn())))
 
 
+@pytest.mark.usefixtures("kept")
 def test_what_training_starts_from_is_saved_before_anything_else(tmp_path, monkeypatch):
     """A run that is broken off before its first step leaves the controller that it would have begun with."""
 

@@ -17,7 +17,8 @@ from lyapnet.training.build import build_module
 
 ROOT = Path(__file__).parents[2]
 SCRATCH = ROOT / "conf" / "from_scratch"
-SHORT = ["training.iterations=1", "horizon.steps=4", "evaluation.validation_states=2", "evaluation.test_states=2"]
+SHORT = ["training.iterations=1", "horizon.steps=4", "evaluation.validation_states=2", "evaluation.test_states=2",
+         "evaluation.animate=false", "rollout.gradient=backprop"]  # fmt: skip
 
 
 def trained(name, folder, *overrides):

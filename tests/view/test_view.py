@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import cache
 from html.parser import HTMLParser
 
 import pytest
@@ -16,7 +17,7 @@ from lyapnet.controller import Controller
 from lyapnet.errors import UsageError
 from lyapnet.loading import load
 from lyapnet.sets import Box
-from lyapnet.view import page_of
+from lyapnet.view import page, page_of
 from tests.problems import Formula, untrained
 
 pytest.importorskip("plotly")
@@ -47,6 +48,25 @@ WARNED = """told.push([!element("outside").hidden, element("plane").data.at(-2).
                        element("plane").data.at(-2).name.includes("outside")].join());"""
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _written_once():
+    """What a page computes is traced and written once for each controller, as it takes seconds."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "functions_of", cache(page.functions_of))
+        patch.setattr("lyapnet.policy.STEEP", 2)  # steps of a law that looks ahead, each of which is in the page
+        yield
+
+
+@cache
+def controller_of(name, *overrides):
+    return untrained(name, "horizon.steps=6", *overrides)
+
+
+@cache
+def page_for(name, *overrides):
+    return page_of(controller_of(name, *overrides), f"controller of {name}")
+
+
 def shown(page, folder, act=SLIDE_AND_CLICK, width=1300):
     """What a browser makes of a page: the title that ACT leaves, and the line of the check."""
     if BROWSER is None:
@@ -60,7 +80,7 @@ def shown(page, folder, act=SLIDE_AND_CLICK, width=1300):
 
 
 def test_a_slider_and_a_click_change_what_is_drawn(tmp_path):
-    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    page = page_for("double_integrator")
     assert len(page) < 8e6
     title, check = shown(page, tmp_path)
     before, later, clicked = (state.split(",") for state in title.split())
@@ -81,26 +101,25 @@ def test_a_slider_and_a_click_change_what_is_drawn(tmp_path):
     ],
 )
 def test_a_page_computes_what_the_controller_does(name, overrides, tmp_path):
-    page = page_of(untrained(name, "horizon.steps=6", *overrides), name)
-    _, check = shown(page, tmp_path)
+    _, check = shown(page_for(name, *overrides), tmp_path)
     assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9, check
 
 
 def test_a_page_computes_a_function_that_javascript_lacks(tmp_path):
-    problem = untrained("double_integrator", "horizon.steps=6").problem
+    problem = controller_of("double_integrator").problem
     page = page_of(Controller(problem, Formula(lambda t, x: (x**2).sum(-1) * (1 + t) + torch.erf(x[..., 0]))), "erf")
     _, check = shown(page, tmp_path)
     assert float(re.search(r"controller by (\S+) at", check)[1]) < 1e-9, check
 
 
 def test_a_page_that_differs_from_the_controller_says_so(tmp_path):
-    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    page = page_for("double_integrator")
     wrong = page.replace('"V": [', '"V": [9e9, ')
     assert "do not use it" in shown(wrong, tmp_path)[1]
 
 
 def test_a_start_outside_of_the_initial_states_is_told(tmp_path):
-    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    page = page_for("double_integrator")
     places = ("0.9, -0.6", "1.07, 0.1", "-0.9, 0.6", "0.1, -0.75")  # X₀ is |position| ≤ 1, |velocity| ≤ 0.7
     title, _ = shown(page, tmp_path, " ".join(f"await click({place}); {WARNED}" for place in places))
     inside, outside = "false,solid,false", "true,dash,true"
@@ -108,14 +127,14 @@ def test_a_start_outside_of_the_initial_states_is_told(tmp_path):
 
 
 def test_the_warning_goes_with_the_closed_loops(tmp_path):
-    page = page_of(untrained("double_integrator", "horizon.steps=6"), "double integrator")
+    page = page_for("double_integrator")
     hidden = 'told.push(element("outside").hidden);'
     title, _ = shown(page, tmp_path, f'{hidden} await click(1.07, 0.1); {hidden} element("clear").click(); {hidden}')
     assert title.split() == ["true", "false", "true"]
 
 
 def test_the_warning_says_where_a_proved_funnel_holds(tmp_path):
-    controller = untrained("double_integrator", "horizon.steps=6")
+    controller = controller_of("double_integrator")
     states = Box(torch.tensor([-2.0, -2.0]), torch.tensor([2.0, 2.0]))
     funnel = KeptSide(0.1, 0.0, states, None, degree=2, rho=1e9, seconds=1.0)
     page = page_of(controller, "double integrator", funnel)
@@ -125,15 +144,22 @@ def test_the_warning_says_where_a_proved_funnel_holds(tmp_path):
 
 
 def test_a_click_beside_thin_initial_states_starts_in_them(tmp_path):
-    page = page_of(untrained("cartpole_family", "horizon.steps=6", "network.hidden=[8]"), "cart-pole family")
+    page = page_for("cartpole_family", "network.hidden=[8]")
     at_side = f"await click(share * axis(0).high, 3.2); {WARNED}"
     title, _ = shown(page, tmp_path, f"for (const share of [0.03, 0.5]) {{ {at_side} }}")
     assert title.split() == ["false,solid,false", "true,dash,true"]  # the cart's position is 0 in X₀
 
 
-@pytest.mark.parametrize(("name", "width"), [("three_link_arm", 420), ("keep_out", 420), ("double_integrator", 800)])
-def test_a_page_fits_its_window(name, width, tmp_path):
-    page = page_of(untrained(name, "horizon.steps=6", "network.hidden=[8]"), f"controller of {name}")
+@pytest.mark.parametrize(
+    ("name", "overrides", "width"),
+    [
+        ("three_link_arm", ["network.hidden=[8]"], 420),
+        ("keep_out", ["network.hidden=[8]"], 420),
+        ("double_integrator", [], 800),
+    ],
+)
+def test_a_page_fits_its_window(name, overrides, width, tmp_path):
+    page = page_for(name, *overrides)
     act = """await click(0, 0.1); const right = (found) => found.getBoundingClientRect().right;
     told.push([innerWidth, Math.max(...[...document.querySelectorAll("body *")].map(right))].join());"""
     window, right = map(float, shown(page, tmp_path, act, width)[0].split(","))
@@ -163,7 +189,7 @@ def test_a_page_fits_a_window_that_is_narrowed(tmp_path):
 def test_a_missing_plotly_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
     with pytest.raises(UsageError, match=r'pip install "lyapnet\[view\]"'):
-        page_of(untrained("pendulum_limited", "horizon.steps=6"), "pendulum")
+        page_of(controller_of("double_integrator"), "double integrator")
 
 
 def test_the_command_refuses_another_ending(tmp_path, capsys, caplog):
@@ -193,7 +219,7 @@ def test_no_title_ends_or_begins_a_script(monkeypatch):
                 self.texts[-1] += data
 
     monkeypatch.setattr("plotly.offline.get_plotlyjs", lambda: "")
-    controller, names = untrained("double_integrator", "horizon.steps=6", "network.hidden=[4]"), set()
+    controller, names = controller_of("double_integrator"), set()
     for title in ("plain", *HOSTILE):
         page = page_of(controller, title)
         found = Elements()

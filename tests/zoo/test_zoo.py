@@ -156,6 +156,7 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     pytest.importorskip("onnxscript")
     monkeypatch.setattr(making, "SAMPLES", 2)
     monkeypatch.setattr(making, "PRECISIONS", ("float64",))
+    monkeypatch.setattr(making, "MULTIPLES", (1, 5))  # of T: longer closed loops are those of the test above
     certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
     monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
     trained = tmp_path / "run" / "checkpoints" / "best.ckpt"
@@ -166,6 +167,7 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     record = making.make(ONE, trained, tmp_path / "zoo")
     assert (record["commit"], record["versions"]["torch"]) == ("abc", "1")
     assert record["evaluation"]["samples"] == 2
+    assert (record["afterwards"]["beyond"], [*record["afterwards"]["distance"]]) == ("riccati", ["1", "5"])
     assert record["command"] == "lyapnet train --config conf/cartpole_balancing.yaml"
     assert all(set(agreements) == set(making.EXPORTS) for agreements in record["export"].values())
     assert record["export"]["float64"]["c"]["control"] < 1e-10

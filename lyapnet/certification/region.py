@@ -208,6 +208,15 @@ class RegionClaim:
         return math.prod(w for i, w in enumerate(self.states.widths.tolist()) if i not in self.left_out)
 
 
+def _kept(file: Path | None, decay: float, w: State | None, n: int, names: Sequence[str]) -> KeptRegion | None:
+    """What a file keeps of the same question; None where there is none yet."""
+    if file is None or not file.exists():
+        return None
+    kept = kept_region(file)
+    kept.require(decay, w, n, names)
+    return kept
+
+
 def region_claim(
     closed_loop: ClosedLoop,
     problem: Problem,
@@ -246,9 +255,7 @@ def region_claim(
         loop, problem = plants.all_of(loop, problem)
         states, w = states and plants.around(states), None if w is None else plants.pushed(w)
     condition = RecedingDecrease(loop, decay, w, names)
-    goal, kept = problem.goal.double(), None if keep is None or not keep.exists() else kept_region(keep)
-    if kept is not None:
-        kept.require(decay, w, n, names)
+    goal, kept = problem.goal.double(), _kept(keep, decay, w, n, names)
     setting = setting_of(condition, problem, 0.0, states, budget, report)
     left_out, X0, wanted, D, domain, sides, *_ = setting
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)

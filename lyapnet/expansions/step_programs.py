@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions.laws import Expansion, held_control
 from lyapnet.expansions.paths import Path
-from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, kernel_or_none
+from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads, kernel_or_none
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, stateless
 from lyapnet.graphs.tracing import cut, trace
@@ -101,22 +101,24 @@ class StepPrograms(StepDerivatives):
         if kernel is None:
             y, u = Scan(lambda: (), step, 0).loop(*columns, start)
         else:
-            parts = [kernel(*state_of(step), *slice_of(rows)) for rows in torch.arange(b).split(TRAJECTORIES)]
+            state = state_of(step)
+            parts = in_threads(lambda rows: kernel(*state, *slice_of(rows)), torch.arange(b).split(TRAJECTORIES))
             y, u = (torch.cat(parts, -2)[..., :b, :] for parts in zip(*parts, strict=True))
         return torch.cat([start[None, ..., :-1], y[..., :-1]]), u, y[-1, ..., -1]
 
     def _in_slices(self, name: str, module: "_OfProblem", *columns: Tensor) -> list[Tensor]:
         """The results of a function of the rows of some columns, for all rows."""
-        parts = [
-            self._run(name, module, [_filled(column, rows, 0, ROWS) for column in columns])
-            for rows in torch.arange(len(columns[0])).split(ROWS)
+        slices = [
+            [_filled(column, rows, 0, ROWS) for column in columns] for rows in torch.arange(len(columns[0])).split(ROWS)
         ]
-        return [torch.cat(results)[: len(columns[0])] for results in zip(*parts, strict=True)]
-
-    def _run(self, name: str, module: "_OfProblem", arguments: list[Tensor]) -> Sequence[Tensor]:
-        examples = [*state_of(module), *arguments]
+        state = state_of(module)
+        examples = [*state, *slices[0]]
         kernel = self._kernel(name, lambda: NumberKernel(trace(stateless(module), examples), examples))
-        return module(*arguments) if kernel is None else kernel(*examples)
+        if kernel is None:
+            parts = [module(*arguments) for arguments in slices]
+        else:
+            parts = in_threads(lambda arguments: kernel(*state, *arguments), slices)
+        return [torch.cat(results)[: len(columns[0])] for results in zip(*parts, strict=True)]
 
     def _kernel(self, name: str, write: Callable[[], Kernel]) -> Kernel | None:
         known, key = self.problem.findings.programs, (name, *self._facts)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lyapnet.errors import UntraceableError
+from lyapnet.graphs.number_kernel.kernel import in_threads
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
 from lyapnet.horizon import TABLEAUX
@@ -186,7 +187,8 @@ class DiscreteAdjoint:
         size, batch = len(self._compiled), len(x0)
         full = torch.cat([x0, x0[-1:].expand(-batch % size, -1)])
         routines = self._routines[self._key(self._compiled)]
-        paths = [self.integrate(routines, part.contiguous(), theta) for part in full.split(size)]
+        parts = [part.contiguous() for part in full.split(size)]
+        paths = in_threads(lambda part: self.integrate(routines, part, theta), parts)
         columns = zip(zip(*paths, strict=True), BATCH_AXES, strict=True)
         return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
 

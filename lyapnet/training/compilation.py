@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.errors import CompilationError, UntraceableError
-from lyapnet.graphs.number_kernel.kernel import is_built
+from lyapnet.graphs.number_kernel.assembly import is_built
 from lyapnet.training.stages import Stages
 
 

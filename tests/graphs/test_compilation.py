@@ -10,7 +10,7 @@ from lyapnet.build import build_problem, build_rollout, build_value_function
 from lyapnet.config import load_config
 from lyapnet.errors import CompilationError, UntraceableError
 from lyapnet.graphs import compilation
-from lyapnet.graphs.number_kernel import kernel
+from lyapnet.graphs.number_kernel import assembly
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -87,7 +87,7 @@ def test_a_loop_that_cannot_be_traced_says_so(monkeypatch):
 
 def test_without_a_compiler_there_is_no_machine_code(monkeypatch):
     monkeypatch.setattr(compilation, "has_compiler", lambda: False)
-    kernel.library.cache_clear()
+    assembly.library.cache_clear()
     with pytest.raises(CompilationError, match="got none"):
         rollout_of().discrete.compile(torch.zeros(3, 2))
 

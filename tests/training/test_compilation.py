@@ -14,7 +14,7 @@ from lyapnet.calculus import ValueFunction
 from lyapnet.cli import main
 from lyapnet.errors import CompilationError
 from lyapnet.graphs import compilation
-from lyapnet.graphs.number_kernel import kernel
+from lyapnet.graphs.number_kernel import assembly
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.stages import PATIENCE, Stages
@@ -34,7 +34,7 @@ def _cache(tmp_path, monkeypatch):
 
 def test_without_a_compiler_a_run_says_so_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(compilation, "has_compiler", lambda: False)
-    kernel.library.cache_clear()
+    assembly.library.cache_clear()
     arguments = ["train", "--config", str(CONFIG), *SHORT, f"logs={tmp_path}", "rollout.compile=on"]
     assert main(arguments) == 0
     notice = "Expected a C++ compiler ($CXX, g++ or clang++), got none; running without compilation."

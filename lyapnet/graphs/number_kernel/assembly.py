@@ -1,0 +1,196 @@
+"""Programs with memory for their runs: what compiled C++ is called with."""
+
+import ctypes
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lyapnet.graphs.compilation import file_of_library, library_of
+from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
+from lyapnet.graphs.number_kernel.rules import RULES
+from lyapnet.graphs.number_kernel.writing import Writer
+
+SOURCE = Path(__file__).with_name("program.cpp")
+NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
+
+
+@cache
+def library(dtype: torch.dtype) -> ctypes.CDLL:
+    """The compiled C++ for one type of numbers, from disk, or compiled now: one file for each machine.
+
+    Raises:
+        CompilationError: as library_of.
+    """
+    return library_of("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}")
+
+
+def is_built(dtype: torch.dtype) -> bool:
+    """Whether the C++ for one type of numbers was compiled before."""
+    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}").is_file()
+
+
+class _Memory(NamedTuple):
+    """What a run of a program works in."""
+
+    arena: Tensor
+    addresses: np.ndarray  # of all buffers
+
+
+class AssembledProgram:
+    """A program with memory for its runs.
+
+    Args:
+        arguments: as NumberKernel.
+    """
+
+    def __init__(self, arguments: Sequence[Tensor]):
+        self.dtype = next(each.dtype for each in reversed(arguments) if each.is_floating_point())
+        if self.dtype not in NUMBERS or any(each.device.type != "cpu" for each in arguments):
+            raise NotImplementedError(f"{self.dtype} on {arguments[-1].device}")
+        self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
+        self.result_shapes: list[torch.Size] = []
+        self._given, self._results = list[int](), list[int]()  # buffers
+        self._frozen: list[tuple[int, Tensor]] = []  # arguments of other types, which are constants of the program
+        self._shapes = [each.shape for each in arguments]
+        self._idle = list[_Memory]()  # of runs that ended; each run has one for itself
+
+    def arguments(self, examples: Sequence[Tensor], varying: int) -> list[Tensor]:
+        """Examples of their own memory, the last ones of which vary from step to step."""
+        own = [each.detach().contiguous().clone() for each in examples]
+        for k, example in enumerate(own):
+            is_number = example.dtype in (self.dtype, torch.bool)
+            if is_number and example.numel():
+                self._given.append(self.writer.argument(example, varies=k >= len(own) - varying))
+            else:
+                self._given.append(-1)
+                self._frozen += [] if is_number else [(k, example)]
+        return own
+
+    def finish(self, results: Sequence[Tensor], sums: int = 0, prepared: bool = False) -> None:
+        """Lay out the memory, for results that are copied out, the last ones added to what is there.
+
+        Args:
+            prepared: what is shared is of constants alone, and done once for a memory.
+        """
+        program, self.sums, self._prepared = self.writer.program, sums, prepared
+        for k, result in enumerate(results):
+            buffer = program.new_buffer(result.numel(), varies=True, given=True)
+            in_line = torch.empty(result.shape, dtype=torch.int8).stride()
+            out, place = Place(buffer, 0, in_line), self.writer.place(result)
+            if k < len(results) - sums:
+                program.elementwise("copy", result.shape, out, [place])
+            else:
+                program.elementwise("sum", result.shape, out, [out, place])
+            self._results.append(buffer)
+            self.result_shapes.append(result.shape)
+        program.without_unread(self._results)
+        self._offsets, self._numbers = program.laid_out()
+        self._constants = [each.constant for each in program.buffers]
+        self.shared, self.repeated = _array(program.shared), _array(program.repeated)
+        self._tables = np.concatenate([*program.tables, np.zeros(1, dtype=np.int64)])
+        del self.writer  # and with it all that torch has computed of the examples
+
+    def is_scan(self, columns: int) -> bool:
+        """Whether there are numbers in x and each column, and x' is like x."""
+        return min(self._given[-columns - 1 :]) >= 0 and self.result_shapes[0] == self._shapes[-1]
+
+    def new_results(self) -> list[Tensor]:
+        """Tensors for the results."""
+        return [torch.empty(shape, dtype=self.dtype) for shape in self.result_shapes]
+
+    def run(self, code: np.ndarray, arguments: Sequence[Tensor], results: Sequence[Tensor]) -> None:
+        """Run instructions, and have them write the results."""
+        given = self._checked(arguments, self._shapes)
+        with self._memory() as memory:
+            self._run(code, self._buffers(memory, given, results))
+
+    def scan(
+        self, state: Sequence[Tensor], moving: Sequence[Tensor], x0: Tensor, two: Tensor, columns: Sequence[Tensor]
+    ) -> None:
+        """Run all steps: `two` is memory for two states x, `columns` for what the steps keep, over time, and sums."""
+        first = len(state)
+        shapes = [torch.Size([len(moving[0]), *shape]) for shape in self._shapes[first:-1]]
+        given = self._checked([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
+        *read, carried = self._given[first:]
+        written, *kept = self._results
+        stacked = len(kept) - self.sums
+        over_time = zip([*read, *kept[:stacked]], [*moving, *columns[:stacked]], strict=True)
+        advances = np.array([(buffer, column[0].numel()) for buffer, column in over_time], dtype=np.int64)
+        with self._memory() as memory:
+            table = self._buffers(memory, given, [two[0], *columns])
+            self._function("scan")(
+                _address(self.shared), _long(len(self.shared)), _address(self.repeated), _long(len(self.repeated)),
+                _address(self._tables), _address(table), _long(len(moving[0])), _address(advances),
+                _long(len(advances)), _long(carried), _long(written), ctypes.c_void_p(two[1].data_ptr()),
+            )  # fmt: skip
+
+    def _checked(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
+        """Arguments as the program reads them."""
+        got = [each.shape for each in arguments]
+        if got != [*shapes] or any(each.device.type != "cpu" for each in arguments):
+            raise ValueError(
+                f"Expected arguments {[*map(tuple, shapes)]}, got {[*map(tuple, got)]}; build another kernel."
+            )
+        for k, example in self._frozen:
+            if not torch.equal(arguments[k], example):
+                raise ValueError(
+                    f"Expected {example.dtype} as it was traced in a program of {self.dtype}, got other numbers; build "
+                    "the kernel anew."
+                )
+        return [argument.detach().to(self.dtype).contiguous() for argument in arguments]
+
+    @contextmanager
+    def _memory(self) -> Iterator["_Memory"]:
+        """Memory that no other thread works in."""
+        try:
+            memory = self._idle.pop()
+        except IndexError:
+            memory = self._new_memory()
+        try:
+            yield memory
+        finally:
+            self._idle.append(memory)
+
+    def _new_memory(self) -> "_Memory":
+        arena = torch.empty(self._numbers + 1, dtype=self.dtype)
+        own = zip(self._constants, self._offsets, strict=True)
+        addresses = [
+            arena[max(offset, 0) :].data_ptr() if constant is None else constant.data_ptr() for constant, offset in own
+        ]
+        memory = _Memory(arena, np.array(addresses, dtype=np.int64))
+        if self._prepared:
+            self._run(self.shared, memory.addresses)
+        return memory
+
+    def _run(self, code: np.ndarray, table: np.ndarray) -> None:
+        self._function("run")(_address(code), _long(len(code)), _address(self._tables), _address(table))
+
+    def _buffers(self, memory: "_Memory", arguments: Sequence[Tensor], results: Sequence[Tensor]) -> np.ndarray:
+        """The addresses of all buffers."""
+        table = memory.addresses.copy()
+        for buffer, tensor in zip((*self._given, *self._results), (*arguments, *results), strict=True):
+            if buffer >= 0:
+                table[buffer] = tensor.data_ptr()
+        return table
+
+    def _function(self, name: str) -> Any:
+        return getattr(library(self.dtype), f"lyapnet_{name}")
+
+
+def _array(instructions: Sequence[Instruction]) -> np.ndarray:
+    rows = [np.array(instruction.row, dtype=np.int64) for instruction in instructions]
+    return np.concatenate(rows) if rows else np.zeros(0, dtype=np.int64)
+
+
+def _address(array: np.ndarray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
+
+
+def _long(number: int) -> ctypes.c_int64:
+    return ctypes.c_int64(number)

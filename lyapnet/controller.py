@@ -290,11 +290,12 @@ class Controller:
         end, value = self.cost.terminal(whole.x[steps]), whole.require_value()[nodes]
         return Trajectory(whole.t[nodes], whole.x[nodes], whole.u[:steps], whole.running_cost[nodes], end, value)
 
-    def share_code(self, rollout: Rollout) -> None:
-        """Follow closed loops by the machine code of another rollout of the same law, if it has some and agrees."""
+    def take_code_of(self, rollout: Rollout) -> None:
+        """Follow closed loops by the machine code of another rollout of this law, where it has some and agrees."""
         own, other = self._rollout.discrete, rollout.discrete
-        if own is not None and other is not None:
-            own.share_code(other)
+        if own is not None and other is not None and other.compiled_batch:
+            draw = torch.Generator().manual_seed(0)
+            own.share_code(other, self.problem.initial_states.sample(other.compiled_batch, draw))
 
     def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
         """A trajectory with further steps, under what follows the horizon."""

@@ -166,7 +166,9 @@ class Problem(nn.Module):
             # one copy of u for each component of ẋ: all rows of the Jacobian in one sweep
             copies = u.expand(n, *u.shape)
             rate = self.rates(x.expand(n, *x.shape), copies)[0]
-            rows = torch.eye(n).to(rate).reshape(n, *[1] * (rate.ndim - 2), n).expand_as(rate)
+            rows = (
+                torch.eye(n, dtype=rate.dtype, device=rate.device).reshape(n, *[1] * (rate.ndim - 2), n).expand_as(rate)
+            )
             (by_control,) = torch.autograd.grad(rate, copies, rows, create_graph=recording)
             (slope,) = torch.autograd.grad(self.rates(x, u)[1].sum(), u, create_graph=True)
             bends = [torch.autograd.grad(s.sum(), u, create_graph=True)[0] for s in slope.unbind(-1)]

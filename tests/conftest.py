@@ -6,6 +6,7 @@ import importlib
 import inspect
 import logging
 import os
+import sys
 
 os.environ["MPLBACKEND"] = "Agg"
 
@@ -111,6 +112,14 @@ def _float64_and_seed_0():
 def _commands_say_no_more_than_they_find(monkeypatch):
     """On a slow machine they would also say what they are doing."""
     monkeypatch.setattr("lyapnet.cli.options.FIRST", float("inf"))
+
+
+@pytest.fixture(autouse=True)
+def _each_test_explores_by_itself(monkeypatch):
+    """What the oracle remembers of other batches in this process."""
+    module = sys.modules.get("lyapnet.evaluation.oracles.transcription")
+    if module is not None:
+        monkeypatch.setattr(module, "_WITH_ONE_MINIMUM", set())
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lyapnet.cost import PenaltyCost, spread
 from lyapnet.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
-from lyapnet.expansions.laws import Expansion
+from lyapnet.expansions.laws import Expansion, greedy_law
 from lyapnet.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 from lyapnet.expansions.step_programs import StepPrograms
 from lyapnet.linear_algebra import is_positive_definite, solve
@@ -139,6 +139,8 @@ def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path
         problem: in float64, on the CPU.
         expansion: one for each state of x0 (b, n).
     """
+    if not len(x0):
+        return path_under(problem, greedy_law(problem, expansion), x0)
     programs = StepPrograms(problem, STEP_SIZES)
     path = path_of(problem, *programs.follow(expansion, x0))
     if not programs.agrees(path) and programs.forget():  # its numbers changed since programs were written

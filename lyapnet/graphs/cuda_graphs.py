@@ -1,6 +1,7 @@
 """Functions on a GPU whose kernels are recorded once and launched at once (CUDA graphs)."""
 
 from collections.abc import Callable, Sequence
+from threading import Lock
 
 import torch
 from torch import Tensor
@@ -49,6 +50,7 @@ class RecordedFunction:
     ):
         self._arguments = [each.detach().clone() for each in arguments]
         self._results = list[Tensor]()
+        self._lock = Lock()  # there is one memory
 
         def run() -> None:
             self._results = [*function(*self._arguments)]
@@ -65,7 +67,7 @@ class RecordedFunction:
         shapes, expected = ([tuple(each.shape) for each in given] for given in (arguments, self._arguments))
         if shapes != expected:
             raise ValueError(f"Expected arguments {expected}, got {shapes}; record the function anew.")
-        with torch.no_grad():
+        with torch.no_grad(), self._lock:
             for own, given in zip(self._arguments, arguments, strict=True):
                 own.copy_(given)
             self._replay()

@@ -41,7 +41,7 @@ class IgnoringStates(ValueFunction):
         H = self.network.curvature(t)
         if H is None:
             return None
-        places = torch.eye(self.n).to(H)[self.kept]
+        places = torch.eye(self.n, dtype=H.dtype, device=H.device)[self.kept]
         return places.mT @ H @ places
 
 

@@ -8,6 +8,7 @@ one step or one block of steps.
 import logging
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -28,8 +29,7 @@ from lyapnet.types import ControlPath, StagePath, State, StatePath, ValuePath
 
 _LOG = logging.getLogger(__name__)
 Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
-FEW = 3  # nodes for which code that is shared is held against the loop that takes it
-VISITED = 6  # steps of a rollout at which its trace is held against the loop itself
+VISITED = 6  # steps of a rollout at which its trace, or shared code, is held against the loop itself
 BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
 ON_GPU = 131_072  # states linearised at once there
 
@@ -46,7 +46,7 @@ class DiscreteAdjoint:
         loop: the closed loop.
         steps, dt: N and Δt in s.
         method: a key of TABLEAUX.
-        costate_limit: L; backwards, at each EVERY-th node, the costates of a batch longer than L times their median are
+        costate_limit: L; backwards, at every fourth node, the costates of a batch longer than L times their median are
             cut to that length. None: no limit, and the exact gradient. It is the exact one too where none is so long.
     """
 
@@ -93,6 +93,11 @@ class DiscreteAdjoint:
         if self._compiled_key != self._key(x0):
             self._take_compiled(self._work(x0).compiled(), x0)
 
+    @property
+    def compiled_batch(self) -> int:
+        """How many states the batches have that run as machine code; 0 where there is none."""
+        return 0 if self._compiled is None else len(self._compiled)
+
     def compile_like(self, other: "DiscreteAdjoint") -> None:
         """Have batches run as machine code where another loop has them.
 
@@ -102,44 +107,60 @@ class DiscreteAdjoint:
         if other._compiled is not None:
             self.compile(other._compiled)
 
-    def share_code(self, other: "DiscreteAdjoint") -> bool:
-        """Run by the machine code of a loop that differs in tensors alone, if it has some and agrees on a few steps.
+    def share_code(self, other: "DiscreteAdjoint", x0: State) -> bool:
+        """Run by the machine code of a loop that differs in tensors alone, if it has some and agrees along its paths.
 
-        What a trace has frozen, a number or a tensor that no buffer holds, may be another one here: both are asked for
-        FEW steps from states around x₀ and, where something is trained, for their gradient. A loop of which nothing is
-        trained takes the code of one of which everything is: its tensors are in the same order.
+        What a trace has frozen, a number or a tensor that no buffer holds, may be another one here. So the code is held
+        against this loop as it is written: at some steps of its paths from x₀ and, where something is trained, by their
+        gradient. A loop of which nothing is trained takes the code of one of which everything is, as its tensors are in
+        the same order.
+
+        Args:
+            x0: (b, n) where closed loops begin, as many as the other has code for.
         """
-        x0 = other._compiled
-        routines = None if x0 is None else other._routines.get(other._key(x0))
-        if x0 is None or routines is None or self.costate_limit != other.costate_limit:
-            return False
+        routines = None if other._compiled is None else other._routines.get(other._key(other._compiled))
         flags, of_other = ([p.requires_grad for p in each.loop.parameters()] for each in (self, other))
-        if flags != of_other and (any(flags) or not all(of_other)):
+        if (
+            routines is None
+            or self._compiled_for(x0) != other._compiled_for(x0)
+            or (flags != of_other and (any(flags) or not all(of_other)))
+        ):
             return False
-        spread = torch.linspace(0.9, 1.1, x0.numel()).to(x0).reshape(x0.shape)
-        start = spread * x0 + 0.1 * (spread - 1)
-        try:
-            found, expected = (self._few_steps(each, start) for each in (routines, self._as_written(x0)))
-        except (RuntimeError, ValueError):  # tensors of other shapes, or on another device
-            return False
-        half = torch.finfo(x0.dtype).eps ** 0.5
-        for mine, theirs in zip(expected, found, strict=True):
-            scale = float(mine.nan_to_num(0, 0, 0).abs().max()) if mine.numel() else 0.0
-            if not torch.allclose(theirs, mine, rtol=half, atol=half * scale, equal_nan=True):
-                return False
-        self._take_compiled(routines, x0)
-        return True
+        agrees = False
+        with suppress(RuntimeError, ValueError):  # tensors of other shapes
+            agrees = self._agrees(routines, x0)
+        if agrees:
+            self._take_compiled(routines, x0)
+        return agrees
 
-    def _few_steps(self, routines: Routines, x0: State) -> list[Tensor]:
-        """The first FEW nodes from x₀ and, of what is trained, the gradient of the sum of their x, ∫ℓ and V."""
-        state, (t, dt) = self._state(self.trained()), (column[:FEW] for column in self._grid(x0, self.steps + 1))
+    def _compiled_for(self, x0: State) -> tuple[Any, ...]:
+        """What is frozen in a trace for sure, besides the code of f, g, the cost and V."""
+        system, cost = self.loop.system, self.loop.cost
+        return self._key(x0)[:3], self.steps, self.dt, self._tableau, self.costate_limit, type(system), type(cost)
+
+    def _agrees(self, routines: Routines, x0: State) -> bool:
+        """Whether paths from x₀ have steps of this loop, and the gradient of the sum of their x, ∫ℓ and V."""
+        theta, step = self.trained(), Step(self.loop, self._tableau)
+        nodes, (t, dt) = self.integrate(routines, x0, theta), self._grid(x0, self.steps + 1)
+        found, expected = list[Tensor](), list[Tensor]()
         with torch.no_grad():
-            nodes = Nodes(*routines.integrate(*state, t, dt, x0))
-        if not self.trained():
-            return [*nodes]
-        ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
-        x0_bar, theta_bar = routines.gradient(state, Columns(t, dt, nodes.stages, *ones))
-        return [*nodes, x0_bar, *theta_bar]
+            for k in self._some_steps():
+                following, *kept = step(t[k], dt[k], nodes.stages[k, 0])
+                found += [column[k] for column in nodes]
+                expected += kept
+                if k < self.steps:
+                    found.append(nodes.stages[k + 1, 0])
+                    expected.append(following)
+        if theta:
+            ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
+            for routes, results in ((routines, found), (self._as_written(x0), expected)):
+                x0_bar, theta_bar = self.gradient(routes, theta, nodes.stages, ones)
+                results += [x0_bar, *theta_bar]
+        return all(are_close(mine, theirs) for mine, theirs in zip(found, expected, strict=True))
+
+    def _some_steps(self) -> list[int]:
+        """VISITED steps, from the first one to the last node."""
+        return torch.linspace(0, self.steps, VISITED).long().tolist()
 
     def _take_compiled(self, routines: Routines, x0: State) -> None:
         self._routines[self._key(x0)] = routines
@@ -171,7 +192,8 @@ class DiscreteAdjoint:
         # a step's cost is part of the running cost of every later node
         cost_bar = padded(running_cost_bar.flip(0).cumsum(0).flip(0)[1:], len(stages))
         path = Columns(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
-        return routines.gradient(self._state(theta), path)
+        costate, share = routines.gradient(self._state(theta), path)
+        return costate, share[: len(theta)]  # shared code may have the gradient of more than is trained here
 
     def _integrate_any(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
         """The path without a gradient: by compiled routines, in slices if need be; else without a trace."""
@@ -188,7 +210,8 @@ class DiscreteAdjoint:
         full = torch.cat([x0, x0[-1:].expand(-batch % size, -1)])
         routines = self._routines[self._key(self._compiled)]
         parts = [part.contiguous() for part in full.split(size)]
-        paths = in_threads(lambda part: self.integrate(routines, part, theta), parts)
+        on_threads = in_threads if x0.device.type == "cpu" else map
+        paths = list(on_threads(lambda part: self.integrate(routines, part, theta), parts))
         columns = zip(zip(*paths, strict=True), BATCH_AXES, strict=True)
         return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
 
@@ -215,7 +238,7 @@ class DiscreteAdjoint:
         """(t, Δt, x) of some steps along the loop as it is written."""
         t, dt = self._grid(x0, self.steps + 1)
         path = self.integrate(self._as_written(x0), x0, self.trained()).stages[:, 0]
-        return [[t[k], dt[k], path[k]] for k in torch.linspace(0, self.steps, VISITED).long()]
+        return [[t[k], dt[k], path[k]] for k in self._some_steps()]
 
     def _as_written(self, x0: Tensor) -> Routines:
         """The work in Python, on the loop's own tensors."""
@@ -280,3 +303,12 @@ def _read(nodes: Nodes) -> Rolled:
     """(x, ∫ℓ, V, u) at the nodes."""
     running_cost = torch.cat([torch.zeros_like(nodes.step_cost[:1]), nodes.step_cost[:-1].cumsum(0)])
     return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]
+
+
+def are_close(found: Tensor, expected: Tensor) -> bool:
+    """Whether two results differ by rounding alone, up to half the digits."""
+    if found.shape != expected.shape or found.dtype != expected.dtype:
+        return False
+    half = torch.finfo(expected.dtype).eps ** 0.5
+    scale = float(expected.nan_to_num(0, 0, 0).abs().max()) if expected.numel() else 0.0
+    return torch.allclose(found, expected, rtol=half, atol=half * scale, equal_nan=True)

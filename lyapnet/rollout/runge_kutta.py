@@ -79,7 +79,7 @@ class PullBack(nn.Module):
             following, _, cost, _, value = self.step(t, dt, x)
             x_bar, *theta_bar = _vjp([following, cost, value], [x, *theta], [costate, cost_bar, value_bar])
         before = node_bar + x_bar
-        return before, before.clone(), *theta_bar
+        return before, before.clone(), *theta_bar  # the first is carried on, the second kept
 
 
 class Linearisation(NamedTuple):
@@ -122,14 +122,16 @@ class Linearise(nn.Module):
             # One copy of (x, u) for each component of (f + gu, ℓ): all rows of the Jacobian in one sweep.
             copies = [y.detach().expand(n + 1, *y.shape).clone().requires_grad_() for y in (x, u)]
             slope = self.loop.slope(*copies)
-            rows = torch.eye(n + 1).to(slope).reshape(n + 1, *[1] * (slope.ndim - 2), n + 1)
+            rows = torch.eye(n + 1, dtype=slope.dtype, device=slope.device).reshape(
+                n + 1, *[1] * (slope.ndim - 2), n + 1
+            )
             y_x, y_u = _vjp([slope], copies, [rows.expand_as(slope)])
             given = self.loop.slope(x.detach(), u.detach())
         y_x = y_x + apply(u_x.mT, y_u)
         f_x, cost_x, f_u, cost_u = y_x[:n].movedim(0, -2), y_x[n], y_u[:n].movedim(0, -2), y_u[n]
 
         h = dt[:, None, None, None]
-        eye = torch.eye(n).to(stages).expand(f_x.shape[0], *f_x.shape[2:])
+        eye = torch.eye(n, dtype=stages.dtype, device=stages.device).expand(f_x.shape[0], *f_x.shape[2:])
         jacobians, cost_jacobians = [], []
         for i, row in enumerate(tableau.a):
             if any(row):

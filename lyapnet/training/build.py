@@ -19,7 +19,7 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
         parts: taken instead of those that the config names.
 
     Raises:
-        UsageError: as build_problem and its like; or the seeds cannot train as one batch.
+        UsageError: as build_problem and its like.
     """
     parts = parts_of(config) if parts is None else parts
     problem, options = build_problem_to_train(config, parts), _optimizer_options(config.training)

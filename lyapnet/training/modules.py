@@ -56,10 +56,13 @@ class TrainingModule(L.LightningModule):
     def compile_for(self, batch_size: int) -> None:
         """Have training batches of this size run as machine code, which members share; see DiscreteAdjoint.compile."""
         first, *others = [member.rollout.discrete for member in self.members]
-        x0 = self.members[0].problem.initial_states.center.expand(batch_size, -1).contiguous()
-        for loop in (first, *others):
-            if loop is not None and (loop is first or first is None or not loop.share_code(first)):
-                loop.compile(x0)
+        if first is None:
+            return
+        X0 = self.members[0].problem.initial_states
+        first.compile(X0.center.expand(batch_size, -1).contiguous())
+        for loop in others:
+            if loop is not None and not loop.share_code(first, X0.sample(batch_size, torch.Generator().manual_seed(0))):
+                loop.compile_like(first)
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
         """One evaluation of each member's program on its initial states."""

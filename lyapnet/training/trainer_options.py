@@ -58,8 +58,8 @@ def check_trainer_options(config: Config) -> None:
     require_memory("trainer.devices", trainer.num_devices, PROCESS * (trainer.num_devices - 1), "take fewer")
     if config.seeds > 1 and trainer.num_devices > 1:
         raise UsageError(
-            f"Expected trainer.devices=1 for seeds={config.seeds}, got {trainer.num_devices} devices; one batch holds "
-            "all seeds, so train on one device, or the seeds one by one."
+            f"Expected trainer.devices=1 for seeds={config.seeds}, got {trainer.num_devices} devices; seeds train side "
+            "by side on one device: take one, or train the seeds one by one."
         )
 
 

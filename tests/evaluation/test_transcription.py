@@ -14,7 +14,7 @@ from lyapnet.config import load_config
 from lyapnet.cost import QuadraticCost
 from lyapnet.errors import OracleError
 from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of, transcription
-from lyapnet.evaluation.oracles.multistart import AGAIN, EXPLORED, Candidate, MultiStart
+from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.horizon import Horizon
 from lyapnet.sets import Box
@@ -232,7 +232,7 @@ def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch)
     for x0 in batches:
         optima = oracle.solve(x0)
         tried += 1
-    assert counts[1] <= counts[0] - (EXPLORED - AGAIN)
+    assert counts[1] <= counts[0] - (EXPLORED - EXPLORED_AGAIN)
     monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
     monkeypatch.setenv("LYAPNET_CACHE", f"{oracle.cache.folder}_empty")
     again, _ = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
@@ -243,6 +243,16 @@ def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch)
     tried += 1
     Transcription(narrower).solve(0.5 * batches[0])
     assert counts[3] > counts[1], "of another X₀"
+
+
+def test_states_close_to_each_other_say_nothing_of_others(monkeypatch):
+    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    oracle, box = transcription_of("double_integrator", "horizon.steps=10", "horizon.dt=0.1")
+    x0 = box.sample(EXPLORED, torch.Generator().manual_seed(0))
+    oracle.solve(0.1 * x0)
+    assert not transcription._WITH_ONE_MINIMUM
+    oracle.solve(x0)
+    assert len(transcription._WITH_ONE_MINIMUM) == 1
 
 
 def test_known_controls_that_cost_less_are_tried_from_any_state():

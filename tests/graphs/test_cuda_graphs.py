@@ -48,6 +48,20 @@ def test_a_recorded_loop_has_the_path_and_the_gradient_of_a_traced_one(overrides
     assert not torch.allclose(results[0][0], results[1][0]), "the twin: parameters and states are read at each call"
 
 
+@pytest.mark.parametrize("policy", ["hjb", "sampled"])
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+def test_nothing_is_copied_from_another_device(method, policy):
+    """As a recording on a GPU would not allow; with tensors without values in the place of a GPU's."""
+    rollout = rollout_of(f"rollout.method={method}", f"rollout.policy={policy}").to("meta")
+    loop, x0 = rollout.discrete, torch.zeros(3, 2, device="meta")
+    work = loop._work(x0)
+    work._visited = list
+    for graph in (*work._forwards, *work._backwards, *work._block_pieces):
+        for node in graph.graph.nodes:
+            assert str(node.kwargs.get("device", "meta")) == "meta", node.format_node()
+            assert "to_copy" not in str(node.target)
+
+
 def shapes_of(nodes):
     """Like x, ∫ℓ and V at the nodes."""
     return nodes.stages[:, 0], nodes.value, nodes.value

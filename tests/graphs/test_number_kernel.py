@@ -22,6 +22,7 @@ from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.rollout import Rollout
+from lyapnet.systems import SYSTEMS, Pendulum
 from tests.configs import objects
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
@@ -150,6 +151,7 @@ def tanh_for_torch(a):
         (lambda a: 1 - 2 * torch.sigmoid(2 * a), True),
         (lambda a: torch.sigmoid(a), False),
         (lambda a: tanh_for_torch(a) + torch.sigmoid(2 * a), True),
+        (lambda a: torch.sub(2 * torch.sigmoid(2 * a), 1, alpha=3), True),
         (lambda a: tanh_for_torch(a) ** 1 * tanh_for_torch(2 * a), True),
     ],
 )
@@ -434,12 +436,60 @@ def test_a_loop_takes_the_code_of_one_that_differs_in_tensors_alone(overrides, c
         for parameter in other.parameters():
             parameter.mul_(1.1)
     change(other.discrete.loop)
-    assert other.discrete.share_code(rollout.discrete) is shared
+    assert other.discrete.share_code(rollout.discrete, problem.initial_states.sample(12)) is shared
     written = Rollout(other.problem, other.closed_loop.policy, gradient="backprop")
     with torch.no_grad():
         for start in (x0, 0.5 * x0[:5]):
             assert_close(other(start).x, written(start).x, rtol=1e-9, atol=1e-9)
         assert float((rollout(x0).x - other(x0).x).abs().max()) > 1e-6, "the twin: they are two loops"
+
+
+class Walled(Pendulum):
+    """With a spring that acts far from the centre alone, and a wind; both are numbers."""
+
+    stiffness, wind = 0.0, 0.0
+
+    def forces(self, q, qdot):
+        return super().forces(q, qdot) + self.stiffness * (q.abs() - 0.7).clamp(min=0) + self.wind
+
+
+class Timed(FCN):
+    """With a number that counts late."""
+
+    late = 0.0
+
+    def forward(self, t, x):
+        return super().forward(t, x) + self.late * (t - 1.2).clamp(min=0) * x.sum(-1)
+
+    value_and_state_gradient = ValueFunction.value_and_state_gradient
+
+
+@pytest.mark.parametrize("change", ["nothing", "stiffness", "wind", "late"])
+def test_code_is_held_against_a_loop_far_from_the_centre_and_late(change, monkeypatch):
+    monkeypatch.setitem(SYSTEMS, "pendulum", Walled)
+    monkeypatch.setitem(NETWORKS, "fcn", Timed)
+    (rollout, problem), (other, _) = rollout_of(), rollout_of()
+    rollout.discrete.compile(problem.initial_states.center.expand(12, -1).contiguous())
+    if change == "late":
+        other.closed_loop.V.late = 3.0
+    elif change != "nothing":
+        setattr(other.problem.system, change, 3.0)
+    x0 = problem.initial_states.sample(12, torch.Generator().manual_seed(0))
+    assert other.discrete.share_code(rollout.discrete, x0) is (change == "nothing")
+
+
+def test_of_shared_code_what_is_trained_here_has_a_gradient():
+    (rollout, problem), (other, _) = rollout_of(), rollout_of()
+    x0 = problem.initial_states.sample(12)
+    rollout.discrete.compile(x0)
+    freeze(*other.parameters())
+    assert other.discrete.share_code(rollout.discrete, x0)
+    written = Rollout(other.problem, other.closed_loop.policy, gradient="backprop")
+    slopes = []
+    for each in (other, written):
+        leaf = x0.clone().requires_grad_()
+        slopes += torch.autograd.grad(each(leaf).cost.sum(), leaf)
+    assert_close(*slopes, rtol=1e-9, atol=1e-9)
 
 
 class Sorting(FCN):

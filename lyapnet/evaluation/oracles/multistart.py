@@ -13,7 +13,7 @@ from lyapnet.evaluation.oracles.base import Report
 HOPELESS = 8  # failures from the first states on, after which there is nothing to be expected for the others
 SECONDS = 15.0  # of the starts of one state, after which no further one is made
 EXPLORED = 16  # first states on which all starts are tried, before it is judged whether there are several minima
-AGAIN = 4  # the same, where an earlier batch of the same X₀ has shown one minimum from each of its states
+EXPLORED_AGAIN = 8  # the same, where an earlier batch over the same X₀ has shown one minimum from each of its states
 NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
 SAME = 1e-6  # relative difference of two costs that are the same
 

@@ -20,7 +20,7 @@ from lyapnet.errors import Interrupted, signals_taken
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
-from lyapnet.evaluation.oracles.multistart import AGAIN, EXPLORED, SAME, Candidate, MultiStart, is_better
+from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, SAME, Candidate, MultiStart, is_better
 from lyapnet.evaluation.oracles.scales import Scales
 from lyapnet.problem import Problem
 from lyapnet.types import ControlPath, PerState, State, StatePath
@@ -34,6 +34,7 @@ INVALID = "IPOPT: Invalid_Number_Detected"
 WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
 BRIEF = 150  # iterations of further starts, where one has led to a minimum
+SPREAD = 0.5  # of the widths of X₀, over which explored states reach
 _WITH_ONE_MINIMUM = set[tuple[Any, ...]]()  # tasks and their X₀, of which this process has explored a batch
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each
 
@@ -113,7 +114,7 @@ class Transcription(Oracle):
         stored = self._replayed(states, [self.cache.read(x) for x in states])
         within = None if known is None else self.problem.controls.project(known.detach().double().cpu())
         given = self._replayed(states, nothing if within is None else within.unbind(1))
-        explored = AGAIN if self._where in _WITH_ONE_MINIMUM else EXPLORED
+        explored = EXPLORED_AGAIN if self._where in _WITH_ONE_MINIMUM else EXPLORED
         search = MultiStart(states.numpy(), stored, self.minimise, explored)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
@@ -123,13 +124,20 @@ class Transcription(Oracle):
             self._search(search, starts, progress, time.thread_time() + seconds)
             if search.several:
                 _WITH_ONE_MINIMUM.discard(self._where)
-            elif len(pending) >= EXPLORED and all(search.best[i] is not None for i in pending[:explored]):
+            elif explored == EXPLORED and self._is_spread(states[pending[:EXPLORED]], search):
                 _WITH_ONE_MINIMUM.add(self._where)
         optima = self._verified(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
                 self.cache.write(states[i], torch.from_numpy(best.u))
         return Optima(optima.cost.to(x0), optima.reasons, None if optima.u is None else optima.u.to(x0))
+
+    def _is_spread(self, states: Tensor, search: MultiStart) -> bool:
+        """Whether there are EXPLORED states, they reach over half of X₀ in each component, and all have a minimum."""
+        if len(states) < EXPLORED or any(best is None for best in search.best):
+            return False
+        box = self.problem.initial_states
+        return bool((states.amax(0) - states.amin(0) >= SPREAD * (box.upper - box.lower)).all())
 
     def _replayed(self, states: Tensor, controls: Sequence[Tensor | None]) -> list[Candidate | None]:
         """The trajectories of the controls that there are, and that keep the state finite and within constraints."""

@@ -29,7 +29,7 @@ def _put_tanh(graph: Graph, sigmoid: Node, tanh: Node) -> None:
     """tanh a in the place of 2σ − 1, and g(1 − tanh² a) in that of its derivative 2(2g)σ(1 − σ), with σ = σ(2a)."""
     for doubled in _doubles_of(sigmoid):
         for node in list(doubled.users):
-            if node.target is aten.sub.Tensor and node.args == (doubled, 1):
+            if node.target is aten.sub.Tensor and node.args == (doubled, 1) and not node.kwargs:
                 node.replace_all_uses_with(tanh)
     for slope in list(sigmoid.users):
         if slope.target is aten.sigmoid_backward.default and slope.args[1] is sigmoid:

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from lyapnet.types import Jacobians, StagePath, State, StatePath, Times, ValuePath
 
-EVERY = 4  # nodes from one limit of the costates to the next
+EVERY = 4  # nodes from one limit of the costates to the next, as the recipe's limit was chosen with
 
 
-class Columns(NamedTuple):
+class PathWithDerivatives(NamedTuple):
     """A path and the loss's derivatives along it, over its nodes 0 … N."""
 
     t: Times
@@ -40,9 +40,10 @@ class StepwiseGradient:
     def __init__(self, pull_back: Callable[..., Sequence[Tensor]], limit: float | None):
         self.pull_back, self.limit = pull_back, limit
 
-    def __call__(self, state: Sequence[Tensor], path: Columns) -> tuple[State, list[Tensor]]:
+    def __call__(self, state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
         nodes = len(path.t)
-        columns = [column.flip(0) for column in path._replace(stages=path.stages[:, 0])]
+        t, dt, stages, *derivatives = path
+        columns = [column.flip(0) for column in (t, dt, stages[:, 0], *derivatives)]
         ends = [0, nodes] if self.limit is None else [0, *range((nodes - 1) % EVERY + 1, nodes + 1, EVERY)]
         costate, gradient = torch.zeros_like(path.node_bar[0]), list[Tensor]()
         for start, end in pairwise(ends):
@@ -71,12 +72,12 @@ class BlockwiseGradient:
     ):
         self.linearise, self.product, self.block, self.limit = linearise, product, block, limit
 
-    def __call__(self, state: Sequence[Tensor], path: Columns) -> tuple[State, list[Tensor]]:
+    def __call__(self, state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
         K, nodes = self.block, len(path.t)
         length = K * math.ceil(nodes / K)
         columns = [
             (repeated if name in ("t", "stages") else padded)(column, length).contiguous()
-            for name, column in zip(Columns._fields, path, strict=True)
+            for name, column in zip(PathWithDerivatives._fields, path, strict=True)
         ]
         costate, gradient = torch.zeros_like(path.node_bar[0]), list[Tensor]()
         for start in reversed(range(0, length, K)):

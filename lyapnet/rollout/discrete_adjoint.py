@@ -21,7 +21,7 @@ from lyapnet.graphs.number_kernel.kernel import in_threads
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
 from lyapnet.horizon import TABLEAUX
-from lyapnet.rollout.backwards import BlockwiseGradient, Columns, padded
+from lyapnet.rollout.backwards import BlockwiseGradient, PathWithDerivatives, padded
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
 from lyapnet.rollout.runge_kutta import Linearise, Step
@@ -191,7 +191,7 @@ class DiscreteAdjoint:
         x_bar, running_cost_bar, value_bar = bars
         # a step's cost is part of the running cost of every later node
         cost_bar = padded(running_cost_bar.flip(0).cumsum(0).flip(0)[1:], len(stages))
-        path = Columns(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
+        path = PathWithDerivatives(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
         costate, share = routines.gradient(self._state(theta), path)
         return costate, share[: len(theta)]  # shared code may have the gradient of more than is trained here
 

@@ -17,7 +17,7 @@ from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import stateless, trained_of
 from lyapnet.graphs.tracing import cut, trace
 from lyapnet.horizon import ButcherTableau
-from lyapnet.rollout.backwards import BlockwiseGradient, Columns, StepwiseGradient
+from lyapnet.rollout.backwards import BlockwiseGradient, PathWithDerivatives, StepwiseGradient
 from lyapnet.rollout.closed_loop import ClosedLoop
 from lyapnet.rollout.runge_kutta import Linearise, PullBack, Step
 from lyapnet.types import ControlPath, StagePath, State, Times, ValuePath
@@ -39,7 +39,7 @@ class Routines(NamedTuple):
     """The two pieces of work, for one shape of batch; `state` is the tensors that a closed loop is made of."""
 
     integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀) ↦ the columns of Nodes at the nodes t
-    gradient: Callable[[Sequence[Tensor], Columns], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
+    gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
 
 
 class TracedRoutines:
@@ -94,15 +94,17 @@ class TracedRoutines:
         integrate = RecordedFunction(self._scan().loop, [*self.state, *self.grid, self.x0], record)
         (t, dt), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
         stages = nodes[:, None].expand(-1, self._stages, -1, -1)
-        path = Columns(t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0]))
+        path = PathWithDerivatives(
+            t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0])
+        )
 
         def backwards(*arguments: Tensor) -> list[Tensor]:
-            costate, share = by_blocks(arguments[:tensors], Columns(*arguments[tensors:]))
+            costate, share = by_blocks(arguments[:tensors], PathWithDerivatives(*arguments[tensors:]))
             return [costate, *share]
 
         gradient = RecordedFunction(backwards, [*self.state, *path], record)
 
-        def unpacked(state: Sequence[Tensor], path: Columns) -> tuple[State, list[Tensor]]:
+        def unpacked(state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
             costate, *share = gradient(*state, *path)
             return costate, share
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from lyapnet.derivatives import StepDerivatives
 from lyapnet.expansions.laws import Expansion, held_control
 from lyapnet.expansions.paths import Path
+from lyapnet.graphs.agreement import THIRD, are_close
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads, kernel_or_none
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, stateless
@@ -73,11 +74,7 @@ class StepPrograms(StepDerivatives):
         with torch.no_grad():
             following, paid = self.problem.step(x[:-1], u)
             total = paid.sum(0) + self.problem.cost.terminal(x[-1])
-        third = torch.finfo(x.dtype).eps ** (1 / 3)
-        return all(
-            not known.numel() or torch.allclose(found, known, rtol=third, atol=third * float(known.abs().max()))
-            for found, known in ((x[1:], following), (cost, total))
-        )
+        return are_close(x[1:], following, THIRD) and are_close(cost, total, THIRD)
 
     def forget(self) -> bool:
         """Run by torch from now on what programs were written for, here and for all copies of the problem.
@@ -148,9 +145,7 @@ class _SearchStep(nn.Module):
     def forward(self, along: Tensor, u: Tensor, k: Tensor, K: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
         x = y[..., :-1]
         u = self.problem.controls.project(u + self.alpha * k + apply(K, x - along))
-        following, paid = self.problem.step(x, u)
-        y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
-        return y, y, u
+        return _moved(self.problem, y, u)
 
 
 class _FollowStep(nn.Module):
@@ -165,9 +160,7 @@ class _FollowStep(nn.Module):
         x = y[..., :-1]
         free = self.problem.response(x)
         u = held_control(self.problem, free, p + apply(H, free.x - center), H)
-        following, paid = self.problem.step(x, u)
-        y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
-        return y, y, u
+        return _moved(self.problem, y, u)
 
 
 class _OfProblem(nn.Module):
@@ -180,6 +173,13 @@ class _OfProblem(nn.Module):
     def forward(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         result = self.function(*arguments)
         return (result,) if isinstance(result, Tensor) else tuple(result)
+
+
+def _moved(problem: Problem, y: Tensor, u: Control) -> tuple[Tensor, Tensor, Control]:
+    """(y', y', u): y = (x, ∫ℓ) after one step, to be carried on and to be kept."""
+    following, paid = problem.step(y[..., :-1], u)
+    y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
+    return y, y, u
 
 
 def _scan_kernel(step: nn.Module, arguments: list[Tensor]) -> ScanKernel:

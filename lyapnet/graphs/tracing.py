@@ -14,9 +14,9 @@ from torch.fx import Graph, GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.node import map_arg
 from torch.overrides import TorchFunctionMode
-from torch.testing import assert_close
 
 from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
+from lyapnet.graphs.agreement import are_close
 
 Tensors = tuple[Tensor, ...]
 
@@ -232,15 +232,11 @@ def _require_same(graph_module: GraphModule, function: Callable[..., Tensors], a
     with torch.no_grad():
         results, expected = graph_module(*arguments), function(*arguments)
     for result, value in zip(results, expected, strict=True):
-        half = torch.finfo(value.dtype).eps ** 0.5
-        try:
-            scale = float(value.detach().nan_to_num(0, 0, 0).abs().max())
-            assert_close(result, value.detach(), rtol=half, atol=half * scale, equal_nan=True)
-        except AssertionError as error:
+        if not are_close(result, value):
             raise ValueError(
                 "Expected f, g, the cost and V to be functions of t and x alone, got code that leaves torch or "
                 "computes something else each time."
-            ) from error
+            )
 
 
 def name_of(target: Any) -> str:

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lyapnet.errors import UntraceableError
+from lyapnet.graphs.agreement import are_close
 from lyapnet.graphs.number_kernel.kernel import in_threads
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.stateless import state_of, trained_of, untrained_of
@@ -303,12 +304,3 @@ def _read(nodes: Nodes) -> Rolled:
     """(x, ∫ℓ, V, u) at the nodes."""
     running_cost = torch.cat([torch.zeros_like(nodes.step_cost[:1]), nodes.step_cost[:-1].cumsum(0)])
     return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]
-
-
-def are_close(found: Tensor, expected: Tensor) -> bool:
-    """Whether two results differ by rounding alone, up to half the digits."""
-    if found.shape != expected.shape or found.dtype != expected.dtype:
-        return False
-    half = torch.finfo(expected.dtype).eps ** 0.5
-    scale = float(expected.nan_to_num(0, 0, 0).abs().max()) if expected.numel() else 0.0
-    return torch.allclose(found, expected, rtol=half, atol=half * scale, equal_nan=True)

@@ -21,7 +21,7 @@ from lyapnet.training.build import build_module
 from lyapnet.training.candidates import CALM
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.start import choose_start, expansions_of
-from tests.fits import shorten_fits
+from tests.fits import few_optima
 
 LINEAR = {
     "experiment": "mine",
@@ -40,10 +40,7 @@ SWING = LINEAR | {
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_optima():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.start.OPTIMA", 12)
-        shorten_fits(patch, 130, 70)
-        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    with few_optima(12, 130, 70):
         yield
 
 

@@ -14,7 +14,7 @@ from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints
 from lyapnet.training.facts import facts_of
 from lyapnet.training.start_cache import StartCache, kept_or_chosen
-from tests.fits import shorten_fits
+from tests.fits import few_optima
 
 TASK = {
     "experiment": "mine",
@@ -28,10 +28,7 @@ TASK = {
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_optima():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.start.OPTIMA", 6)
-        shorten_fits(patch, 20, 10)
-        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    with few_optima(6, 20, 10):
         yield
 
 

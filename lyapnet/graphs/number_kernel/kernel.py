@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.fx import GraphModule
 
 from lyapnet.errors import LyapnetError
+from lyapnet.graphs.agreement import THIRD, are_close
 from lyapnet.graphs.number_kernel.assembly import AssembledProgram
 from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.scan import Scan
@@ -124,7 +125,5 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
 def _require_same(results: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
     """Hold a program against its graph up to a third of the digits: a rule that is wrong is not to be trained with."""
     for result, value in zip(results, expected, strict=True):
-        third = torch.finfo(result.dtype).eps ** (1 / 3)
-        scale = float(value.to(result.dtype).nan_to_num(0, 0, 0).abs().max()) if value.numel() else 0.0
-        if not torch.allclose(result, value.to(result.dtype), rtol=third, atol=third * scale, equal_nan=True):
+        if not are_close(result, value.to(result.dtype), THIRD):
             raise NotImplementedError("another result than torch's")

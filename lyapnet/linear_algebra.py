@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.overrides import handle_torch_function, has_torch_function_unary
 
+from lyapnet.operators import are_operators, operator
+
 SMALL = 16  # products of entries that are cheaper without the library
 CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
 UNROLLED = 6  # unknowns of a linear system, up to which it is solved in whole batches
@@ -52,7 +54,7 @@ def solve(A: Tensor, B: Tensor) -> Tensor:
     d = A.shape[-1]
     if d == 1:
         return B / A
-    if d > UNROLLED:
+    if d > UNROLLED and not are_operators():
         return torch.linalg.solve(A, B)
     if d > 2:
         return multiply(_Inverse.apply(A), B)  # pyright: ignore[reportArgumentType]
@@ -78,31 +80,37 @@ def convex_or(A: Tensor, floor: Tensor, otherwise: Tensor) -> Tensor:
     return torch.where(is_positive_definite(A - CONVEX * floor)[..., None, None], A, otherwise)
 
 
-class _Inverse(torch.autograd.Function):
-    """A ↦ A⁻¹ of symmetric positive definite A, from its lower triangle, entry by entry over the batch.
+@operator
+def symmetric_inverse(A: Tensor) -> Tensor:
+    """A⁻¹ of symmetric positive definite A (*batch, d, d), from its lower triangle, entry by entry over the batch.
 
     Each pivot p in turn takes a_pp to −1/a_pp, a_ip to a_ip/a_pp and a_ij to a_ij − a_ip a_jp/a_pp: after the last one
     the matrix is −A⁻¹. No rows are exchanged, which such matrices do not need.
     Source: Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979.
     """
+    d = A.shape[-1]
+    a = {(i, j): A[..., i, j] for i in range(d) for j in range(i + 1)}
+    for p in range(d):
+        reciprocal = 1 / a[p, p]
+        column = [a[max(i, p), min(i, p)] for i in range(d)]
+        scaled = [entry * reciprocal for entry in column]
+        for i, j in a:
+            if p in (i, j):
+                a[i, j] = -reciprocal if i == j else scaled[i + j - p]
+            else:
+                a[i, j] = a[i, j] - scaled[i] * column[j]
+    rows = [torch.stack([-a[max(i, j), min(i, j)] for j in range(d)], -1) for i in range(d)]
+    return torch.stack(rows, -2)
+
+
+class _Inverse(torch.autograd.Function):
+    """symmetric_inverse with its derivative −A⁻ᵀ Ā A⁻ᵀ."""
 
     generate_vmap_rule = True
 
     @staticmethod
     def forward(A: Tensor) -> Tensor:
-        d = A.shape[-1]
-        a = {(i, j): A[..., i, j] for i in range(d) for j in range(i + 1)}
-        for p in range(d):
-            reciprocal = 1 / a[p, p]
-            column = [a[max(i, p), min(i, p)] for i in range(d)]
-            scaled = [entry * reciprocal for entry in column]
-            for i, j in a:
-                if p in (i, j):
-                    a[i, j] = -reciprocal if i == j else scaled[i + j - p]
-                else:
-                    a[i, j] = a[i, j] - scaled[i] * column[j]
-        rows = [torch.stack([-a[max(i, j), min(i, j)] for j in range(d)], -1) for i in range(d)]
-        return torch.stack(rows, -2)
+        return symmetric_inverse(A)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from lyapnet.linear_algebra import apply, has_values, solve
+from lyapnet.operators import are_operators, operator
 from lyapnet.types import Control, ControlMatrix, State
 
 
@@ -162,8 +163,9 @@ class ControlBox(ControlSet):
 
     The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with two, clipped
     twice; with three or four, each way to hold some of them at a limit leaves a linear system for the others, and all
-    3ᵐ are solved as one batch; with more, by an active-set method. Of numbers, from which no gradient is asked, with
-    three and more by rounds that a trace could not have, as it may not look at them.
+    3ᵐ are solved as one batch; with more, by an active-set method, which is one operator where a reader of traces has
+    it. Of numbers, from which no gradient is asked, with three and more by rounds that a trace could not have, as it
+    may not look at them.
 
     Args:
         lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none on that side.
@@ -224,7 +226,8 @@ class ControlBox(ControlSet):
         R, b = R.double(), b.double()
         if m == 2:
             return self._of_two(R, b, low, high).to(given)
-        way = self._of_numbers if _are_numbers(R, b) else self._of_few if m <= FEW else self._of_many
+        few = m <= FEW and not are_operators()
+        way = self._of_numbers if _are_numbers(R, b) else self._of_few if few else self._of_many
         u = way(R, b, low, high).clamp(low, high)
         known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
         return torch.where(known[..., None], u, torch.nan).to(given)  # what is no number stays none
@@ -272,7 +275,8 @@ class ControlBox(ControlSet):
     @staticmethod
     def _of_many(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
         """The minimum over the controls that no limit holds at it, the others at theirs."""
-        side = _active_set(R.detach(), b.detach(), low, high)
+        shape = torch.broadcast_shapes(R.shape[:-1], b.shape)
+        side = active_set(b.detach().expand(shape), R.detach(), low, high)
         held = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))  # finite, where side is not 0
         return torch.where(side == 0, _minimum_beside(R, b, held, side), held)
 
@@ -329,7 +333,8 @@ def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Contro
     return minimum, settled
 
 
-def _active_set(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+@operator
+def active_set(b: Control, R: ControlMatrix, low: Tensor, high: Tensor) -> Control:
     """Which controls are at a limit at the minimum: −1 at the lower, 1 at the upper, 0 at none.
 
     From a control in the box, towards the minimum over those that no limit holds: up to the first limit on the way,

@@ -110,7 +110,7 @@ class StepPrograms(StepDerivatives):
         ]
         state = state_of(module)
         examples = [*state, *slices[0]]
-        kernel = self._kernel(name, lambda: NumberKernel(trace(stateless(module), examples), examples))
+        kernel = self._kernel(name, lambda: NumberKernel(trace(stateless(module), examples, whole=True), examples))
         if kernel is None:
             parts = [module(*arguments) for arguments in slices]
         else:
@@ -187,7 +187,7 @@ def _scan_kernel(step: nn.Module, arguments: list[Tensor]) -> ScanKernel:
     *columns, y = arguments
     state, moving = state_of(step), len(columns)
     middle = [column[len(column) // 2] for column in columns]
-    graph = trace(stateless(step), [*state, *(column[0] for column in columns), y], [[*middle, y]])
+    graph = trace(stateless(step), [*state, *(column[0] for column in columns), y], [[*middle, y]], whole=True)
     prepare, repeated = cut(graph, late=moving + 1, early_outputs=0, repeat=False)
     return ScanKernel(prepare, repeated, [*state, *arguments], moving)
 

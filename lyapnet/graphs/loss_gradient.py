@@ -46,4 +46,4 @@ def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None
     examples = [*state_of(loss), *arguments]
     if any(example.device.type != "cpu" for example in examples):
         return None
-    return kernel_or_none(lambda: NumberKernel(trace(gradient, examples), examples))
+    return kernel_or_none(lambda: NumberKernel(trace(gradient, examples, whole=True), examples))

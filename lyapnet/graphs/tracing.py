@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from traceback import FrameSummary
 from typing import Any
 
@@ -17,6 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
 from lyapnet.graphs.agreement import are_close
+from lyapnet.operators import as_operators
 
 Tensors = tuple[Tensor, ...]
 
@@ -26,6 +27,7 @@ def trace(
     arguments: Sequence[Tensor],
     elsewhere: Sequence[Sequence[Tensor]] = (),
     decompositions: Mapping[Any, Any] | None = None,
+    whole: bool = False,
 ) -> GraphModule:
     """The operations that `function` runs on tensors of these shapes, derivatives taken inside it included.
 
@@ -36,6 +38,7 @@ def trace(
     Args:
         elsewhere: other values of its last arguments, on which the trace is held against the function.
         decompositions: operator ↦ the same in simpler operators, for a reader that knows only those.
+        whole: whether lyapnet's own operators stay in it, for a reader that has them.
 
     Raises:
         UsageError: the function draws random numbers.
@@ -43,7 +46,7 @@ def trace(
         Exception: of any other kind that the function raises.
     """
     options = {"decomposition_table": decompositions, "tracing_mode": "fake", "_allow_non_fake_inputs": True}
-    with _reading_values(), _Watch() as watch:
+    with as_operators() if whole else nullcontext(), _reading_values(), _Watch() as watch:
         graph_module = make_fx(function, **options)(*arguments)
     written = next((node for node in graph_module.graph.nodes if _mutates(node) and _writes_outside(node)), None)
     if written is not None:
@@ -72,12 +75,7 @@ def trace(
             node.replace_all_uses_with(node.args[0])
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
-    for node in graph_module.graph.nodes:
-        if name_of(node.target) in UNINITIALISED and not all(_overwrites(user, node) for user in node.users):
-            raise UsageError(
-                f"Expected f, g, the cost and V without memory that nothing was written to, got {node.target}; use "
-                "zeros or full."
-            )
+    _require_written_memory(graph_module.graph)
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module
@@ -111,6 +109,15 @@ NOT_CORE = [getattr(torch.ops.aten, name) for name in ("addmm", "elu", "gelu", "
 
 # constants that take their shape from an argument
 SHAPED = {"empty_like", "full_like", "new_empty", "new_full", "new_ones", "new_zeros", "ones_like", "zeros_like"}
+
+
+def _require_written_memory(graph: Graph) -> None:
+    for node in graph.nodes:
+        if name_of(node.target) in UNINITIALISED and not all(_overwrites(user, node) for user in node.users):
+            raise UsageError(
+                f"Expected f, g, the cost and V without memory that nothing was written to, got {node.target}; use "
+                "zeros or full."
+            )
 
 
 def _overwrites(node: Node, memory: Node) -> bool:

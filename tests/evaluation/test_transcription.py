@@ -159,6 +159,19 @@ def test_what_does_not_converge_is_nan_and_says_why():
     assert not oracle.cache.folder.exists()
 
 
+def test_further_starts_end_where_they_take_much_longer_than_the_first_minimum(monkeypatch):
+    oracle, X0 = transcription_of("cartpole_swingup")
+    x0, rest = X0.sample(1)[0].numpy(), torch.zeros(oracle.problem.horizon.steps, 1).numpy()
+    still = Candidate(rest.repeat(len(x0), 1), rest, math.inf)
+    first = oracle.minimise(x0, still)
+    assert oracle.minimise(x0, still, briefly=True).cost == first.cost
+    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    assert oracle.minimise(x0, still, briefly=True).cost == first.cost, "as long as the first one took, and longer"
+    monkeypatch.setattr(transcription, "LONGER", 0)
+    assert oracle.minimise(x0, still, briefly=True) == "IPOPT: Maximum_Iterations_Exceeded"
+    assert oracle.minimise(x0, still).cost == first.cost, "where none is known, there is more time"
+
+
 def test_a_minimum_that_the_rollout_does_not_confirm_is_none():
     oracle, X0 = transcription_of("reacher", "horizon.steps=10")
     minimise, x0 = oracle.minimise, X0.sample(2)

@@ -33,7 +33,8 @@ BESIDE = 1e-8  # of the extents: how far from x₀ a path may begin, for a cost 
 INVALID = "IPOPT: Invalid_Number_Detected"
 WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
 SECONDS = 10.0  # of one start
-BRIEF = 150  # iterations of further starts, where one has led to a minimum
+BRIEF = 40, 150  # iterations at least and at most, after which a further start of a state with a minimum is given up
+LONGER = 3  # times the iterations that a first minimum has taken, between these two
 SPREAD = 0.5  # of the widths of X₀, over which explored states reach
 _WITH_ONE_MINIMUM = set[tuple[Any, ...]]()  # tasks and their X₀, of which this process has explored a batch
 BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each
@@ -77,10 +78,8 @@ class Transcription(Oracle):
         limits = self.problem.controls.limits
         domain = self.problem.domain
         bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
-        # two that differ in their iterations alone, as CasADi has no such parameter
-        self._solver, self._brief_solver = (
-            _solver(self.task, horizon.steps, most, bounded) for most in (iterations, min(iterations, BRIEF))
-        )
+        self._limit, self._solver = _solver(self.task, horizon.steps, bounded)
+        self._iterations, self._needed = iterations, 0  # at most; by a first minimum of a state so far
         self._scales = Scales(self.problem)
         assert limits is not None  # oracle_of asks before
         free = torch.full((system.n,), torch.inf)
@@ -204,27 +203,33 @@ class Transcription(Oracle):
         """The local minimum that IPOPT finds from a start, or its reason for none.
 
         Args:
-            briefly: in at most BRIEF iterations, as most minima take 20 to 80.
+            briefly: in not many more iterations than a first minimum has taken.
         """
-        solver = self._brief_solver if briefly else self._solver
-        found = self._minimum(x0, start, solver)
+        most = self._iterations
+        if briefly:
+            least, most = BRIEF
+            most = min(most, self._iterations, max(least, LONGER * self._needed))
+        found = self._minimum(x0, start, most)
         if found == INVALID:  # where slopes do not exist at x₀ itself, as those of |v| at rest
-            found = self._minimum(x0 + BESIDE * self._scales.of_states, start, solver)
+            found = self._minimum(x0 + BESIDE * self._scales.of_states, start, most)
+        if not briefly and not isinstance(found, str):
+            self._needed = max(self._needed, self._limit.done)
         return found
 
-    def _minimum(self, x0: np.ndarray, start: Candidate, solver: casadi.Function) -> Candidate | str:
+    def _minimum(self, x0: np.ndarray, start: Candidate, iterations: int) -> Candidate | str:
         lower, upper = self._bounds
         of_x, of_u, scale = self._scales.of_states, self._scales.of_controls, self._scales.of_cost(x0)
         guess = np.concatenate([(start.u / of_u).ravel(), (start.x / of_x).ravel()])
         given = np.concatenate([x0, [scale], of_x, of_u])
         least, greatest = self._held
+        self._limit.start(iterations)
         with redirect_stderr(StringIO()):  # CasADi warns of what ends it; it goes on as a reason, or as what was raised
-            result = solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
-        status = solver.stats()["return_status"]
+            result = self._solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
+        status = self._solver.stats()["return_status"]
         if self._stopped:
             self._stop()
         if status not in CONVERGED:
-            return f"IPOPT: {status}"
+            return f"IPOPT: {'Maximum_Iterations_Exceeded' if self._limit.is_reached() else status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
         u = of_u * u.reshape(start.u.shape)
         u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # which IPOPT may pass
@@ -261,8 +266,42 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
     return ""
 
 
-def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> casadi.Function:
-    """IPOPT for the transcribed task, with exact sparse derivatives.
+class _IterationLimit(casadi.Callback):
+    """Ends IPOPT after a number of iterations that each call may choose, as CasADi has no such parameter.
+
+    Args:
+        sizes: numbers in the variables x, the constraints g and the parameters p.
+    """
+
+    def __init__(self, sizes: Mapping[str, int]):
+        super().__init__()
+        self.sizes, self.done, self.most = sizes, 0, 0
+        self.construct("iteration_limit", {})
+
+    def start(self, most: int) -> None:
+        """Count from here."""
+        self.done, self.most = -1, most  # the start is reported too
+
+    def is_reached(self) -> bool:
+        return self.done >= self.most
+
+    def get_n_in(self) -> int:
+        return casadi.nlpsol_n_out()
+
+    def get_n_out(self) -> int:
+        return 1
+
+    def get_sparsity_in(self, i: int) -> casadi.Sparsity:
+        name = casadi.nlpsol_out(i)
+        return casadi.Sparsity.dense(1 if name == "f" else self.sizes[name.removeprefix("lam_")])
+
+    def eval(self, arg: Sequence[casadi.DM]) -> list[int]:
+        self.done += 1
+        return [int(self.is_reached())]
+
+
+def _solver(task: CasadiTask, steps: int, limited: bool) -> tuple[_IterationLimit, casadi.Function]:
+    """IPOPT for the transcribed task, with exact sparse derivatives, and what limits its iterations.
 
     Variables are (u, x) in units of their scales, parameters x₀, what J is divided by, and those scales.
     """
@@ -282,6 +321,7 @@ def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> cas
     enough = {"tol": ACCEPTABLE, "constr_viol_tol": ACCEPTABLE, "compl_inf_tol": ACCEPTABLE, "dual_inf_tol": 1e-4}
     acceptable = {f"ipopt.acceptable_{name}": value for name, value in enough.items()}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
-    ends = {"ipopt.max_iter": iterations, "ipopt.max_wall_time": SECONDS, "ipopt.acceptable_iter": 5}
+    limit = _IterationLimit({name: problem[name].numel() for name in ("x", "g", "p")})
+    ends = {"iteration_callback": limit, "ipopt.max_wall_time": SECONDS, "ipopt.acceptable_iter": 5}
     options = {**quiet, **exact, **acceptable, **ends}
-    return casadi.nlpsol("transcription", "ipopt", problem, options)
+    return limit, casadi.nlpsol("transcription", "ipopt", problem, options)

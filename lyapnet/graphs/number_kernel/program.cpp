@@ -599,6 +599,147 @@ void products(const Machine<T> &machine, const Integer *row) {
     }
 }
 
+// --- Small linear systems, one for each of a batch: the last two axes of the shape are a matrix ---
+
+constexpr int MOST_UNKNOWNS = 32;  // as in program.py
+
+// out = A⁻¹ of symmetric positive definite A, from its lower triangle, several matrices at once. Each pivot p in turn
+// takes a_pp to −1/a_pp, a_ip to a_ip/a_pp and a_ij to a_ij − a_ip a_jp/a_pp: after the last one the matrix is −A⁻¹.
+template <class T>
+void symmetric_inverse(const Machine<T> &machine, const Integer *row) {
+    VECTOR;
+    const int rank = *row++, batch = rank - 3;
+    const Integer *shape = row;
+    const int d = shape[rank - 1];
+    row += rank;
+    Operand<T> operands[2] = {machine.operand(row, rank), {}};
+    operands[1] = machine.operand(row, rank);
+    const Integer *to = operands[0].strides + batch, *from = operands[1].strides + batch;  // of batch, rows, columns
+    V a[MOST_UNKNOWNS][MOST_UNKNOWNS], column[MOST_UNKNOWNS];
+    for_each_row<T, 2>(batch + 1, shape, operands, [&](T **at) {
+        for (Integer first = 0; first < shape[batch]; first += LANES) {
+            const int count = std::min<Integer>(LANES, shape[batch] - first);
+            for (int i = 0; i < d; i++)
+                for (int j = 0; j <= i; j++)
+                    a[i][j] = gathered(at[1] + first * from[0] + i * from[1] + j * from[2], from[0], count);
+            for (int p = 0; p < d; p++) {
+                const V reciprocal = 1 / a[p][p];
+                for (int i = 0; i < d; i++) column[i] = i < p ? a[p][i] : a[i][p];
+                for (int i = 0; i < d; i++) {
+                    const V scaled = column[i] * reciprocal;
+                    for (int j = 0; j <= i; j++) {
+                        if (i != p && j != p) a[i][j] -= scaled * column[j];
+                    }
+                    if (i != p) a[std::max(i, p)][std::min(i, p)] = scaled;
+                }
+                a[p][p] = -reciprocal;
+            }
+            for (int i = 0; i < d; i++)
+                for (int j = 0; j < d; j++)
+                    scattered(at[0] + first * to[0] + i * to[1] + j * to[2], to[0], -a[std::max(i, j)][std::min(i, j)],
+                              count);
+        }
+    });
+}
+
+// The solution of A v = v, in the place of v, for the lower triangle of symmetric positive definite A, which it uses up
+template <class T>
+inline void solve_in_place(int d, T (&A)[MOST_UNKNOWNS][MOST_UNKNOWNS], T *v) {
+    for (int j = 0; j < d; j++) {  // A = L Lᵀ
+        for (int k = 0; k < j; k++)
+            for (int i = j; i < d; i++) A[i][j] -= A[i][k] * A[j][k];
+        const T root = std::sqrt(A[j][j]);
+        for (int i = j; i < d; i++) A[i][j] /= root;
+    }
+    for (int i = 0; i < d; i++) {
+        for (int k = 0; k < i; k++) v[i] -= A[i][k] * v[k];
+        v[i] /= A[i][i];
+    }
+    for (int i = d - 1; i >= 0; i--) {
+        for (int k = i + 1; k < d; k++) v[i] -= A[k][i] * v[k];
+        v[i] /= A[i][i];
+    }
+}
+
+constexpr int ROUNDS = 4;  // for each control, as in sets.py
+
+// Which of m controls are at a limit where uᵀRu + bᵀu is least: −1 at the lower, 1 at the upper, 0 at none. In each round
+// towards the minimum over those that no limit holds, up to the first limit on the way, which holds from there; or all
+// the way, and then of the held ones that is let go which gains most.
+template <class T>
+void find_active_set(int m, const T (&R)[MOST_UNKNOWNS][MOST_UNKNOWNS], const T *b, const T *low, const T *high, T *side) {
+    T u[MOST_UNKNOWNS], A[MOST_UNKNOWNS][MOST_UNKNOWNS], step[MOST_UNKNOWNS];
+    int free[MOST_UNKNOWNS];
+    for (int i = 0; i < m; i++) {
+        u[i] = std::min(std::max(-b[i] / (2 * R[i][i]), low[i]), high[i]);
+        side[i] = (u[i] >= high[i]) - (u[i] <= low[i]);
+    }
+    for (int round = 0; round < ROUNDS * m; round++) {
+        int count = 0;
+        for (int i = 0; i < m; i++)
+            if (side[i] == 0) free[count++] = i;
+        for (int k = 0; k < count; k++) {
+            const int i = free[k];
+            step[k] = -b[i] / 2;
+            for (int j = 0; j < m; j++) step[k] -= R[i][j] * u[j];
+            for (int l = 0; l <= k; l++) A[k][l] = R[i][free[l]];
+        }
+        solve_in_place(count, A, step);
+        T share = INFINITY;
+        int first = -1;
+        for (int k = 0; k < count; k++) {
+            if (step[k] == 0) continue;
+            const T room = ((step[k] > 0 ? high : low)[free[k]] - u[free[k]]) / step[k];
+            if (room < share) share = room, first = k;
+        }
+        const bool arrived = !(share < 1);
+        for (int k = 0; k < count; k++) u[free[k]] += (arrived ? 1 : share) * step[k];
+        if (!arrived) {
+            const int i = free[first];
+            side[i] = step[first] > 0 ? 1 : -1;
+            u[i] = (step[first] > 0 ? high : low)[i];
+            continue;
+        }
+        T most = 0;
+        int released = -1;
+        for (int i = 0; i < m; i++) {
+            if (side[i] == 0) continue;
+            T slope = b[i];
+            for (int j = 0; j < m; j++) slope += 2 * R[i][j] * u[j];
+            const T gain = side[i] * slope / std::sqrt(R[i][i]);
+            if (gain > most) most = gain, released = i;
+        }
+        if (released < 0) return;
+        side[released] = 0;
+    }
+}
+
+// side = the active set for (b, low, high, R) of a batch
+template <class T>
+void active_set(const Machine<T> &machine, const Integer *row) {
+    const int rank = *row++, batch = rank - 3;
+    const Integer *shape = row;
+    const int m = shape[rank - 1];
+    row += rank;
+    Operand<T> operands[5] = {machine.operand(row, rank), {}, {}, {}, {}};
+    for (int k = 1; k < 5; k++) operands[k] = machine.operand(row, rank);
+    T R[MOST_UNKNOWNS][MOST_UNKNOWNS], vectors[4][MOST_UNKNOWNS];
+    for_each_row<T, 5>(batch + 1, shape, operands, [&](T **at) {
+        for (Integer each = 0; each < shape[batch]; each++) {
+            const T *given[5];
+            for (int k = 0; k < 5; k++) given[k] = at[k] + each * operands[k].strides[batch];
+            for (int i = 0; i < m; i++) {
+                for (int k = 1; k < 4; k++) vectors[k][i] = given[k][i * operands[k].strides[batch + 1]];
+                for (int j = 0; j < m; j++)
+                    R[i][j] = given[4][i * operands[4].strides[batch + 1] + j * operands[4].strides[batch + 2]];
+            }
+            find_active_set(m, R, vectors[1], vectors[2], vectors[3], vectors[0]);
+            T *to = at[0] + each * operands[0].strides[batch];
+            for (int i = 0; i < m; i++) to[i * operands[0].strides[batch + 1]] = vectors[0][i];
+        }
+    });
+}
+
 template <class T>
 using Instruction = void (*)(const Machine<T> &, const Integer *);
 
@@ -672,6 +813,8 @@ const Instruction<T> INSTRUCTIONS[] = {
     packed<T>,
     product_with_packed<T>,
     products<T>,
+    symmetric_inverse<T>,
+    active_set<T>,
 };
 
 template <class T>

@@ -80,10 +80,13 @@ OPERATIONS = {
             "pack",
             "product_with_packed",
             "products",
+            "symmetric_inverse",
+            "active_set",
         )
     )
 }
 MOST_RANK = 8  # as in program.cpp
+MOST_UNKNOWNS = 32  # of a small linear system, as in program.cpp
 LINE = 64  # bytes of a line of the cache, at which buffers begin
 
 
@@ -215,6 +218,20 @@ class Program:
             row += [place.buffer, place.offset, *place.strides]
         reads = [A.buffer, B.buffer, *([out.buffer] if add else [])]
         self._append("products", row, reads, out.buffer)
+
+    def small_matrices(self, operation: str, shape: Sequence[int], places: Sequence[Place]) -> None:
+        """places[0] = operation(the others), for each matrix of a batch (*batch, d, d).
+
+        Strides are 0 where an operand is repeated, and along the last axis for vectors.
+        """
+        if 0 in shape:
+            return
+        if shape[-1] > MOST_UNKNOWNS:
+            raise NotImplementedError(f"a small linear system of more than {MOST_UNKNOWNS} unknowns")
+        sizes, strides = _merged(shape[:-2], [place.strides[:-2] for place in places])
+        strides = [[*own, *place.strides[-2:]] for place, own in zip(places, strides, strict=True)]
+        row = _row(places, [*sizes, *shape[-2:]], strides)
+        self._append(operation, row, [place.buffer for place in places[1:]], places[0].buffer)
 
     def _append(self, operation: str, row: list[int], reads: Sequence[int], writes: int) -> None:
         self.buffers[writes].varies |= any(self.buffers[each].varies for each in reads)

@@ -230,6 +230,16 @@ def _add_matrix_product(
     _matrix_product(writer, out, A, B, add=True)
 
 
+def _symmetric_inverse(writer: Writer, out: Tensor, A: Tensor) -> None:
+    writer.program.small_matrices("symmetric_inverse", A.shape, [writer.place(out), writer.place(A)])
+
+
+def _active_set(writer: Writer, out: Tensor, b: Tensor, R: Tensor, low: Tensor, high: Tensor) -> None:
+    shape = *b.shape, b.shape[-1]
+    vectors = [writer.place(each.unsqueeze(-1), shape) for each in (out, b, low, high)]
+    writer.program.small_matrices("active_set", shape, [*vectors, writer.place(R, shape)])
+
+
 def _concatenate(writer: Writer, out: Tensor, parts: Sequence[Tensor], dim: int = 0) -> None:
     first = 0
     for part in parts:
@@ -369,6 +379,8 @@ RULES: dict[str, Callable[..., None]] = {
     "mv": _matrix_and_vector,
     "addmm": _add_matrix_product,
     "baddbmm": _add_matrix_product,
+    "symmetric_inverse": _symmetric_inverse,
+    "active_set": _active_set,
     "cat": _concatenate,
     "stack": _stack,
     "select_backward": _backward_of(_select_scatter),

@@ -1,0 +1,43 @@
+"""Functions of tensors that can stay one operator in a trace, for a reader that has an instruction for them."""
+
+import functools
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from torch import Tensor
+from torch.library import custom_op
+
+_AS_OPERATORS = ContextVar("functions are traced as operators", default=False)
+
+
+@contextmanager
+def as_operators() -> Iterator[None]:
+    """Within it, functions under `operator` are one operator each; elsewhere they are what they are written as."""
+    token = _AS_OPERATORS.set(True)
+    try:
+        yield
+    finally:
+        _AS_OPERATORS.reset(token)
+
+
+def are_operators() -> bool:
+    """Whether functions under `operator` are one operator each."""
+    return _AS_OPERATORS.get()
+
+
+def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """Make a function torch's operator lyapnet::NAME too, which it is `as_operators`.
+
+    Its arguments are tensors, its result has the shape and the type of the first one, and no gradient runs through it.
+    """
+    named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
+    whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")
+    whole.register_fake(lambda first, *_: first.new_empty(first.shape))
+
+    @functools.wraps(function)
+    def called(*tensors: Tensor) -> Tensor:
+        return whole(*tensors) if are_operators() else function(*tensors)
+
+    return called

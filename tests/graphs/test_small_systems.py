@@ -1,0 +1,123 @@
+"""Small linear systems and minima within a box, which the kernel has as one instruction each."""
+
+import contextlib
+import math
+
+import pytest
+import torch
+from torch.testing import assert_close
+
+from lyapnet.graphs.compilation import has_compiler
+from lyapnet.graphs.number_kernel.kernel import NumberKernel
+from lyapnet.graphs.tracing import name_of, trace
+from lyapnet.linear_algebra import solve
+from lyapnet.operators import are_operators, as_operators, operator
+from lyapnet.sets import ControlBox
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
+
+
+def convex(*batch, m):
+    """Some (R, b), of which the unlimited minimum is often outside the limits."""
+    factor = torch.randn(*batch, m, m)
+    return factor @ factor.mT + 0.05 * torch.eye(m), 4 * torch.randn(*batch, m)
+
+
+def operators_of(graph):
+    return [name_of(node.target) for node in graph.graph.nodes if "lyapnet" in str(node.target)]
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (13,), (2, 3, 5)])
+@pytest.mark.parametrize("m", [3, 4, 6, 9, 32])
+def test_the_minimum_within_limits_is_that_of_rounds(m, batch):
+    low, high = -torch.rand(m), torch.rand(m)
+    low[0], high[1] = -math.inf, math.inf
+    controls, (R, b) = ControlBox(low, high), convex(*batch, m=m)
+    graph = trace(lambda R, b: (controls.minimise(R, b),), [R, b], whole=True)
+    assert operators_of(graph) == ["active_set", "symmetric_inverse"]
+    (u,) = NumberKernel(graph, [R, b])(R, b)
+    assert_close(u, controls.minimise(R, b), rtol=0, atol=1e-10)
+    assert controls.contains(u).all()
+    if u.numel() > 10:
+        held = ((u == low) | (u == high)).double().mean()
+        assert 0.1 < held < 0.9, "some are at a limit, some at none"
+
+
+def test_all_or_none_may_be_held():
+    controls, (R, b) = ControlBox(-1.0, 1.0), convex(7, m=3)
+    kernel = NumberKernel(trace(lambda R, b: (controls.minimise(R, b),), [R, b], whole=True), [R, b])
+    far = 1e4 * torch.ones(7, 3)
+    assert_close(kernel(torch.eye(3).expand(7, 3, 3).clone(), far)[0], -torch.ones(7, 3), rtol=0, atol=0)
+    assert_close(kernel(R, 1e-4 * b)[0], solve(R, -5e-5 * b[..., None])[..., 0])
+    b[2, 1], R[4, 0, 0] = math.nan, math.inf
+    u = kernel(R, b)[0]
+    assert u.isnan().any(-1).nonzero().flatten().tolist() == [2, 4]
+
+
+@pytest.mark.parametrize("m", [3, 7])
+def test_its_slope_is_that_of_the_free_controls(m):
+    """Of what a limit holds it is zero, of the others that of the linear system that is left for them."""
+    controls, (R, b) = ControlBox(-0.5, 0.5), convex(20, m=m)
+
+    def slope(R, b, bar):
+        with torch.enable_grad():
+            b = b.detach().requires_grad_()
+            return torch.autograd.grad(controls.minimise(R, b), b, bar)
+
+    bar = torch.randn(20, m)
+    graph = trace(slope, [R, b, bar], whole=True)
+    (got,) = NumberKernel(graph, [R, b, bar])(R, b, bar)
+    h, differences = 1e-6, torch.empty(20, m)
+    for j in range(m):
+        step = h * torch.eye(m)[j]
+        difference = (controls.minimise(R, b + step) - controls.minimise(R, b - step)) / (2 * h)
+        differences[:, j] = (bar * difference).sum(-1)
+    assert_close(got, differences, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("d", [3, 5, 8, 32])
+def test_inverses_and_their_slopes_are_torchs(d):
+    A, B = convex(11, m=d)[0] + torch.eye(d), torch.randn(11, d, 2)
+
+    def both(A, B):
+        with torch.enable_grad():
+            A = A.detach().requires_grad_()
+            X = solve(A, B)
+            return X.detach(), torch.autograd.grad(X.square().sum(), A)[0]
+
+    graph = trace(both, [A, B], whole=True)
+    assert operators_of(graph) == ["symmetric_inverse"]
+    X, slope = NumberKernel(graph, [A, B])(A, B)
+    assert_close(X, torch.linalg.solve(A, B))
+    assert_close(slope, -2 * torch.linalg.solve(A.mT, X) @ X.mT)
+
+
+def test_larger_systems_are_no_instruction():
+    R, b = convex(3, m=33)
+    graph = trace(lambda R, b: (solve(R, b[..., None]),), [R, b], whole=True)
+    with pytest.raises(NotImplementedError, match="more than 32 unknowns"):
+        NumberKernel(graph, [R, b])
+
+
+def test_elsewhere_functions_are_what_they_are_written_as():
+    controls, (R, b) = ControlBox(-1.0, 1.0), convex(5, m=3)
+    assert not operators_of(trace(lambda R, b: (controls.minimise(R, b),), [R, b])), "other readers have no such rule"
+    with contextlib.suppress(ZeroDivisionError), as_operators():
+        assert are_operators()
+        raise ZeroDivisionError
+    assert not are_operators()
+
+
+def test_an_operator_computes_what_its_function_does():
+    @operator
+    def twice_and_one_more(x: torch.Tensor, one: torch.Tensor) -> torch.Tensor:
+        return 2 * x + one
+
+    x = torch.randn(4)
+    with as_operators():
+        assert_close(twice_and_one_more(x, torch.ones(4)), 2 * x + 1)
+    assert_close(twice_and_one_more(x, torch.ones(4)), 2 * x + 1)
+    graph = trace(lambda x: (twice_and_one_more(x, x),), [x], whole=True)
+    assert operators_of(graph) == ["twice_and_one_more"]
+    with pytest.raises(NotImplementedError, match="twice_and_one_more"):
+        NumberKernel(graph, [x])

@@ -33,7 +33,7 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
-NEAR, SETTLED = 1e-3, 1e-9  # relative improvements of J_N at which second derivatives of F join, and that are none
+NEAR, SETTLED = 1e-3, 1e-9  # shares of J_N to gain at which second derivatives of F join, and that are none
 HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
 ROUNDING = 1e-12  # of the largest eigenvalue of Q_uu, below which the others are lost in it
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
@@ -48,8 +48,7 @@ class Optimum(NamedTuple):
 
     def member(self, rows: Tensor) -> "Optimum":
         """Those with some indices."""
-        x, u, cost = self.path
-        return Optimum(Path(x[:, rows], u[:, rows], cost[rows]), self.expansion.member(rows), self.mended[rows])
+        return Optimum(self.path.member(rows), self.expansion.member(rows), self.mended[rows])
 
 
 class _Backward(NamedTuple):
@@ -57,6 +56,10 @@ class _Backward(NamedTuple):
     K: Tensor  # (N, *batch, m, n)
     expansion: Expansion
     mended: Tensor  # (N + 1, *batch) the nodes with a derivative that does not exist
+
+    def member(self, rows: Tensor) -> "_Backward":
+        """Those with some indices."""
+        return _Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.mended[:, rows])
 
 
 def riccati(problem: Problem) -> Expansion:
@@ -112,24 +115,24 @@ def optimal_trajectories(
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
         return path_under(problem, lambda n, _: controls[n], x0)
 
-    now, higher_order = under(u), problem.horizon.method != "euler"
-    kinds, b = 2 + higher_order, len(x0)
+    def descended(problem: Problem, programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
+        descent = _Descent(problem, programs, now, curved, NEAR if kind < kinds - 1 else SETTLED)
+        descent.run(iterations, rivals, lambda count: progress((kind * b + count) // kinds, b), until)
+        return descent
 
-    def settled(kind: int) -> Callable[[int], None]:
-        return lambda count: progress((kind * b + count) // kinds, b)
-
+    higher_order = problem.horizon.method != "euler"
+    now, kinds, b = under(u), 2 + higher_order, len(x0)
     if higher_order:
         roughly = problem.in_steps(method="euler")
         rough = StepPrograms(roughly, STEP_SIZES)
-        euler = _descended(roughly, rough, under(u, roughly), False, iterations, NEAR, rivals, settled(0), until)
+        euler = descended(roughly, rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
     programs = StepPrograms(problem, STEP_SIZES)
-    now = _descended(problem, programs, now, False, iterations, NEAR, rivals, settled(kinds - 2), until)
-    now = _descended(problem, programs, now, True, iterations, SETTLED, rivals, settled(kinds - 1), until)
-    if not programs.agrees(now) and programs.forget():  # its numbers changed since programs were written
+    now = descended(problem, programs, now, curved=False, kind=kinds - 2).now
+    descent = descended(problem, programs, now, curved=True, kind=kinds - 1)
+    if not programs.agrees(descent.now) and programs.forget():  # its numbers changed since programs were written
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
-    backward = _backward(problem, programs, now.x, now.u)
-    return Optimum(now, backward.expansion, backward.mended.sum(0))
+    return descent.optimum()
 
 
 def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
@@ -148,36 +151,64 @@ def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path
     return path
 
 
-def _descended(
-    problem: Problem,
-    programs: StepPrograms,
-    now: Path,
-    curved: bool,
-    iterations: int,
-    enough: float,
-    rivals: bool,
-    progress: Callable[[int], None],
-    until: float,
-) -> Path:
-    """Where line searches lead until no trajectory improves by more than a share; each has a damping of its own."""
-    damping, failures, settled = torch.zeros_like(now.cost), torch.zeros_like(now.cost), ~now.cost.isfinite()
-    for k in range(iterations):
-        rows = torch.nonzero(~settled).flatten()
-        progress(len(settled) - len(rows))
-        if not len(rows) or time.thread_time() > until:
-            break
-        was = Path(now.x[:, rows], now.u[:, rows], now.cost[rows])
-        tried = _line_search(problem, programs, was, _backward(problem, programs, was.x, was.u, damping[rows], curved))
-        better = tried.cost < was.cost
-        x, u = torch.where(better[:, None], tried.x, was.x), torch.where(better[:, None], tried.u, was.u)
-        now = exchanged(now, rows, Path(x, u, torch.where(better, tried.cost, was.cost)))
-        failures[rows] = torch.where(better, 0, failures[rows] + 1)
-        damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
-        settled[rows] = better & (was.cost - tried.cost <= enough * was.cost.abs()) | (failures[rows] > TRIES)
-        if rivals and (curved or k >= GRACE) and settled.any():
-            least = now.cost[settled].min()
-            settled |= now.cost > least + (HOPELESS - 1) * least.abs()
-    return now
+class _Descent:
+    """Line searches until no trajectory is expected to gain more than a share of its cost; each has its own damping.
+
+    What a pass without damping expects is its V_0(x₀) beside J_N: to second order what the full step leads to.
+
+    Args:
+        now: trajectories to begin with.
+        curved: with the second derivatives of F.
+        enough: the share.
+    """
+
+    def __init__(self, problem: Problem, programs: StepPrograms, now: Path, curved: bool, enough: float):
+        self.problem, self.programs, self.curved, self.enough = problem, programs, curved, enough
+        self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (rows, the pass that expected no more of them)
+
+    def run(self, iterations: int, rivals: bool, progress: Callable[[int], None], until: float) -> None:
+        """Iterate; see optimal_trajectories."""
+        cost = self.now.cost
+        damping, failures, settled = torch.zeros_like(cost), torch.zeros_like(cost), ~cost.isfinite()
+        for k in range(iterations):
+            rows = torch.nonzero(~settled).flatten()
+            progress(len(settled) - len(rows))
+            if not len(rows) or time.thread_time() > until:
+                break
+            was, backward = self._pass(rows, damping[rows])
+            expected = (was.cost - backward.expansion.value[0]).abs()
+            going = (damping[rows] > 0) | ~(expected <= self.enough * was.cost.abs())
+            self._passes.append((rows[~going], backward.member(~going)))
+            settled[rows[~going]] = True
+            rows, was, backward = rows[going], was.member(going), backward.member(going)
+            if len(rows):
+                tried = _line_search(self.problem, self.programs, was, backward)
+                better = tried.cost < was.cost
+                gain = torch.where(better, was.cost - tried.cost, 0)
+                self.now = exchanged(self.now, rows[better], tried.member(better))
+                failures[rows] = torch.where(better, 0, failures[rows] + 1)
+                damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
+                settled[rows] = better & (gain <= self.enough * was.cost.abs()) | (failures[rows] > TRIES)
+            if rivals and (self.curved or k >= GRACE) and settled.any():
+                least = self.now.cost[settled].min()
+                settled |= self.now.cost > least + (HOPELESS - 1) * least.abs()
+
+    def optimum(self) -> Optimum:
+        """The trajectories, with V around each; there is no pass yet where the last search gained what is no gain."""
+        without = torch.ones_like(self.now.cost, dtype=torch.bool)
+        for rows, _ in self._passes:
+            without[rows] = False
+        left = torch.nonzero(without).flatten()
+        passes = [*self._passes, *([(left, self._pass(left)[1])] if len(left) else [])]
+        order = torch.cat([rows for rows, _ in passes]).argsort()
+        parts = zip(*(backward.expansion for _, backward in passes), strict=True)
+        mended = torch.cat([backward.mended for _, backward in passes], 1)[:, order].sum(0)
+        return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), mended)
+
+    def _pass(self, rows: Tensor, damping: Tensor | None = None) -> tuple[Path, _Backward]:
+        """Some of the trajectories, and the pass backwards along them."""
+        path = self.now.member(rows)
+        return path, _backward(self.problem, self.programs, path.x, path.u, damping, self.curved)
 
 
 def sizes(problem: Problem, cost: PerState) -> PerState:

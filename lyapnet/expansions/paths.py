@@ -19,6 +19,10 @@ class Path(NamedTuple):
     u: ControlPath
     cost: PerState
 
+    def member(self, rows: Tensor) -> "Path":
+        """Those with some indices."""
+        return Path(self.x[:, rows], self.u[:, rows], self.cost[rows])
+
 
 @torch.no_grad()
 def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:

@@ -8,7 +8,7 @@ from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati, oracle_of
-from lyapnet.expansions import greedy_law, optimal_trajectories, path_under, riccati, sizes
+from lyapnet.expansions import dynamic_programming, greedy_law, optimal_trajectories, path_under, riccati, sizes
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import ControlAffineSystem, Linear, Pendulum
 from tests.problems import problem_of
@@ -31,6 +31,28 @@ def swings():
     problem = hanging()
     x0 = problem.initial_states.sample(9, torch.Generator().manual_seed(0))
     return problem, x0, optimal_trajectories(problem, x0, still(problem, 9))
+
+
+def test_what_is_optimal_needs_one_pass_backwards_and_no_search(swings, monkeypatch):
+    problem, x0, optimum = swings
+    searched = []
+    search = dynamic_programming._line_search
+    monkeypatch.setattr(
+        dynamic_programming, "_line_search", lambda *given: searched.append(len(given[2].cost)) or search(*given)
+    )
+    again = optimal_trajectories(problem, x0, optimum.path.u)
+    assert not searched
+    assert_close(again.path.cost, optimum.path.cost, rtol=1e-12, atol=0)
+    for part, expected in zip(again.expansion, optimum.expansion, strict=True):
+        assert_close(part, expected, rtol=1e-6, atol=1e-8)
+    some = optimum.path.u.clone()
+    some[:, [2, 5]] += 0.01
+    beside = optimal_trajectories(problem, x0, some)
+    assert searched
+    assert max(searched) <= 2, "the others have been settled by what their passes expect"
+    for part, expected in zip(beside.expansion, optimum.expansion, strict=True):
+        assert_close(part, expected, rtol=1e-3, atol=1e-4)
+    assert_close(beside.path.cost, optimum.path.cost, rtol=1e-9, atol=0)
 
 
 def test_on_a_linear_problem_it_is_riccatis_solution():

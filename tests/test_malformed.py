@@ -441,7 +441,7 @@ def _checkpoint(tmp_path_factory):
         yield
 
 
-@pytest.mark.parametrize("count", [42, pytest.param(700, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, pytest.param(700, marks=pytest.mark.gate)])
 def test_what_is_malformed_is_refused_in_one_line_and_leaves_nothing(count, tmp_path, capsys):
     threads = torch.get_num_threads()
     found = {name: [] for name in ("traceback", "slow", "accepted", "left", "form", "status")}
@@ -463,6 +463,7 @@ def test_what_is_malformed_is_refused_in_one_line_and_leaves_nothing(count, tmp_
     assert all(few.values()), "\n".join(map(str, found.items()))
 
 
+@pytest.mark.gate
 def test_what_is_not_malformed_is_accepted(tmp_path, capsys):
     """A twin: the inputs are refused for what is wrong with them."""
     for template, section, functions, start in PLACES:

@@ -166,7 +166,7 @@ def minimise_in_graph(controls, R, b):
     return controls.minimise(R, b.clone().requires_grad_()).detach()
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [200, pytest.param(100_000, marks=pytest.mark.gate)])
 @pytest.mark.parametrize("m", range(1, 7))
 def test_within_limits_the_minimum_is_that_of_another_solver(m, count):
     """Some controls are held at a limit, in some states; the clipped minimum of all is another."""

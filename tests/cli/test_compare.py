@@ -21,7 +21,7 @@ from lyapnet.evaluation.measurement import evaluate
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "conf" / "compare_smoke.yaml"
-SOME = ["--tasks", "double_integrator", "--methods", "lyapnet,ppo_tuned"]  # the slow test has all of them
+SOME = ["--tasks", "double_integrator", "--methods", "lyapnet,ppo_tuned"]  # test_the_whole_comparison has all of them
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +68,12 @@ def require_complete(folder, said, tasks, methods, unclipped):
     assert within == unclipped
 
 
+@pytest.mark.gate
 def test_every_method_is_trained_and_measured_alike(smoke):
     require_complete(*smoke, ["double_integrator"], [OURS, "ppo_tuned"], unclipped=1)
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_the_whole_comparison(tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     tasks = load_comparison(SMOKE).tasks
@@ -80,6 +81,7 @@ def test_the_whole_comparison(tmp_path):
     require_complete(tmp_path, compared(tmp_path, "--workers", "2"), tasks, LEARNED, unclipped=3)
 
 
+@pytest.mark.gate
 def test_planners_stand_beside_what_learns(smoke, compare):
     status, out, err = compare("--tasks", "double_integrator", "--methods", "lqr,mpc_100", "--workers", "2")
     assert status == 0, err
@@ -111,7 +113,7 @@ def compare(smoke, monkeypatch, capsys):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_the_same_command_again_trains_nothing(smoke, compare):
     before = {path: path.stat().st_mtime_ns for path in (smoke[0] / "logs").rglob("result.json")}
     status, out, err = compare(*SOME)
@@ -121,6 +123,7 @@ def test_the_same_command_again_trains_nothing(smoke, compare):
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("change", "named", "report"),
     [
@@ -135,7 +138,7 @@ def test_another_config_is_not_taken_for_the_same(change, named, report, compare
     assert len(err.strip().splitlines()) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_seeds_beyond_the_config_are_reported(smoke, compare):
     tasks = "double_integrator,double_integrator"
     status, out, err = compare("--tasks", tasks, "--methods", "ppo_tuned", "--seeds", "2")
@@ -147,7 +150,7 @@ def test_seeds_beyond_the_config_are_reported(smoke, compare):
     assert len(rows) == 3
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_killed_job_goes_on(tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     longer = "tasks.double_integrator.steps.ppo_tuned=15000"
@@ -180,7 +183,7 @@ def steps_kept(folder):
     return max(int(path.name[5:]) for path in (folder / "checkpoints").glob("step_*"))
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 @pytest.mark.parametrize("killed", ["all of it", "the parent alone"])
 def test_a_killed_comparison_goes_on(killed, tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
@@ -228,6 +231,7 @@ def test_command_says_in_one_line_what_is_wrong(capsys):
     assert "task/method/seed_k" in capsys.readouterr().err
 
 
+@pytest.mark.gate
 def test_a_run_without_metrics_is_told_in_one_line(smoke, compare):
     """As a run of lyapnet 0.1, whose curves were in event files alone."""
     job = smoke[0] / "logs" / "compare_smoke" / "double_integrator" / "lyapnet" / "seed_0"

@@ -89,7 +89,7 @@ def trains(arguments: list[str]) -> bool:
     return "trainer.strategy=ddp" not in arguments  # which starts this very process again: see test_distributed
 
 
-@pytest.mark.gate
+@pytest.mark.nightly
 def test_every_command_runs(workplace, capsys):
     trainings = commands("python train.py")
     assert len(trainings) >= 4

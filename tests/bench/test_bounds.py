@@ -228,7 +228,7 @@ def test_json_and_figure(run, enclosed, monkeypatch, tmp_path):
     status, out, err = run("--json", "--figures", str(tmp_path / "new"))
     assert status == 0, err
     result = json.loads(out)
-    assert [row["enclosure"] for row in result["tightness"]] == list(ENCLOSURES)
+    assert [row["enclosure"] for row in result["tightness"]] == list(enclosed)
     assert [row["method"] for row in result["proofs"]] == [*METHODS, "certifier"]
     assert all(len(row["factors"]) == len(row["sides"]) for row in result["tightness"])
     assert [row["verdict"] for row in result["proofs"]] == ["certified"] * len(METHODS) + ["falsified"]

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -73,7 +74,7 @@ def test_every_method_is_trained_and_measured_alike(smoke):
     require_complete(*smoke, ["double_integrator"], [OURS, "ppo_tuned"], unclipped=1)
 
 
-@pytest.mark.gate
+@pytest.mark.nightly
 def test_the_whole_comparison(tmp_path):
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     tasks = load_comparison(SMOKE).tasks
@@ -118,7 +119,7 @@ def test_the_same_command_again_trains_nothing(smoke, compare):
     before = {path: path.stat().st_mtime_ns for path in (smoke[0] / "logs").rglob("result.json")}
     status, out, err = compare(*SOME)
     assert status == 0, err
-    assert "2 jobs" not in out
+    assert not re.search(r"\b2 jobs", out)
     assert before
     assert before == {path: path.stat().st_mtime_ns for path in before}
 
@@ -146,8 +147,8 @@ def test_seeds_beyond_the_config_are_reported(smoke, compare):
     assert "2/2" in out
     with (smoke[0] / "logs" / "compare_smoke" / "report" / "results.csv").open(newline="") as file:
         rows = [(row["task"], row["method"], row["seed"]) for row in csv.DictReader(file)]
-    assert ("double_integrator", "ppo_tuned", "1") in rows
-    assert len(rows) == 3
+    assert [seed for _, method, seed in rows if method == "ppo_tuned"] == ["0", "1"]
+    assert [seed for _, method, seed in rows if method == "lyapnet"] == ["0"]
 
 
 @pytest.mark.gate

@@ -189,15 +189,25 @@ def quadratic():
     return Quadratic
 
 
+MARKS = pytest.StashKey[dict[str, set[str]]]()
 LONG = (
-    "test_runs.py", "test_start.py", "test_constraints.py", "test_crossing.py", "test_readme.py", "test_funnel.py",
-    "test_negative_controls.py", "test_bounds.py",
+    "test_false_attempts.py", "test_runs.py", "test_regions.py", "test_compare.py", "test_evil_files.py",
+    "test_export.py", "test_operators.py", "test_kept_regions.py", "test_rules.py", "test_constraints.py",
+    "test_start.py", "test_negative_controls.py", "test_readme.py", "test_settling.py", "test_refinement.py",
 )  # fmt: skip
 
 
-def pytest_collection_modifyitems(items):
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items, config):
     """The files that take longest come first, so that no process is left alone with one of them."""
     items.sort(key=lambda item: item.path.name not in LONG)
+    config.stash[MARKS] = {item.nodeid: {mark.name for mark in item.iter_markers()} for item in items}
+
+
+@pytest.fixture(scope="session")
+def marks(request) -> dict[str, set[str]]:
+    """Id ↦ marks of all tests that were collected, also of those that do not run now."""
+    return request.config.stash[MARKS]
 
 
 def pytest_collection_finish():

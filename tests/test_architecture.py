@@ -79,6 +79,7 @@ def one_way(modules):
     return list(TopologicalSorter({name: found - {"lyapnet"} for name, found in graph.items()}).static_order())
 
 
+@pytest.mark.gate
 def test_every_room_stands_on_its_level():
     assert set().union(*LEVELS) == rooms(sources()).keys()
     assert not list(upward(sources()))
@@ -148,18 +149,21 @@ def loaded(*statements):
     return set(done.stdout.split())
 
 
+@pytest.mark.gate
 def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
     heavy = {"torch", "lightning", "matplotlib", "tensorboard", "gymnasium", "casadi"}
     assert not heavy & loaded("import lyapnet", "import lyapnet.cli")
     assert heavy & loaded("import lyapnet.evaluation.figures") == {"torch", "matplotlib"}
 
 
+@pytest.mark.gate
 def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning():
     assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.config")
     slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
     assert not slow & loaded("import lyapnet.build, lyapnet.training.build_learner, lyapnet.training.facts")
 
 
+@pytest.mark.gate
 def test_training_and_comparing_import_no_module_of_unix_alone():
     without = "sys.modules |= dict.fromkeys(['fcntl', 'resource'])"
     psutil = "import sys, psutil"  # which on Linux imports them itself
@@ -167,6 +171,7 @@ def test_training_and_comparing_import_no_module_of_unix_alone():
     assert "lyapnet.training.run_lock" in found
 
 
+@pytest.mark.gate
 def test_training_loads_neither_bench_nor_comparison():
     found = loaded("import lyapnet", "lyapnet.train")
     assert "lyapnet.training.experiment" in found

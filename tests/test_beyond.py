@@ -29,6 +29,7 @@ from lyapnet.regulator import Regulator
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box, ControlBox
 from lyapnet.systems import DoubleIntegrator, Linear, Pendulum
+from tests.marks import sample
 from tests.problems import CONF, Formula, Quadratic, problem_of
 
 T = 1.0
@@ -126,6 +127,7 @@ def test_no_time_is_before_the_horizon(beyond):
         controller(beyond).policy(-0.1, X)
 
 
+@pytest.mark.gate
 def test_the_regulator_is_that_of_a_long_horizon():
     """Held against Riccati's recursion over 4000 steps, and against scipy's solution written out."""
     system = DoubleIntegrator()
@@ -397,14 +399,14 @@ def test_what_does_not_hold_is_said_at_load(tmp_path, logged):
 
 @pytest.mark.parametrize(
     "said",
-    [
+    sample([
         None, "riccati", {}, {"beyond": "riccati"}, {"beyond": "error", "held": 1, "loops": 1, "reason": ""},
         {"beyond": ["riccati"], "held": 1, "loops": 1, "reason": ""},
         {"beyond": "riccati", "held": True, "loops": 1, "reason": ""},
         {"beyond": "riccati", "held": 1, "loops": 1, "reason": "", "more": 1},
         {"beyond": "receding", "held": 65, "loops": 64, "reason": ""},
         {"beyond": "receding", "held": 1, "loops": 64, "reason": "\x1b[2J"},
-    ],
+    ], 7),
 )  # fmt: skip
 def test_what_a_checkpoint_cannot_mean_is_found_anew(said, tmp_path):
     found = lyapnet.load(checkpoint_that_says(tmp_path, said)).after_horizon()

@@ -266,16 +266,19 @@ def outcomes(tmp_path_factory):
     return dict(zip(calls, train(folder, list(calls.values())), strict=True))
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("overrides", REFUSED)
 def test_bad_value_is_refused(overrides, outcomes):
     is_refused(outcomes[overrides], *REFUSED[overrides])
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", [*FILES, "missing.yaml", "."])
 def test_bad_file_is_refused(name, outcomes):
     is_refused(outcomes[name], f"'{name}'")
 
 
+@pytest.mark.gate
 def test_without_bad_values_the_config_trains(outcomes):
     status, said, made = outcomes[""]
     assert (status, made) == (0, True)

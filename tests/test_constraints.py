@@ -153,6 +153,7 @@ def test_the_oracle_finds_the_closed_form_of_bryson_and_denham(limit):
     assert abs(float(problem.constraints.worst(path.x).max())) <= 1e-6
 
 
+@pytest.mark.gate
 def test_a_violation_is_no_cheaper_optimum():
     """Controls that violate a constraint cost less than the optimum, and are none to compare with."""
     pytest.importorskip("casadi")
@@ -171,6 +172,7 @@ def test_a_state_from_which_a_limit_cannot_be_kept_has_no_optimum():
     assert "IPOPT" in optima.reasons[0]
 
 
+@pytest.mark.gate
 def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
     monkeypatch.setattr("lyapnet.training.relaxation.STATES", 3)
     problem = bryson_denham(0.1).relaxed()
@@ -211,6 +213,7 @@ def run(tmp_path_factory):
         return lyapnet.train(content, [*BRIEF, "rollout.policy=sampled", "constraints.margin=0.02"])
 
 
+@pytest.mark.gate
 def test_a_training_with_constraints(run):
     """Of a few steps: what it finds, says, keeps, and goes on with."""
     relaxation, result = run.record()["relaxation"], run.evaluation
@@ -228,6 +231,7 @@ def test_a_training_with_constraints(run):
     assert float(problem.constraints.worst(free.x).max()) > 0.5
 
 
+@pytest.mark.gate
 def test_a_resumed_training_has_the_same_penalty(run):
     first = read_checkpoint(run.last)
     before = {k: v.clone() for k, v in first["state_dict"].items()}
@@ -238,6 +242,7 @@ def test_a_resumed_training_has_the_same_penalty(run):
     assert any(not torch.equal(before[k], stored["state_dict"][k]) for k in before)
 
 
+@pytest.mark.gate
 def test_who_violates_is_told(run):
     controller = lyapnet.load(run.best)
     tighter = AllOf([StateLimits([1], [0.3], [1.0], [0.3], ["slow"]), StateLimits([0], [9.0], [1.0], [9.0], ["far"])])
@@ -251,6 +256,7 @@ def test_who_violates_is_told(run):
     assert far["violated"] == 0
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_optima")
 def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     content = {**constrained(name="tests.test_constraints:Tube"), "logs": str(tmp_path)}
@@ -262,6 +268,7 @@ def test_own_constraints_are_never_imported_by_a_checkpoint(tmp_path):
     assert by_hand.constraints.reach == 3.0
 
 
+@pytest.mark.gate
 def test_no_number_is_a_violation(run):
     table = evaluation(lyapnet.load(run.best), 8, optimum=False).table
     broken = dataclasses.replace(table, worst=torch.where(torch.arange(8)[:, None] < 2, torch.nan, -1.0))
@@ -324,6 +331,7 @@ def test_paths_around_a_disk():
     assert math.isclose(panel.patches[0].get_radius(), 0.3)
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_optima")
 def test_what_is_said_before_training_names_the_penalty():
     config = config_from_plain(constrained(**SPEED), ["rollout.policy=sampled"])

@@ -47,6 +47,7 @@ def plain_default():
     torch.set_default_dtype(torch.float64)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("precision", "also"), [("float64", set()), ("float32", {torch.float32})])
 def test_commands_have_the_type_of_their_precision(tmp_path, capsys, plain_default, precision, also):
     task = tmp_path / "charger.yaml"

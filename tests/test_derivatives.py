@@ -1,5 +1,6 @@
 """Derivatives along trajectories, where some of them do not exist at a node."""
 
+import pytest
 import torch
 from torch.testing import assert_close
 
@@ -45,6 +46,7 @@ def of(problem, x0):
     return optimal_trajectories(problem, x0, torch.zeros(30, len(x0), 2))
 
 
+@pytest.mark.gate
 def test_a_curvature_that_is_missing_at_one_node_does_not_cost_the_others_theirs():
     problem, x0 = drone(), torch.tensor([[3.0, 1.0, 0, 0], [2.0, 0.9, 0, 0]])
     for system in (Drone(), Rooted()):

@@ -238,6 +238,7 @@ def written_to(tmp_path, **changes):
     return str(tmp_path / "task.yaml")
 
 
+@pytest.mark.gate
 def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
     assert main(["train", "--config", written_to(tmp_path), "rollout.gradient=backprop"]) == 0
     result = json.loads((tmp_path / "logs/economy/version_0/evaluation.json").read_text())
@@ -249,6 +250,7 @@ def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
     assert str(lyapnet.load(run, system=Village(), cost=Displeasure()).problem.domain).startswith("capital > 0")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 @pytest.mark.parametrize("gradient", ["discrete", "backprop"])
 def test_the_gradient_of_a_closed_loop_that_leaves_is_finite(method, gradient):
@@ -305,6 +307,7 @@ class Worth(lyapnet.ValueFunction):
         return -self.price * x[..., 0] + 0 * t
 
 
+@pytest.mark.gate
 def test_check_says_the_domain_and_who_leaves_it(tmp_path, brief, capsys, monkeypatch):
     assert main(["check", written_to(tmp_path), "--json"]) == 0
     facts = [fact for fact in json.loads(capsys.readouterr().out)["facts"] if fact["fact"] == "domain"]

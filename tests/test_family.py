@@ -179,6 +179,7 @@ def trained(tmp_path_factory):
     return folder / "masses" / "version_0" / "checkpoints" / "best.ckpt"
 
 
+@pytest.mark.gate
 def test_a_controller_is_told_its_member(trained):
     controller = lyapnet.load(trained)
     x, mass = np.array([[0.4, 0.1], [0.2, -0.3]]), np.array([0.8, 1.1])
@@ -199,6 +200,7 @@ def test_a_controller_is_told_its_member(trained):
     assert controller.rollout(x, 3, mass=1.1, length=1.2).x.shape == (4, 2, 2)
 
 
+@pytest.mark.gate
 def test_a_member_is_the_same_however_it_is_named(trained):
     torch.set_default_dtype(torch.float32)  # as it is outside of tests: 0.9 is no number of float32
     controller, x = lyapnet.load(trained), np.array([[0.4, 0.1], [0.2, -0.3]])
@@ -211,6 +213,7 @@ def test_a_member_is_the_same_however_it_is_named(trained):
     np.testing.assert_array_equal(controller.rollout(x, length=1.4, mass=0.9).cost, member.rollout(x).cost)
 
 
+@pytest.mark.gate
 def test_a_policy_asked_outside_its_family_says_so_once(trained, caplog):
     controller = lyapnet.load(trained)
     controller.policy(0, [0.0, 0.0], mass=0.8, length=1.5)
@@ -222,6 +225,7 @@ def test_a_policy_asked_outside_its_family_says_so_once(trained, caplog):
     assert "length in [0.9, 1.5], and is asked outside" in record.getMessage()
 
 
+@pytest.mark.gate
 def test_what_a_member_is_asked_for_and_cannot_be(trained):
     controller = lyapnet.load(trained)
     with pytest.raises(UsageError, match="Expected values for mass, length, got mass"):
@@ -243,6 +247,7 @@ def test_what_a_member_is_asked_for_and_cannot_be(trained):
         member(controller.config, Parts(), controller.system, {"mass": [1, 1], "length": 1})
 
 
+@pytest.mark.gate
 def test_a_member_keeps_the_law_after_the_end(trained):
     """That of the family is a polynomial in its parameters; that of a member its own regulator."""
     x = np.array([0.1, -0.2])
@@ -252,6 +257,7 @@ def test_a_member_keeps_the_law_after_the_end(trained):
         assert family.policy(1e3, x, mass=0.9, length=1.1) == pytest.approx(own, rel=1e-3)
 
 
+@pytest.mark.gate
 def test_a_disturbed_parameter_is_told_where_v_knows_it(trained):
     rows = {row.disturbance: row for row in robustness(lyapnet.load(trained), samples=4, optimum=False)}
     assert {"mass -20%", "mass -20%, told", "mass +20%, told", "length +20%, told"} <= rows.keys()
@@ -259,6 +265,7 @@ def test_a_disturbed_parameter_is_told_where_v_knows_it(trained):
     assert "none" in rows
 
 
+@pytest.mark.gate
 def test_a_member_is_evaluated_by_name(trained, capsys):
     def evaluated(*arguments):
         status = main(["evaluate", str(trained), "--samples", "3", "--no-optimum", "--json", *arguments])
@@ -280,6 +287,7 @@ def test_a_member_is_evaluated_by_name(trained, capsys):
     assert "Expected --at once for each parameter" in " ".join(printed.err.split())
 
 
+@pytest.mark.gate
 def test_a_certificate_is_about_all_members_or_one(trained, capsys, tmp_path):
     def certified(*arguments):
         status = main(["certify", *arguments])
@@ -300,6 +308,7 @@ def test_a_certificate_is_about_all_members_or_one(trained, capsys, tmp_path):
     assert "Expected --at or --refine, got both" in certified("sound", str(trained), "--refine", "1", *one)[1]
 
 
+@pytest.mark.gate
 def test_weights_go_on_with_the_same_parameters_in_the_same_places(trained, tmp_path, caplog):
     few = {"logs": str(tmp_path), "training": {"iterations": 1, "batch_size": 2}, "program": {"name": "value"},
            "network": {"name": "expansion", "hidden": [4]}, "rollout": {"policy": "sampled"},
@@ -313,6 +322,7 @@ def test_weights_go_on_with_the_same_parameters_in_the_same_places(trained, tmp_
         lyapnet.train(config_from_plain(MASSES | few | {"family": {}}), finetune=trained)
 
 
+@pytest.mark.gate
 def test_figures_show_what_moves(trained):
     controller = lyapnet.load(trained)
     figure = trajectories(controller.rollout(controller.initial_states.sample(3)), controller.problem)
@@ -380,6 +390,7 @@ def test_targets_that_one_given_control_is_counted_from():
     assert_close(task.cost.terminal(torch.tensor([0.5, 0.0, 0.5])), torch.tensor(0.0))
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("path", sorted(CONF.glob("*_family.yaml")), ids=lambda path: path.stem)
 def test_the_shipped_families_learn(path):
     _, V, program, rollout = objects(load_config(path, ["network.hidden=[8]"]))

@@ -434,6 +434,7 @@ def test_what_is_appended_goes_through_no_link(folder):
     assert Path("victim").read_text() == "mine\nmore\n"
 
 
+@pytest.mark.gate
 def test_what_is_sound_is_read(folder):
     """The twins: what stands in the files is what is wrong with them."""
     (folder / "law.onnx").write_bytes(beside("short"))

@@ -18,6 +18,7 @@ from lyapnet.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPoli
 from lyapnet.rollout import Rollout
 from lyapnet.systems import DoubleIntegrator
 from lyapnet.training.build import build_learner
+from tests.marks import sample
 from tests.problems import Quadratic, problem_of, with_expansion
 
 TASK = {
@@ -58,7 +59,8 @@ def learner_of(name, law):
 
 
 @pytest.mark.parametrize(
-    ("name", "law"), [*((name, "sampled") for name in (*NETWORKS, "own")), ("expansion", "hjb"), ("stationary", "hjb")]
+    ("name", "law"),
+    sample([*((name, "sampled") for name in (*NETWORKS, "own")), ("expansion", "hjb"), ("stationary", "hjb")], 6),
 )
 def test_a_controller_of_parts_costs_what_its_training_measured(name, law):
     learner = learner_of(name, law)

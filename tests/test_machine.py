@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from lyapnet.machine import usable_cores
 
 ON_ONE_CORE = """
@@ -31,6 +33,7 @@ def test_cores_are_those_of_the_process():
     assert printed(ON_ONE_CORE) == [1]
 
 
+@pytest.mark.gate
 def test_peak_of_memory_is_in_bytes_and_outlives_what_was_held():
     size, peak = printed(HOLDING)
     assert size < peak < size + 2**27

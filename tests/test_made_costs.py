@@ -100,6 +100,7 @@ def test_both_routes_find_the_same_optimum():
     assert not torch.allclose(optima.cost, plain, rtol=1e-2)
 
 
+@pytest.mark.gate
 def test_a_guess_that_is_slow_at_first_is_not_given_up():
     """Here swinging back first is cheaper, and its guess settles long after that of the way straight up."""
     problem = objects(load_config(CONF / "pendulum_periodic.yaml"))[0]
@@ -111,6 +112,7 @@ def test_a_guess_that_is_slow_at_first_is_not_given_up():
     assert float(optimum.x[:, 0].max()) > 4, "it swings back first"
 
 
+@pytest.mark.gate
 def test_it_trains_and_comes_back(tmp_path, monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     shorten_fits(monkeypatch, 260, 140)

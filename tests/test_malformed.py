@@ -18,6 +18,7 @@ import yaml
 from lyapnet import sizes
 from lyapnet.cli import main
 from lyapnet.config import Config
+from tests.marks import at_the_gate
 
 SECONDS = 20
 BASE = {
@@ -441,8 +442,17 @@ def _checkpoint(tmp_path_factory):
         yield
 
 
-@pytest.mark.parametrize("count", [42, pytest.param(700, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20, at_the_gate(42)])
 def test_what_is_malformed_is_refused_in_one_line_and_leaves_nothing(count, tmp_path, capsys):
+    assert_refused(count, tmp_path, capsys)
+
+
+@pytest.mark.nightly
+def test_so_are_seven_hundred(tmp_path, capsys):
+    assert_refused(700, tmp_path, capsys)
+
+
+def assert_refused(count, tmp_path, capsys):
     threads = torch.get_num_threads()
     found = {name: [] for name in ("traceback", "slow", "accepted", "left", "form", "status")}
     for i, given in enumerate(malformed(count)):
@@ -463,6 +473,7 @@ def test_what_is_malformed_is_refused_in_one_line_and_leaves_nothing(count, tmp_
     assert all(few.values()), "\n".join(map(str, found.items()))
 
 
+@pytest.mark.gate
 def test_what_is_not_malformed_is_accepted(tmp_path, capsys):
     """A twin: the inputs are refused for what is wrong with them."""
     for template, section, functions, start in PLACES:

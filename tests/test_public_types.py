@@ -132,6 +132,7 @@ def site(tmp_path):
     return tmp_path / "site"
 
 
+@pytest.mark.gate
 def test_every_type_of_the_public_interface_is_known(site):
     known = symbols(site)
     assert len(known) >= 300
@@ -139,6 +140,7 @@ def test_every_type_of_the_public_interface_is_known(site):
     assert [name for name, is_known in known.items() if not is_known] == []
 
 
+@pytest.mark.gate
 def test_an_attribute_without_its_type_is_found(site):
     problem = site / "lyapnet" / "problem.py"
     source = problem.read_text(encoding="utf-8")
@@ -148,6 +150,7 @@ def test_an_attribute_without_its_type_is_found(site):
     assert {"lyapnet.problem.Problem.system", "lyapnet.problem.Problem", "lyapnet.loading.load"} <= unknown
 
 
+@pytest.mark.gate
 def test_a_script_of_a_user_is_clean_under_strict_and_a_wrong_argument_is_found(site):
     assert WRONG != SCRIPT
     for name, content in (("right", SCRIPT), ("wrong", WRONG)):

@@ -89,7 +89,7 @@ def trains(arguments: list[str]) -> bool:
     return "trainer.strategy=ddp" not in arguments  # which starts this very process again: see test_distributed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_every_command_runs(workplace, capsys):
     trainings = commands("python train.py")
     assert len(trainings) >= 4
@@ -100,6 +100,7 @@ def test_every_command_runs(workplace, capsys):
         assert main(brief(arguments)) in outcomes, (arguments, capsys.readouterr().err)
 
 
+@pytest.mark.gate
 def test_every_command_of_the_readme_runs(workplace, capsys):
     """But for the proof and the comparison, which take longer than the others together: see cli/."""
     of_readme = blocks("bash", README)
@@ -122,6 +123,7 @@ def understood(arguments: list[str]) -> dict:
         _, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
 
 
+@pytest.mark.gate
 def test_every_command_is_understood(workplace):
     """Each option exists, and each experiment and change that is named makes a config."""
     trainings = [["train", *arguments] for arguments in commands("python train.py")]
@@ -139,6 +141,7 @@ def test_every_command_is_understood(workplace):
         understood(["evaluate", "last.ckpt", "--samplez", "3"])
 
 
+@pytest.mark.gate
 def test_the_python_example_runs(trained, monkeypatch):
     monkeypatch.chdir(trained)
     (example,) = [block for block in blocks("python") if "lyapnet.load" in block and "controller.rollout" in block]
@@ -148,6 +151,7 @@ def test_the_python_example_runs(trained, monkeypatch):
     assert names["trajectory"].x.shape == (9, 2)
 
 
+@pytest.mark.gate
 def test_the_oracle_example_runs(trained, monkeypatch):
     monkeypatch.chdir(trained)
     names: dict = {"controller": lyapnet.load("logs/double_integrator/version_0/checkpoints/best.ckpt")}
@@ -176,6 +180,7 @@ def test_the_examples_from_python_train(workplace):
         assert len(rows) > 1
 
 
+@pytest.mark.gate
 def test_the_environment_example_runs(trained, monkeypatch):
     monkeypatch.chdir(trained)
     (example,) = [block for block in blocks("python") if "gymnasium.make" in block]
@@ -193,6 +198,7 @@ def test_the_table_of_the_comparison_is_that_of_its_report():
     assert "\n".join(shown) in report
 
 
+@pytest.mark.gate
 def test_a_system_of_your_own(workplace, monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     shorten_fits(monkeypatch, 40, 20)

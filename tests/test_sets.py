@@ -12,6 +12,7 @@ from torch.testing import assert_close
 
 from lyapnet.cost import QuadraticCost
 from lyapnet.sets import CONTROL_SETS, Box, ControlBox, Unbounded
+from tests.marks import at_the_gate
 
 
 def seeded(seed=0):
@@ -166,7 +167,7 @@ def minimise_in_graph(controls, R, b):
     return controls.minimise(R, b.clone().requires_grad_()).detach()
 
 
-@pytest.mark.parametrize("count", [200, pytest.param(100_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [200, at_the_gate(12_000), pytest.param(100_000, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize("m", range(1, 7))
 def test_within_limits_the_minimum_is_that_of_another_solver(m, count):
     """Some controls are held at a limit, in some states; the clipped minimum of all is another."""

@@ -21,7 +21,8 @@ def told_after(seconds, number):
     threading.Timer(seconds, os.kill, (os.getpid(), number)).start()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.gate
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.gate)])
 def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, few_seconds_for_levels):
     kept, reports = tmp_path / "proof", []
 
@@ -78,7 +79,7 @@ def test_without_a_signal_nothing_stops():
         assert float(torch.ones(())) == 1
 
 
-@pytest.mark.slow  # by the clock: on a machine that has nothing else to do
+@pytest.mark.nightly  # by the clock: on a machine that has nothing else to do
 @pytest.mark.parametrize("seconds", [12.0])
 def test_seconds_hold_for_all_of_a_certificate(seconds):
     """For a condition that no budget decides."""

@@ -117,7 +117,7 @@ def test_tutorials_that_are_run_lose_what_they_printed_before(monkeypatch):
             assert source[0].count("```") % 2 == 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_site_builds_with_its_tutorials_executed_and_needs_no_network(tmp_path):
     pytest.importorskip("myst_nb")
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "-D", "nb_execution_mode=force", str(DOCS), str(tmp_path)]

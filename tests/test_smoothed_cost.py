@@ -179,6 +179,7 @@ def test_what_trains_is_rounded():
     assert not kink_facts(plain), "the twin"
 
 
+@pytest.mark.gate
 def test_the_distance_to_a_goal():
     """Optima from no control and from the Riccati law, and by IPOPT, for what they cost as the task is written."""
     pytest.importorskip("casadi")

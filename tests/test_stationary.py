@@ -224,6 +224,7 @@ def test_any_other_network_is_read_at_one_time():
     assert isinstance(build_value_function(config, build_problem(config)), Timeless)
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_optima")
 def test_the_regulator_of_a_linear_system_is_known_before_training():
     (learner,) = build_module(config_from_plain(CHAIN)).members
@@ -240,6 +241,7 @@ def test_before_a_start_too_V_vanishes_at_the_target_alone():
     assert float(V(torch.zeros(()).double(), target)) == 0 < float(V(torch.zeros(()).double(), 0 * target))
 
 
+@pytest.mark.gate
 def test_from_the_goal_alone_there_is_a_start():
     only = {"initial_states": {"lower": [0, 0, 0], "upper": [0, 0, 0]}}
     (learner,) = build_module(config_from_plain(CHAIN | only)).members
@@ -250,6 +252,7 @@ def test_from_the_goal_alone_there_is_a_start():
     assert_close(H, 2 * P_of(learner.problem), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.gate
 def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     """Of a pendulum between tight limits it lies far below what V is on a wide X₀, and a fit sees both."""
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
@@ -273,6 +276,7 @@ def few_optima(monkeypatch):
     shorten_fits(monkeypatch, 130, 70)
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_optima")
 def test_a_checkpoint_is_loaded_with_its_tail(tmp_path):
     own = CHAIN | {"logs": str(tmp_path), "trainer": {"accelerator": "cpu"}}

@@ -16,6 +16,7 @@ from lyapnet.regulator import Regulator
 from lyapnet.rollout import Rollout
 from lyapnet.sets import Box
 from lyapnet.systems import DoubleIntegrator, Linear, Pendulum
+from tests.marks import sample
 from tests.problems import CONF, Formula, problem_of
 
 ORDERS = {"euler": 1, "midpoint": 2, "rk4": 4}
@@ -68,6 +69,7 @@ def test_a_step_answers_to_its_control_as_differences_say(method, target):
     assert by_euler == (method == "euler")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("law", [SampledPolicy, LookaheadPolicy])
 @pytest.mark.parametrize("gradient", ["backprop", "discrete"])
 def test_the_gradient_through_a_held_law_is_that_of_differences(law, gradient):
@@ -111,7 +113,7 @@ def test_the_response_is_part_of_the_graph_where_one_is_recorded():
         assert not any(part.requires_grad for part in problem.response(x))
 
 
-@pytest.mark.parametrize("law", [SampledPolicy, LookaheadPolicy])
+@pytest.mark.parametrize("law", sample([SampledPolicy, LookaheadPolicy], 3))
 @pytest.mark.parametrize("method", TABLEAUX)
 def test_a_held_law_with_the_true_value_function_is_the_best_of_its_problem(method, law):
     """Of a linear problem by fourth-order steps too; and the law of Euler steps is not that of others."""
@@ -143,6 +145,7 @@ def test_a_held_law_with_the_true_value_function_is_the_best_of_its_problem(meth
     assert (float((cost(law(of_euler, Known(value))) / best - 1).max()) > 1e-3) == (method != "euler")
 
 
+@pytest.mark.gate
 def test_a_rollout_holds_what_is_made_to_be_held():
     """Its path is that of one control a step, through every route; another law is read at every stage."""
     problem = hanging("rk4", steps=10)
@@ -175,6 +178,7 @@ def test_the_regulator_is_that_of_many_steps(method):
     assert not torch.allclose(regulator.P, other.P, rtol=1e-4)
 
 
+@pytest.mark.gate
 def test_a_start_knows_the_steps_of_its_rollouts():
     """What optima cost by fourth-order steps is what they cost in continuous time, up to O(Δt²) for holding u."""
     costs = {}

@@ -191,6 +191,7 @@ def test_what_a_cost_ignores_it_ignores_about_a_target():
     assert not problem.differences(without), "u* = 0 is the same as none"
 
 
+@pytest.mark.gate
 def test_fine_tuning_to_another_target_is_no_silent_matter(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)

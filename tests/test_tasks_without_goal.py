@@ -253,6 +253,7 @@ def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
     assert "more than without" in str(found)
 
 
+@pytest.mark.gate
 def test_a_training_without_a_goal(tmp_path, monkeypatch, capsys):
     """From YAML to a table: one state, a cost of both signs, an end that is to be far."""
     monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)

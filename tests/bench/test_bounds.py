@@ -99,7 +99,7 @@ def test_conditions_lie_within_every_enclosure(case, enclosed, name):
         assert outside(case, enclosed[name], *random_boxes(case, side, 50)) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_mean_value_form_with_the_gradient_of_the_middle_alone_is_caught(case, monkeypatch):
     """The twin: sound only because the gradient is bounded on the whole box."""
 
@@ -111,7 +111,7 @@ def test_a_mean_value_form_with_the_gradient_of_the_middle_alone_is_caught(case,
     assert outside(case, wrong, *random_boxes(case, 0.3, 50)) > 0
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_orders_of_the_excess(case, enclosed):
     """Affine and mean-value forms gain two digits where intervals gain one; forms of second degree begin ahead."""
     rows = {row.enclosure: row for row in tightness(case, enclosed, 30, 1, sides=(0.1, 2e-3, 1e-3, 5e-4))}
@@ -222,20 +222,20 @@ def run(capsys, monkeypatch):
     return call
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_json_and_figure(run, enclosed, monkeypatch, tmp_path):
     monkeypatch.setattr(enclosures, "enclosures_of", lambda *_: enclosed)  # as traced above
     status, out, err = run("--json", "--figures", str(tmp_path / "new"))
     assert status == 0, err
     result = json.loads(out)
-    assert [row["enclosure"] for row in result["tightness"]] == list(ENCLOSURES)
+    assert [row["enclosure"] for row in result["tightness"]] == list(enclosed)
     assert [row["method"] for row in result["proofs"]] == [*METHODS, "certifier"]
     assert all(len(row["factors"]) == len(row["sides"]) for row in result["tightness"])
     assert [row["verdict"] for row in result["proofs"]] == ["certified"] * len(METHODS) + ["falsified"]
     assert (tmp_path / "new" / "certify_bench.png").stat().st_size > 0
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_checkpoint_and_its_tables(run, tmp_path):
     tiny = ["training.iterations=2", "horizon.steps=8", "rollout.gradient=backprop", "loggers=[csv]"]
     tiny += ["evaluation.validation_states=4", "evaluation.test_states=4"]

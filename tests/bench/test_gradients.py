@@ -54,6 +54,7 @@ def rows_by_route(rows):
     return {row["route"]: row for row in rows}
 
 
+@pytest.mark.gate
 def test_json_is_a_list_of_objects_with_these_fields(rows_of):
     rows = rows_of("--routes", ",".join(TORCH_ROUTES))
     assert [row["route"] for row in rows] == list(TORCH_ROUTES)
@@ -70,6 +71,7 @@ def test_json_is_a_list_of_objects_with_these_fields(rows_of):
         assert (row["relative_error"] is None) == (row["route"] == "rollout")
 
 
+@pytest.mark.gate
 def test_discrete_is_exact_and_the_adjoint_is_not(rows_of):
     error = {route: row["relative_error"] for route, row in rows_by_route(rows_of("horizon.steps=5")).items()}
     assert error["backprop"] == 0
@@ -105,7 +107,7 @@ def test_peak_of_known_tensors():
     assert peak_bytes(lambda: None) == 0
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_memory_of_backprop_grows_with_the_steps_and_exceeds_that_of_discrete():
     short, long = (
         {row.route: row.peak_bytes for row in bench.time_routes(case, 16, ["backprop", "discrete"], 1, print)}
@@ -117,7 +119,7 @@ def test_memory_of_backprop_grows_with_the_steps_and_exceeds_that_of_discrete():
 
 
 @pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
-@pytest.mark.slow
+@pytest.mark.gate
 def test_compiled_rows_come_after_the_eager_ones_unless_compilation_fails(monkeypatch):
     # machine code takes a minute to make: the traces stand in for it
     monkeypatch.setattr("lyapnet.rollout.discrete_adjoint.DiscreteAdjoint.compile", lambda self, x0: None)
@@ -146,7 +148,7 @@ def test_without_a_compiler_a_notice_and_eager_rows(run, monkeypatch):
     assert [row["compiled"] for row in json.loads(out)] == [False]
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_table_names_every_route_and_batch(run):
     routes = ("adjoint", "adjoint-autograd", "backprop")
     status, out, _ = run(
@@ -214,10 +216,12 @@ def test_chain_of_integrators_moves_its_last_state_by_its_control():
     assert system.dynamics(x, u).tolist() == [[2.0, 3.0, 4.0]]
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_accuracy_orders_of_convergence():
     by_route = {}
-    for point in bench.gradient_accuracy(case_of("horizon.steps=40", "horizon.dt=0.02"), batch=2, halvings=2):
+    for point in bench.gradient_accuracy(
+        case_of("horizon.steps=40", "horizon.dt=0.02", "rollout.policy=hjb"), batch=2, halvings=2
+    ):
         by_route.setdefault((point.route, point.method), []).append(point)
     for method, order, stages in (("euler", 1, 1), ("rk4", 4, 4)):
         coarse, fine = by_route["discrete", method]  # twice the steps
@@ -232,6 +236,7 @@ def test_accuracy_orders_of_convergence():
     assert tight.continuous_error < loose.continuous_error
 
 
+@pytest.mark.gate
 def test_figures_are_written(run, tmp_path, monkeypatch):
     points = [bench.Accuracy("adjoint", "euler", 20, 1e-2, 1e-2), bench.Accuracy("backprop", "euler", 10, 0.0, 1e-2)]
     monkeypatch.setattr("lyapnet.bench.gradient_accuracy", lambda case: points)

@@ -14,6 +14,7 @@ from tests.runs import tiny_checkpoint
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 
 
+@pytest.mark.gate
 def test_each_way_is_timed(tmp_path, capsys):
     checkpoint = tiny_checkpoint(tmp_path)
     capsys.readouterr()
@@ -29,6 +30,7 @@ def test_each_way_is_timed(tmp_path, capsys):
     assert "microseconds of u(t, x), 1 kHz" in capsys.readouterr().out
 
 
+@pytest.mark.gate
 def test_a_compiler_without_native_code(tmp_path, capsys, monkeypatch):
     checkpoint = tiny_checkpoint(tmp_path)
     compiling = latency.compile_c
@@ -45,6 +47,7 @@ def test_a_compiler_without_native_code(tmp_path, capsys, monkeypatch):
     assert ways == ["C, -O2", "C, -O3", "Python, compiled", "Python"]
 
 
+@pytest.mark.gate
 def test_mpc_and_a_learners_policy_beside(tmp_path, capsys):
     pytest.importorskip("casadi")
     pytest.importorskip("stable_baselines3")

@@ -32,6 +32,7 @@ def level(constraints, delta=0.0, enough=ENOUGH):
     return crossing_level(condition, domain(), Budget(20), enough)
 
 
+@pytest.mark.gate
 def test_the_level_of_a_limit_of_the_position():
     """h = x − b crosses with v ≥ 0, where xᵀPx is least at v = 0: P₁₁b²; beyond the shell it only grows."""
     P, b = torch.as_tensor(riccati()), 1.2
@@ -123,6 +124,7 @@ def certificate(limit, claimed):
     return SoundCertificate(Controller(task_within(limit), loop(riccati()).V), claimed, {"seconds": 30.0})
 
 
+@pytest.mark.gate
 def test_a_safe_set_is_proved_and_another_falsified(safe, unsafe):
     """From the corner of X₀ the position rises to 1.06 m; the funnel that X₀ needs reaches 1.31 m."""
     between = claim(position(1.2))
@@ -139,6 +141,7 @@ def test_a_safe_set_is_proved_and_another_falsified(safe, unsafe):
     assert 0 < between.volume_share < 1
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_about_its_constraints(safe, kept):
     again = claim(position(1.35), keep=kept, replay=True, budget=Budget(60))
     assert safe.verdict == again.verdict == "certified"
@@ -160,6 +163,7 @@ class Counting(Constraints):
         return x[..., :1] / 1.35 - (1 if self.calls < 60 else 9)
 
 
+@pytest.mark.gate
 def test_constraints_that_change_with_the_calls_are_refused_or_what_they_were(safe):
     try:
         found = claim(Counting())
@@ -179,6 +183,7 @@ def test_a_violation_is_one():
     assert find_violation(loop(riccati()), task_within(position(1.35)), None) is None
 
 
+@pytest.mark.gate
 def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
     """V rises on one side of a bump at a speed that no closed loop reaches from below, within the level of X₀."""
     quadratic, place = stationary(riccati()), torch.tensor([-0.2, 0.72])
@@ -190,6 +195,7 @@ def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
     assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(60)).verdict == "certified"
 
 
+@pytest.mark.gate
 def test_the_report_says_what_is_kept(safe, unsafe):
     proved, failed = certificate(position(1.35), safe), certificate(position(1.03), unsafe)
     assert "or violates a constraint (position within 1.35), up to T = 2 s" in proved.in_words()
@@ -257,6 +263,7 @@ def test_states_of_X0_between_the_samples_are_held_against_constraints():
     assert least[1:] == [float("inf"), float("inf")], "X₀ may reach to a limit"
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_checked_with_its_constraints(safe, kept):
     V = loop(riccati()).V
     verdicts = [check(Controller(task_within(h), V), kept)["verdict"] for h in (position(1.35), position(1.36), None)]

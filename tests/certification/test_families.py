@@ -37,6 +37,7 @@ class Square(lyapnet.ValueFunction):
         return x[..., 0] ** 2 + 0 * t
 
 
+@pytest.mark.gate
 def test_a_funnel_of_a_family_has_no_members_beside_it():
     """A parameter stays: D is its range, closed loops do not leave D along it, and no other k is a counterexample."""
     task = build_problem(config_from_plain({

@@ -336,6 +336,7 @@ def test_leaves_cover_their_box_exactly():
 # Threads
 
 
+@pytest.mark.gate
 def test_threads_come_to_the_same_verdict_and_level(P):
     true = dipped(P)
     one, two = (go_on(true, None, workers=workers) for workers in (1, 2))

@@ -23,7 +23,7 @@ from tests.certification.planted import riccati, stationary
 from tests.certification.test_region import LIMITED, D, loop_of, problem
 from tests.problems import AMPLE
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("batch_sizes_once")]
 ABOUT = problem(controls=LIMITED)
 
 

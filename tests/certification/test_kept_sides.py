@@ -17,7 +17,7 @@ from tests.certification.planted import riccati, stationary
 from tests.certification.test_least_cost import problem
 from tests.problems import Formula
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("batch_sizes_once")]
 SET = "-2.5:2.5,-4.5:4.5"
 
 

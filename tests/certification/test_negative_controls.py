@@ -13,6 +13,7 @@ from lyapnet.rollout import ClosedLoop
 from lyapnet.sets import Box
 from lyapnet.systems import Linear
 from tests.certification.planted import Planted
+from tests.marks import sample
 from tests.problems import AMPLE, problem_of
 
 DURATION = 2.0
@@ -106,8 +107,9 @@ def test_what_nothing_is_planted_in_is_certified():
     assert proof_of(DecreaseCondition(loop(Bowl()), 0.5, 0.02), 0).verdict == "certified"
 
 
-def test_a_hundred_planted_violations_are_never_certified():
-    assert "certified" not in controls(range(100))
+@pytest.mark.parametrize("first", sample(range(0, 100, 4), 25))
+def test_a_hundred_planted_violations_are_never_certified(first):
+    assert "certified" not in controls(range(first, first + 4))
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -182,6 +184,7 @@ def test_what_cannot_be_certified_is_refused_in_one_line(V, options, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.gate
 def test_kinks_are_certified():
     found = claim(loop(Bent()), 0.5, 0.05, budget=Budget(120, boxes=20_000))
     assert found.verdict == "certified"

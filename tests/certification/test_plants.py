@@ -142,6 +142,7 @@ def edge(function, inside, outside):
     return inside
 
 
+@pytest.mark.gate
 def test_of_two_states_the_largest_interval_is_that_of_the_matrix_inequality():
     assert springs().verdict == "certified"
     mass = edge(lambda m: excess(m, 0.0), 1.0, 9.0)
@@ -269,6 +270,7 @@ def test_pieces_cover_a_box():
 # Words and files
 
 
+@pytest.mark.gate
 def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_path):
     at, path = leaky(), tmp_path / "plants.proof"
     options = {"set": "-1:1", "parameter": ["gain=2:3"], "seconds": 20.0}

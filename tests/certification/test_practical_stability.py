@@ -100,6 +100,7 @@ def test_of_one_state_the_ultimate_bound_is_known(w):
     assert claim.entered_within == pytest.approx(math.log(claim.rho / claim.hole) / LAMBDA)
 
 
+@pytest.mark.gate
 def test_of_a_linear_law_region_and_ultimate_bound_are_those_of_the_ellipses():
     claim, c = pushed_claim(), highest_rise(float(W[1]))
     largest = float((D.upper**2 / P().inverse().diagonal()).min())
@@ -113,6 +114,7 @@ def test_of_a_linear_law_region_and_ultimate_bound_are_those_of_the_ellipses():
         assert (side <= 1.03 * reach).all()
 
 
+@pytest.mark.gate
 def test_the_ultimate_bound_grows_with_the_square_of_the_push():
     """Of a linear law all is alike at each size: c(2W) = 4c(W)."""
     assert claimed(disturbance=2 * W).hole == pytest.approx(4 * pushed_claim().hole, rel=5e-3)
@@ -148,6 +150,7 @@ def test_a_hundred_times_larger_pushes_leave_it_and_nothing_is_proved_of_them():
     assert "\n" not in none.reason
 
 
+@pytest.mark.gate
 def test_nothing_is_proved_of_a_hole_that_is_too_small(monkeypatch):
     """The twin of the search for c: no claim rests on it."""
     monkeypatch.setattr(region, "ultimate_level", lambda *_: 0.5 * pushed_claim().hole)
@@ -158,6 +161,7 @@ def test_nothing_is_proved_of_a_hole_that_is_too_small(monkeypatch):
     assert claimed(disturbance=W).verdict == "certified"
 
 
+@pytest.mark.gate
 def test_without_pushes_the_claim_is_what_it_was():
     one, other = plain_claim(), claimed(disturbance=0 * W)
     for name in ("rho", "hole", "verdict", "volume_share", "region_share", "disturbance", "extent"):
@@ -257,6 +261,7 @@ def rewritten(path, change, again=True):
     kept_proofs.write_proofs(path, proofs)
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_checked_with_its_disturbance(kept):
     result = checked(kept)
     assert (result["verdict"], result["reason"], result["of"]) == ("certified", None, "region")
@@ -266,6 +271,7 @@ def test_a_kept_proof_is_checked_with_its_disturbance(kept):
     assert checked(kept)["verdict"] == "certified", "the twin: what the tests compute anew is what the file says"
 
 
+@pytest.mark.gate
 def test_it_goes_on_by_the_same_disturbance_alone(kept, plain):
     before = kept.read_bytes()
     for w in (0.5 * W, 2 * W, 0 * W, None):
@@ -297,6 +303,7 @@ EDITS = {
 }
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", EDITS)
 def test_an_edited_file_is_refused(name, kept):
     """By an author who computes the digest and the fingerprint again."""
@@ -318,6 +325,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", BROKEN)
 def test_a_broken_file_is_refused(name, kept):
     rewritten(kept, BROKEN[name], again=False)
@@ -326,6 +334,7 @@ def test_a_broken_file_is_refused(name, kept):
     assert "\n" not in result["reason"]
 
 
+@pytest.mark.gate
 def test_a_plain_proof_is_none_of_pushes(plain):
     rewritten(plain, set_of(disturbance=[0.0, 0.2]))
     assert checked(plain)["verdict"] == "refused"
@@ -338,6 +347,7 @@ def controller():
     return Controller(problem(), stationary(riccati()))
 
 
+@pytest.mark.gate
 def test_for_each_size_there_is_a_claim():
     regions = regions_under_pushes(controller(), ["velocity=0.4,0,0.2,30,0.2"], set="-3:3,-4:4")
     assert regions.pushes == [0, 0.2, 0.4, 30]
@@ -386,6 +396,7 @@ def checkpoint(tmp_path_factory):
     return str(tiny_checkpoint(tmp_path_factory.mktemp("logs")))
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_seconds_for_levels")
 def test_the_command_takes_one_push_and_several(checkpoint, capsys, tmp_path):
     line = ["certify", "region", checkpoint, "--seconds=2"]

@@ -71,6 +71,7 @@ def after(about, x0, seconds=30.0, dt=0.01):
     return x
 
 
+@pytest.mark.gate
 def test_of_a_linear_law_the_largest_ellipse_in_the_set_is_proved():
     """min of xᵀPx on the face x_i = b is b²/(P⁻¹)_ii; the ellipse's area is πρ/√det P."""
     claim, P = plain_claim(), torch.from_numpy(riccati())
@@ -93,6 +94,7 @@ def test_its_contraction_is_that_of_the_linear_law():
     assert 0 < plain_claim().hole < plain_claim().rho
 
 
+@pytest.mark.gate
 def test_between_limits_the_region_is_what_a_grid_says():
     """The least V where V does not fall, on 400 × 400 states outside the hole: no more is proved, and 90 % of it is."""
     claim, V, t = limited_claim(), stationary(riccati()), torch.zeros(())
@@ -106,6 +108,7 @@ def test_between_limits_the_region_is_what_a_grid_says():
     assert claim.rho < 0.9 * plain_claim().rho, "limits cost something here"
 
 
+@pytest.mark.gate
 def test_closed_loops_from_its_edge_go_to_the_goal():
     claim, about = limited_claim(), problem(controls=LIMITED)
     x = D.sample(20_000, torch.Generator().manual_seed(0))
@@ -133,6 +136,7 @@ def test_a_law_that_leaves_further_out_is_falsified():
     assert claim.rho < 0.5, "V at (0, 1), beyond which V falls as |x₂| grows"
 
 
+@pytest.mark.gate
 def test_a_second_well_is_not_taken_for_the_hole():
     """V = x²(x − 2)² is low around the equilibrium 2 too, where a closed loop stays: {V ≤ ρ} holds it for every ρ."""
     system = Linear([[0.0]], [[1.0]])
@@ -237,6 +241,7 @@ def test_a_hole_below_zero_is_none(well):
     assert "not above 0 around the goal" in claim.reason
 
 
+@pytest.mark.gate
 def test_a_rate_that_is_asked_in_vain_is_not_called_unstable():
     """ẋ = −x with V = x² falls at the rate 2, and no faster."""
     about = problem_of(Linear([[-1.0]], [[0.0]]), None, 100, 0.02, Box([-0.8], [0.8]))
@@ -300,6 +305,7 @@ def checkpoint(tmp_path_factory):
     return tiny_checkpoint(tmp_path_factory.mktemp("logs"))
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_seconds_for_levels")
 def test_the_command_prints_what_was_claimed(checkpoint, capsys, tmp_path):
     arguments = ["certify", "region", str(checkpoint), "--seconds", "2", "--json", "--figure", str(tmp_path / "r.png")]

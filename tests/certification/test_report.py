@@ -58,6 +58,7 @@ def content(folder):
     return json.loads((folder / "report.json").read_text(encoding="utf-8"), parse_constant=refuse)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", ["sampled", "statistical", "sound", "region"])
 def test_a_report_names_what_was_certified(kind, reported, checkpoint):
     report = content(reported / kind)
@@ -74,6 +75,7 @@ def test_a_report_names_what_was_certified(kind, reported, checkpoint):
     assert {path.name for path in (reported / kind).iterdir()} == {"report.json", "report.md", report["figure"]}
 
 
+@pytest.mark.gate
 def test_a_report_has_the_limits_of_the_controller(checkpoint):
     """Not those of its config, which may be others."""
 
@@ -88,6 +90,7 @@ def test_a_report_has_the_limits_of_the_controller(checkpoint):
     assert controls_of(controls=ControlBox(-1.0, math.inf)) == limited
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", ["sampled", "statistical", "sound", "region"])
 def test_its_markdown_says_the_same(kind, reported):
     report, text = content(reported / kind), (reported / kind / "report.md").read_text(encoding="utf-8")
@@ -101,6 +104,7 @@ def test_its_markdown_says_the_same(kind, reported):
         assert len(columns) == 1, "every row of a table has the same cells"
 
 
+@pytest.mark.gate
 def test_its_command_makes_the_same_certificate(reported, capsys):
     report = content(reported / "statistical")
     program, *arguments = report["command"].split()
@@ -110,6 +114,7 @@ def test_its_command_makes_the_same_certificate(reported, capsys):
     assert json.loads(capsys.readouterr().out) == report["certificate"]
 
 
+@pytest.mark.gate
 def test_another_checkpoint_has_another_hash(reported, checkpoint, tmp_path):
     copy = tmp_path / "copy.ckpt"
     weights = read_checkpoint(checkpoint)
@@ -176,6 +181,7 @@ def test_no_funnel_claims_nothing():
     assert "At t = 1 s, x = (0.5, 1.5) it fails by 0.1" in nothing.of_the_verdict()
 
 
+@pytest.mark.gate
 def test_the_result_is_printed_even_if_the_report_cannot_be_written(checkpoint, tmp_path, monkeypatch, capsys):
     def full(path, content):
         raise OSError(28, "No space left on device", str(path))
@@ -190,6 +196,7 @@ def test_the_result_is_printed_even_if_the_report_cannot_be_written(checkpoint, 
     assert not list((tmp_path / "report").iterdir())
 
 
+@pytest.mark.gate
 def test_a_figure_in_any_format_that_is_known(checkpoint, tmp_path):
     certificate = sampled_certificate(load(checkpoint), 5)
     for name, start in (("claim.svg", b"<?xml"), ("claim.pdf", b"%PDF")):
@@ -197,6 +204,7 @@ def test_a_figure_in_any_format_that_is_known(checkpoint, tmp_path):
         assert (tmp_path / name).read_bytes().startswith(start)
 
 
+@pytest.mark.gate
 def test_nothing_is_infinite_in_json(checkpoint):
     result = sound_certificate(load(checkpoint), alpha=1.0, delta=0.0, seconds=0.1).result
     assert json.dumps(result, allow_nan=False)

@@ -15,6 +15,7 @@ from lyapnet.graphs.bound_rules import RULES
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.networks import FCN, Scaling
 from lyapnet.systems import DoubleIntegrator
+from tests.marks import at_the_gate
 from tests.problems import hjb_loop
 
 Q, R, ALPHA, DELTA = ((10.0, 0.3), (0.3, 0.1)), 0.5, 0.9, 0.01
@@ -112,9 +113,11 @@ def test_bounds_at_points_hold_the_value_in_fifty_digits():
     assert widest < 1e-10
 
 
+@pytest.mark.gate
+@pytest.mark.parametrize("count", [20, at_the_gate(300)])
 @pytest.mark.parametrize("width", [0.3, 0.1, 1e-2, 1e-3, 1e-5])
-def test_both_enclosures_of_many_boxes_agree(width):
-    assert boxes_outside(width, 300) == (0, 0)
+def test_both_enclosures_of_many_boxes_agree(width, count):
+    assert boxes_outside(width, count) == (0, 0)
 
 
 def mutilated(rule, change):

@@ -113,6 +113,7 @@ def test_a_second_integrator_stays_within(swung):
     assert float((high - low).max()) < 0.05 * float(high.mean()), "and the bounds are not loose"
 
 
+@pytest.mark.gate
 def test_the_machine_code_encloses_the_same(swung, monkeypatch):
     monkeypatch.setattr(bounds, "MANY", 10**9 if swung.steps > bounds.MANY else 0)
     other = tube_claim(controller(Swinging(), Formula(damped)), Budget(60))
@@ -124,6 +125,7 @@ def limit(bound):
     return StateLimits([0], [bound], [1.0], [1.0], ["angle"])
 
 
+@pytest.mark.gate
 def test_constraints_are_kept_or_violated_and_which_is_proved(straight):
     peak = float(straight.ranges[..., 0, 1].max())
     kept = tube_claim(controller(constraints=limit(1.05 * peak)), Budget(60))
@@ -136,6 +138,7 @@ def test_constraints_are_kept_or_violated_and_which_is_proved(straight):
     assert float((torch.linalg.matrix_exp(A * t[:, None, None]) @ x0)[:, 0].max()) > 0.9 * peak, "it does"
 
 
+@pytest.mark.gate
 def test_the_end_within_a_radius(straight):
     radii = 1.001 * straight.reach, 0.5 * straight.reach
     asked = [tube_claim(controller(), Budget(60), radius=r).verdict for r in radii]
@@ -149,6 +152,7 @@ class Escaping(Swinging):
         return torch.stack([x[..., 0] ** 2, -x[..., 1]], -1)
 
 
+@pytest.mark.gate
 def test_what_escapes_is_not_proved():
     assert tube_claim(controller(Escaping(), half=0.7), Budget(60)).verdict == "certified"
     claim = tube_claim(controller(Escaping(), half=1.2), Budget(60, 100))
@@ -201,6 +205,7 @@ def outside(claim, about):
     return int(((costs < low) | (costs > high)).sum()), int(high.isfinite().sum())
 
 
+@pytest.mark.gate
 def test_simulations_are_not_believed(monkeypatch):
     """Polynomials along closed loops that are not are further off, and the tube is as much wider."""
     monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
@@ -211,6 +216,7 @@ def test_simulations_are_not_believed(monkeypatch):
     assert wrong == 0
 
 
+@pytest.mark.gate
 def test_without_the_bounds_they_would_be(monkeypatch):
     """The twin: with the bounds of what polynomials are off taken for 0, what is claimed is false."""
     monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
@@ -240,6 +246,7 @@ def test_two_workers_prove_the_same(swung):
     assert two.volume_share == swung.volume_share == 1
 
 
+@pytest.mark.gate
 def test_from_the_command_line(capsys):
     main(["certify", "tube", "zoo:double_integrator", "--seconds", "60", "--json"])
     result = json.loads(capsys.readouterr().out)

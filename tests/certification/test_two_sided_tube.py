@@ -39,6 +39,7 @@ def riccatis():
     return two_sided_tube(Controller(in_continuous_time(), stationary(riccati())), BETA, DELTA)
 
 
+@pytest.mark.gate
 def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
     """What is left of the ratio is β and δT; a funnel would pay for both once more, from above."""
     result = riccatis.result
@@ -51,6 +52,7 @@ def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
     assert result["lower_fingerprint"] != result["fingerprint"]
 
 
+@pytest.mark.gate
 def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
     """V = 0.8 J* bounds the optimum from below, and its law is not the optimal one."""
     result = both_sides(0.8, seconds=30).result
@@ -65,6 +67,7 @@ def few_boxes(monkeypatch):
     monkeypatch.setattr(two_sided, "Budget", partial(Budget, boxes=300))
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_boxes")
 def test_a_value_that_is_too_high_is_no_bound():
     certificate = both_sides(1.1)
@@ -76,12 +79,14 @@ def test_a_value_that_is_too_high_is_no_bound():
     assert bool((below.least_cost(certificate.value) <= optimum(x0)).all()), "what is left of it is true"
 
 
+@pytest.mark.gate
 def test_one_of_the_sides_alone_is_no_certificate(riccatis):
     certificate = both_sides(radius=1e-9, seconds=30)
     assert certificate.below.claim.verdict == "certified"
     assert certificate.verdict == certificate.claim.verdict != "certified"
 
 
+@pytest.mark.gate
 def test_words_formulas_and_figure_are_about_both(riccatis):
     words, formulas = riccatis.in_words(), riccatis.in_formulas()
     assert "a tube, proved" in words
@@ -93,6 +98,7 @@ def test_words_formulas_and_figure_are_about_both(riccatis):
     assert "from above / from below" in figure.get_suptitle()
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("few_seconds_for_levels", "few_boxes")
 def test_the_command(capsys, tmp_path):
     command = ["certify", "tube", str(tiny_checkpoint(tmp_path)), "--two-sided", "--beta", "0.8", "--delta", "0.5"]
@@ -114,6 +120,7 @@ def test_what_is_of_the_other_side_is_refused_without_it(option, capsys):
     assert f"Expected {name} with --two-sided, got it alone; add --two-sided" in capsys.readouterr().err
 
 
+@pytest.mark.gate
 def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay():
     """D just around X₀: a bound for controls that stay there, and a law that does not."""
     certificate = both_sides(set="-1.01:1.01,-0.71:0.71", seconds=30)
@@ -124,6 +131,7 @@ def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay()
     assert "the tube leaves D" in certificate.of_the_verdict()
 
 
+@pytest.mark.gate
 def test_with_half_a_tube_the_states_that_have_one_are_compared(riccatis, monkeypatch):
     claim = riccatis.claim
     kept = claim.cells.lower[:, 0] >= 0
@@ -138,6 +146,7 @@ def test_with_half_a_tube_the_states_that_have_one_are_compared(riccatis, monkey
     assert certificate.result["certified_ratio"] == pytest.approx(riccatis.result["certified_ratio"], rel=0.05)
 
 
+@pytest.mark.gate
 def test_where_nothing_is_proved_from_below_nothing_is_drawn_of_it(riccatis):
     nothing = dataclasses.replace(riccatis.below.claim, level=-math.inf)
     certificate = TwoSidedTube(riccatis.controller, riccatis.claim, nothing, riccatis.options)

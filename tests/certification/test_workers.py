@@ -95,7 +95,7 @@ def test_another_machine_bounds_the_same_or_nothing():
             bounded_again(condition, domain(), 1, other)
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_cluster_proves_the_same():
     pytest.importorskip("ray")
     condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
@@ -105,7 +105,7 @@ def test_a_cluster_proves_the_same():
     assert proof.verdict == "certified"
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_what_a_cluster_cannot_do_is_one_line(monkeypatch):
     """More workers than it has cores; other code there; and SIGTERM stays with who had it."""
     pytest.importorskip("ray")

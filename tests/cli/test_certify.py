@@ -59,6 +59,7 @@ def test_sampled_and_statistical(checkpoint, capsys):
     assert result["verdict"] in ("certified", "falsified", "unknown")
 
 
+@pytest.mark.gate
 def test_sound(checkpoint, capsys, tmp_path):
     options = ("--seconds", "1", "--figure", str(tmp_path / "funnel.png"), "--delta", "0.5")
     result = certificate(capsys, "sound", checkpoint, *options)
@@ -71,6 +72,7 @@ def test_sound(checkpoint, capsys, tmp_path):
     assert (tmp_path / "funnel.png").stat().st_size > 0
 
 
+@pytest.mark.gate
 def test_tables(checkpoint, capsys):
     few = ["--samples", "20"]
     for kind, options, shown in (
@@ -141,6 +143,7 @@ def certifiable(*arguments, **own):
     return Controller(planted.problem(), planted.stationary(planted.riccati()))
 
 
+@pytest.mark.gate
 def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(certify.Given, "load", certifiable)
     monkeypatch.setattr(funnel, "LEVELS", 20.0)
@@ -171,6 +174,7 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
         assert why in json.loads(capsys.readouterr().out)["reason"]
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", [["region"], ["sound", "--two-sided", "--alpha=0.9", "--delta=0.05"]])
 def test_kept_proofs_of_other_kinds_are_checked(kind, checkpoint, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(certify.Given, "load", certifiable)
@@ -260,6 +264,7 @@ def test_sets_are_read():
             parse_set(text)
 
 
+@pytest.mark.gate
 def test_disturbances_are_named_by_states(checkpoint, capsys, tmp_path):
     options = ["--seconds", "2", "--delta", "1", "--disturbance", "velocity=0.01"]
     result = certificate(capsys, "sound", checkpoint, *options, "--report", str(tmp_path))

@@ -89,6 +89,7 @@ def test_a_goal_that_is_no_equilibrium(B, words):
     assert facts(content)["goal"].found == "an equilibrium without control"
 
 
+@pytest.mark.gate
 def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     """ẋ = u, φ = px²: the gain over a step is Δt p/R, and Euler steps of u = −px/R grow above 2."""
     stiff = linear([[0]], [[1]], cost={"Q": [1e-9], "R": [1], "Q_T": [30]})
@@ -106,6 +107,7 @@ def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     )
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(("method", "least"), [("euler", 2.0), ("midpoint", 2.0), ("rk4", 2.785)])
 def test_a_step_that_a_method_cannot_take(method, least):
     """−λΔt at which each becomes unstable (Hairer, Wanner, Solving Ordinary Differential Equations II, § IV.2)."""
@@ -115,6 +117,7 @@ def test_a_step_that_a_method_cannot_take(method, least):
     assert "Δt" not in facts(linear([[-10 * (least - 0.01)]], [[1]], **by))
 
 
+@pytest.mark.gate
 def test_what_steps_miss_of_continuous_time():
     """ẋ = u from any x₀ under u = −Kx held: Σ x² of Euler against ∫x² of straight lines."""
     coarse = linear([[0]], [[1]], cost={"Q": [1], "R": [0.1], "Q_T": [1e-3]}, horizon={"steps": 10, "dt": 0.2})
@@ -146,6 +149,7 @@ def test_a_start_that_is_not_finite_says_so():
     assert any("from the Riccati solution at the goal: finite on 0%" in fact.found for fact in found)
 
 
+@pytest.mark.gate
 def test_the_command(tmp_path, capsys):
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(TASK))

@@ -20,6 +20,7 @@ from lyapnet.errors import UsageError
 from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.facts import facts_of, unreached_modes
 from tests.fits import shorten_fits
+from tests.marks import sample
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -44,7 +45,7 @@ def facts_before_optima(config, parts=None):
     return told
 
 
-@pytest.mark.parametrize("path", sorted(CONF.rglob("*.yaml")), ids=lambda path: str(path.relative_to(CONF)))
+@pytest.mark.parametrize("path", sample(sorted(CONF.rglob("*.yaml")), 4), ids=lambda path: str(path.relative_to(CONF)))
 def test_every_config(path):
     try:
         config = load_config(path)
@@ -174,6 +175,7 @@ LONG = {
 }
 
 
+@pytest.mark.gate
 def test_an_interrupt_leaves_the_facts(tmp_path):
     path = tmp_path / "long.yaml"
     path.write_text(yaml.safe_dump(LONG))
@@ -238,6 +240,7 @@ def test_a_failure_of_linear_algebra_is_a_fact(monkeypatch):
     assert "R" in last.advice
 
 
+@pytest.mark.gate
 def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch):
     """Nothing of LAPACK or torch is on the terminal, and what cannot be is a fact; tests of signals ask CasADi."""
     (tmp_path / "growing.py").write_text(

@@ -67,6 +67,7 @@ def evaluated(run, capsys, *arguments):
     return capsys.readouterr().out
 
 
+@pytest.mark.gate
 def test_what_follows_the_horizon_is_told_where_it_is_asked_for(run, capsys, tmp_path):
     options = ["--no-optimum", "--until", "2"]
     later = json.loads(evaluated(run, capsys, "--json", "--figures", str(tmp_path), *options))["afterwards"]
@@ -80,6 +81,7 @@ def test_what_follows_the_horizon_is_told_where_it_is_asked_for(run, capsys, tmp
     assert "afterwards" not in json.loads(evaluated(run, capsys, "--json", "--no-optimum"))
 
 
+@pytest.mark.gate
 def test_evaluation_reports_the_optimum_of_a_nonlinear_task(run, capsys, tmp_path):
     files = ["--table", str(tmp_path / "states.csv"), "--figures", str(tmp_path / "figures")]
     result = json.loads(evaluated(run, capsys, "--json", *files))
@@ -101,6 +103,7 @@ def test_evaluation_reports_the_optimum_of_a_nonlinear_task(run, capsys, tmp_pat
         assert (tmp_path / "figures" / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.gate
 def test_failed_optima_are_left_out_and_counted(run, capsys, monkeypatch, tmp_path):
     controller = load(run / "checkpoints" / "best.ckpt")
     whole = evaluation(controller, 5)
@@ -121,6 +124,7 @@ def test_failed_optima_are_left_out_and_counted(run, capsys, monkeypatch, tmp_pa
     assert "2 of 5 states have no optimum" in " ".join(evaluated(run, capsys).split())
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("without_casadi")
 def test_without_casadi_the_rest_is_reported(run, capsys, tmp_path):
     result = evaluated(run, capsys, "--json", "--figures", str(tmp_path))

@@ -71,6 +71,7 @@ def test_training_says_what_it_waits_for(tmp_path, monkeypatch, capsys, telling)
     assert capsys.readouterr().err.startswith("train: ")
 
 
+@pytest.mark.gate
 def test_a_certificate_tells_its_stages_before_its_boxes(checkpoint, few_seconds_for_levels):
     told, seen = [], []
     report = progress_told_to(lambda stage, detail: seen.append((stage, detail)), "sound")

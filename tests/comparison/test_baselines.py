@@ -91,8 +91,9 @@ def test_training_leaves_curves_and_a_model_that_sb3_loads(method, tmp_path):
     assert len(list((tmp_path / "checkpoints").iterdir())) <= 2
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
-    "method", [pytest.param(m, marks=pytest.mark.slow) if m.endswith("paper") else m for m in SETTINGS]
+    "method", [pytest.param(m, marks=pytest.mark.gate) if m.endswith("paper") else m for m in SETTINGS]
 )
 def test_stopped_training_goes_on_as_if_it_had_not_been(method, tmp_path):
     baseline = baseline_of(method, 2400)
@@ -157,7 +158,7 @@ def test_killed_while_saving_the_last_whole_checkpoint_counts(tmp_path):
     assert trained(tmp_path, baseline).curve[-1].environment_steps >= 1200
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_tuned_ppo_learns_where_no_learning_does_not(tmp_path):
     learning = baseline_of("ppo_tuned", 20_000, n_epochs=10, n_steps=6, batch_size=96)
     first, *_, last = trained(tmp_path / "learning", learning).curve

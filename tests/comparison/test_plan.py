@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[2]
 SMOKE, FULL = ROOT / "conf" / "compare_smoke.yaml", ROOT / "conf" / "compare.yaml"
 
 
+@pytest.mark.gate
 def test_jobs_go_seed_by_seed_and_are_as_many_as_asked_for():
     comparison = load_comparison(FULL)
     jobs = jobs_of(comparison)

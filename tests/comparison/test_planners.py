@@ -70,6 +70,7 @@ def test_with_the_whole_horizon_it_is_the_optimum_and_with_less_it_is_not():
     assert (linear > 1.5).any()
 
 
+@pytest.mark.gate
 def test_an_optimal_trajectory_from_where_it_starts():
     policy, ratio = scored("ilqr", task("reacher", "horizon.steps=20", "horizon.dt=0.05"), states=2)
     torch.testing.assert_close(ratio, torch.ones_like(ratio), rtol=1e-3, atol=0)

@@ -124,6 +124,7 @@ def test_pictures_leave_the_episode_as_it_is():
         assert one[1] == other[1]
 
 
+@pytest.mark.gate
 def test_nothing_is_left_of_past_pictures():
     environment = Environment("cartpole_balancing", render_mode="rgb_array")
 
@@ -152,6 +153,7 @@ def test_gymnasium_collects_the_pictures_of_an_episode():
     assert not any(np.array_equal(frame, later) for frame, later in itertools.pairwise(frames))
 
 
+@pytest.mark.gate
 def test_an_environment_without_pictures_loads_no_matplotlib():
     program = (
         "import sys; from lyapnet.comparison.environments import Environment; {}; print('matplotlib' in sys.modules)"

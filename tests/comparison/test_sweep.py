@@ -53,6 +53,7 @@ def points(folder, *overrides, vary="system.parameters.length=2,3"):
     return points_of([CHAIN], vary, [f"logs={folder / 'logs'}", *SMALL, *overrides])
 
 
+@pytest.mark.gate
 def test_each_seed_of_each_value_is_a_row(swept):
     folder, _ = swept
     with (folder / "out" / "sweep.csv").open(newline="") as file:
@@ -66,6 +67,7 @@ def test_each_seed_of_each_value_is_a_row(swept):
     assert all(Path(row["checkpoint"]).is_file() for row in rows)
 
 
+@pytest.mark.gate
 def test_finished_runs_are_not_run_again(swept, commands, capsys):
     _, arguments = swept
     assert main(arguments) == 0
@@ -78,6 +80,7 @@ def test_finished_runs_are_not_run_again(swept, commands, capsys):
     assert len(commands) == 2
 
 
+@pytest.mark.gate
 def test_a_stopped_run_goes_on(swept, commands):
     folder, _ = swept
     point = points(folder)[0]
@@ -120,6 +123,7 @@ def test_what_cannot_be_swept_is_refused_before_anything_is_trained(configs, var
     assert not commands
 
 
+@pytest.mark.gate
 def test_figure_shows_every_seed_and_every_measure(swept):
     folder, _ = swept
     rows = [row for point in points(folder) for row in rows_of(point, point.run())]
@@ -135,6 +139,7 @@ def test_figure_shows_every_seed_and_every_measure(swept):
     assert line.get_ydata()[0] == pytest.approx(sum(two) / 2)
 
 
+@pytest.mark.gate
 def test_a_run_that_fails_is_named_and_the_others_are_shown(swept, commands, capsys):
     _, arguments = swept
     more = [a.replace("length=2,3", "length=2,3,4") for a in arguments]
@@ -146,6 +151,7 @@ def test_a_run_that_fails_is_named_and_the_others_are_shown(swept, commands, cap
     assert "1 failed" in shown.err
 
 
+@pytest.mark.gate
 def test_a_finetuned_run_is_not_the_training_itself(swept):
     folder, _ = swept
     point = points(folder)[0]
@@ -159,6 +165,7 @@ def test_a_finetuned_run_is_not_the_training_itself(swept):
     assert point.run() is not None
 
 
+@pytest.mark.gate
 def test_seconds_to_the_optimum_are_read_from_the_metrics(swept):
     folder, _ = swept
     point = points(folder)[0]

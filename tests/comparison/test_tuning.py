@@ -103,6 +103,7 @@ def test_a_search_goes_on_and_tells_what_fails(path, pretended):
     assert {row["state"] for row in rows} == {"failed", "complete"}
 
 
+@pytest.mark.gate
 def test_a_search_that_was_killed_proposes_what_it_would_have(path, pretended, tmp_path):
     whole = task(path)
     study = open_study(whole, print)

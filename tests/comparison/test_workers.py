@@ -40,7 +40,7 @@ class Pretended(Runnable):
         return (self.folder / "result.json").is_file()
 
 
-@pytest.mark.parametrize("runner", ["local", pytest.param("ray", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runner", ["local", pytest.param("ray", marks=pytest.mark.gate)])
 def test_a_job_that_fails_is_told_and_the_others_go_on(runner, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     jobs = [Pretended("failing", FAILING), Pretended("working", WORKING)]

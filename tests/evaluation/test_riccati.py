@@ -244,6 +244,7 @@ def test_continuous_policy_is_the_HJB_policy_at_every_node():
         assert not torch.allclose(solution.policy(0, x), hjb(t, x)) or step == 0
 
 
+@pytest.mark.gate
 def test_optimal_cost_of_linear_systems_with_constant_R_is_riccatis():
     system, cost = double_integrator()
     J = optimal_cost(reference_problem(system, cost))

@@ -136,6 +136,7 @@ def test_no_controller_costs_less():
         assert (oracle.rollout(x0, torch.stack(u))[1] > optima.cost).all()
 
 
+@pytest.mark.gate
 def test_neighbours_and_batch_do_not_matter():
     oracle, X0 = transcription_of("cartpole_swingup")
     x0 = X0.sample(3)
@@ -337,6 +338,7 @@ def unsolvable(oracle):
     return oracle
 
 
+@pytest.mark.gate
 def test_what_is_on_disk_is_not_solved_again(solved):
     _, x0, optima = solved
     again = unsolvable(transcription_of("reacher", "horizon.steps=10")[0])

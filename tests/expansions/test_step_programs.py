@@ -147,6 +147,7 @@ class Priced(Cost):
         return 5 * x.square().sum(-1)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("what", ["mass", "price"])
 def test_a_number_that_changed_is_noticed(what):
     def problem_with(value):

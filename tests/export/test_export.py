@@ -19,6 +19,7 @@ from lyapnet.files import digest_of_file
 from lyapnet.graphs import c_rules
 from lyapnet.sets import ControlBox
 from lyapnet.systems import ControlAffineSystem
+from tests.marks import sample
 from tests.problems import Formula, problem_of, untrained
 from tests.runs import tiny_checkpoint
 
@@ -66,7 +67,7 @@ def answers_of_main(folder):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", sample(KINDS, 9))
 def test_c_says_what_the_controller_says(kind, tmp_path):
     controller = controller_of(kind)
     paths, agreement = export(controller, tmp_path / "law", "c")
@@ -128,6 +129,7 @@ def test_limits_hold_to_the_last_bit(tmp_path):
     assert "8.0" in text
 
 
+@pytest.mark.gate
 def test_torchs_program_runs_without_lyapnet(tmp_path):
     controller = controller_of("two limits, R(x) full")
     _, agreement = export(controller, tmp_path / "law.pt2", "torch")
@@ -147,6 +149,7 @@ def test_torchs_program_runs_without_lyapnet(tmp_path):
     assert not loaded
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("kind", ["a limit, held", "a family"])
 def test_onnx_says_what_the_controller_says(kind, tmp_path):
     pytest.importorskip("onnxscript")
@@ -196,7 +199,7 @@ OWN = {
 
 
 @needs_compiler
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", sample(OWN, 6))
 @pytest.mark.parametrize("to", ["c", "torch", "onnx"])
 def test_networks_of_ones_own(name, to, tmp_path):
     if to == "onnx":
@@ -243,6 +246,7 @@ int main(void)
 """
 
 
+@pytest.mark.gate
 @needs_compiler
 def test_one_program_has_several_laws_by_name(tmp_path):
     controllers = {name: untrained("double_integrator", *SHORT, f"seed={k}") for k, name in enumerate(("arm", "leg"))}
@@ -323,6 +327,7 @@ def test_without_a_compiler_or_onnx_it_says_what_to_do(monkeypatch, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.gate
 @needs_compiler
 def test_the_command(tmp_path, capsys):
     checkpoint = tiny_checkpoint(tmp_path)

@@ -70,6 +70,7 @@ def in_c(tmp_path_factory):
     return written(FUNCTIONS, tmp_path_factory.mktemp("c"))
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_operations_of_user_systems_are_written(name, in_c):
     for x in (POINT, POINT.flip(-1) / 2, torch.zeros_like(POINT)):
@@ -90,6 +91,7 @@ def test_the_same_operations_are_written_once():
     assert larger_size > same_size
 
 
+@pytest.mark.gate
 def test_what_is_not_a_number_stays_so(in_c):
     x = torch.tensor([[torch.nan, 1.0, 2.0, 3.0]])
     for name in ("extremes", "branches", "products", "one extreme", "places of extremes"):

@@ -48,6 +48,7 @@ def test_a_recorded_loop_has_the_path_and_the_gradient_of_a_traced_one(overrides
     assert not torch.allclose(results[0][0], results[1][0]), "the twin: parameters and states are read at each call"
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("policy", ["hjb", "sampled"])
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 def test_nothing_is_copied_from_another_device(method, policy):

@@ -10,6 +10,7 @@ from collections import Counter
 from functools import cache
 
 import mpmath
+import pytest
 import torch
 from torch.func import vmap
 
@@ -292,6 +293,7 @@ def groups():
     return [[name for name in cases() if (name in lacking) == missing] for missing in (False, True)]
 
 
+@pytest.mark.gate
 def test_no_value_lies_outside():
     found, tried, exact, seed = Counter(), Counter(), Counter(), 0
     while sum(tried.values()) < VALUES:

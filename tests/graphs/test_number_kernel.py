@@ -24,6 +24,7 @@ from lyapnet.networks import FCN, NETWORKS
 from lyapnet.rollout import Rollout
 from lyapnet.systems import SYSTEMS, Pendulum
 from tests.configs import objects
+from tests.marks import sample
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
 
@@ -375,6 +376,7 @@ def gradient_of(rollout, x0):
     return [p.grad.clone() for p in rollout.parameters() if p.grad is not None]
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("law", "changed"),
     [
@@ -416,17 +418,20 @@ def freeze(*parameters):
 
 @pytest.mark.parametrize(
     ("overrides", "change", "shared"),
-    [
-        ([], lambda loop: None, True),
-        ([], lambda loop: freeze(*loop.parameters()), True),
-        ([], lambda loop: freeze(next(loop.parameters())), False),
-        (["cost.R=[0.2]"], lambda loop: None, True),
-        (["system.parameters.length=0.8"], lambda loop: None, False),
-        (["rollout.policy=sampled"], lambda loop: None, False),
-        (["network.hidden=[8]"], lambda loop: None, False),
-        (["rollout.method=rk4"], lambda loop: None, False),
-        (["rollout.costate_limit=5"], lambda loop: None, False),
-    ],
+    sample(
+        [
+            ([], lambda loop: None, True),
+            ([], lambda loop: freeze(*loop.parameters()), True),
+            ([], lambda loop: freeze(next(loop.parameters())), False),
+            (["cost.R=[0.2]"], lambda loop: None, True),
+            (["system.parameters.length=0.8"], lambda loop: None, False),
+            (["rollout.policy=sampled"], lambda loop: None, False),
+            (["network.hidden=[8]"], lambda loop: None, False),
+            (["rollout.method=rk4"], lambda loop: None, False),
+            (["rollout.costate_limit=5"], lambda loop: None, False),
+        ],
+        3,
+    ),
 )
 def test_a_loop_takes_the_code_of_one_that_differs_in_tensors_alone(overrides, change, shared):
     (rollout, problem), (other, _) = rollout_of(), rollout_of(*overrides)
@@ -501,6 +506,7 @@ class Sorting(FCN):
     value_and_state_gradient = ValueFunction.value_and_state_gradient
 
 
+@pytest.mark.gate
 def test_a_run_whose_loop_has_an_operation_without_a_rule_says_which_and_goes_on(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(NETWORKS, "fcn", Sorting)
     monkeypatch.setattr("lyapnet.training.figure_logger.figures_of", lambda learner: {})

@@ -15,6 +15,7 @@ from lyapnet.graphs.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.graphs.bounds import BoundedFunction
 from lyapnet.graphs.branches import decisions
 from lyapnet.graphs.rounding import ROUNDED
+from tests.marks import at_the_gate, sample
 
 aten = torch.ops.aten
 AXES = 3
@@ -223,7 +224,7 @@ def examine(operation, boxes, seed=0):
     return tuple(int(count.sum()) for count in (violated(bounds, values), violated(bounds, values, 0.8), known))
 
 
-@pytest.mark.parametrize("operation", CASES, ids=str)
+@pytest.mark.parametrize("operation", sample(CASES, 2), ids=str)
 def test_no_value_lies_outside(operation):
     """The twin: bounds made 20 % narrower are caught."""
     outside, outside_narrower, known = examine(operation, 300)
@@ -232,7 +233,7 @@ def test_no_value_lies_outside(operation):
     assert known > 100
 
 
-@pytest.mark.parametrize("operation", CASES, ids=str)
+@pytest.mark.parametrize("operation", sample(CASES, 25), ids=str)
 def test_no_value_lies_outside_in_ten_thousand_boxes(operation):
     counts = [examine(operation, 2000, seed) for seed in range(1, 6)]
     assert sum(outside for outside, _, _ in counts) == 0
@@ -279,6 +280,7 @@ def outside_of_composition(expression, boxes=60):
     return int(violated(bounds, values_on(function, lower, upper)).sum())
 
 
+@pytest.mark.gate
 @settings(max_examples=300)
 @given(EXPRESSIONS)
 def test_no_value_of_many_compositions_lies_outside(expression):
@@ -333,9 +335,11 @@ def largest_error(name, count):
         return float(max(errors)) / taylor.EPSILON
 
 
+@pytest.mark.gate
+@pytest.mark.parametrize("count", [2000, at_the_gate(100_000)])
 @pytest.mark.parametrize("name", ELEMENTARY)
-def test_elementary_functions_err_by_less_at_many_points(name):
-    assert largest_error(name, 100_000) < 2
+def test_elementary_functions_err_by_less_at_many_points(name, count):
+    assert largest_error(name, count) < 2
 
 
 def test_a_function_in_single_precision_errs_by_more(monkeypatch):

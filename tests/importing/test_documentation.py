@@ -42,6 +42,7 @@ def by_command(capsys, *options):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.gate
 @pytest.mark.filterwarnings("ignore")  # torch's exporter's own
 @pytest.mark.usefixtures("few_seconds_for_levels")
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
@@ -50,7 +51,7 @@ def test_the_example_runs(tmp_path, monkeypatch, capsys):
     assert by_command(capsys, "--seconds=2")["verdict"] in ("certified", "falsified", "unknown")
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 @pytest.mark.filterwarnings("ignore")
 def test_the_example_is_certified(tmp_path, monkeypatch, capsys):
     """Files and modules are one function: the same boxes, but for the rounding of constants."""

@@ -60,7 +60,9 @@ training: {iterations: 3, batch_size: 8}
 evaluation: {validation_states: 4, test_states: 4}
 """
 LIMIT = 0.05
-pytestmark = [  # Lightning's own, of torch, and on machines with more than three cores
+pytestmark = [
+    pytest.mark.gate,
+    # Lightning's own, of torch, and on machines with more than three cores
     pytest.mark.filterwarnings("ignore:.*LeafSpec:FutureWarning"),
     pytest.mark.filterwarnings("ignore:.*does not have many workers"),
 ]

@@ -135,6 +135,7 @@ def test_what_does_not_suit_a_region_is_refused(overrides, message):
         build_module(config_from_plain(OWN, overrides))
 
 
+@pytest.mark.gate
 def test_training_for_it_makes_the_region_larger(monkeypatch):
     monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
     shorten_fits(monkeypatch, 200, 100)

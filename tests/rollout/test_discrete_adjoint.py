@@ -22,6 +22,7 @@ from lyapnet.programs import LyapunovProgram, ValueProgram
 from lyapnet.rollout import FIXED_STEP_METHODS, Rollout, backwards, discrete_adjoint
 from lyapnet.rollout.runge_kutta import Linearise
 from lyapnet.systems import SYSTEMS, ControlAffineSystem
+from tests.marks import sample
 from tests.problems import KINDS, problem_of, with_expansion
 
 EXACT = 1e-10  # relative, of what differs by rounding alone
@@ -74,11 +75,17 @@ def is_exact(rollouts, x0, of=weighted):
 
 @pytest.mark.parametrize(
     ("system", "method", "traced"),
-    [
-        *((system, "euler", False) for system in SYSTEMS),
-        *(pytest.param(system, "euler", True, marks=() if system in KINDS else pytest.mark.slow) for system in SYSTEMS),
-        *((system, method, False) for system in KINDS for method in FIXED_STEP_METHODS if method != "euler"),
-    ],
+    sample(
+        [
+            *((system, "euler", False) for system in SYSTEMS),
+            *(
+                pytest.param(system, "euler", True, marks=() if system in KINDS else pytest.mark.gate)
+                for system in SYSTEMS
+            ),
+            *((system, method, False) for system in KINDS for method in FIXED_STEP_METHODS if method != "euler"),
+        ],
+        4,
+    ),
     indirect=["system"],
 )
 def test_gradient_of_every_output_is_that_of_backpropagation(system, cost, policy, x0, method):
@@ -177,7 +184,10 @@ IN_TRACE = {"anchored": "hjb", "fcn": "sontag", "expansion": "sampled", "angles"
 @double_integrator
 @pytest.mark.parametrize(
     ("value", "law", "traced"),
-    [*((value, law, False) for value in VALUES for law in POLICIES), *((*pair, True) for pair in IN_TRACE.items())],
+    sample(
+        [*((value, law, False) for value in VALUES for law in POLICIES), *((*pair, True) for pair in IN_TRACE.items())],
+        7,
+    ),
 )
 def test_every_network_under_every_control_law(value, law, system, cost, x0):
     V = VALUES[value](cost)

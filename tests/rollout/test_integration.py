@@ -17,6 +17,7 @@ from lyapnet.horizon import Horizon
 from lyapnet.policy import POLICIES
 from lyapnet.rollout import ADAPTIVE_METHODS, FIXED_STEP_METHODS, GRADIENTS, METHODS, Rollout
 from lyapnet.systems import SYSTEMS, DoubleIntegrator
+from tests.marks import sample
 from tests.problems import KINDS, problem_of
 
 DURATION = 0.2
@@ -165,7 +166,7 @@ def relative_error(value, expected):
 
 @pytest.mark.parametrize(
     ("system", "method", "gradient"),
-    [(system, *route) for route in EXACT for system in (SYSTEMS if route[0] == "euler" else KINDS)],
+    sample([(system, *route) for route in EXACT for system in (SYSTEMS if route[0] == "euler" else KINDS)], 3),
     indirect=["system"],
 )
 def test_exact_routes_give_the_gradient_of_the_discretisation(system, cost, policy, x0, directions, method, gradient):
@@ -215,7 +216,9 @@ def law_by_autograd(request, system, cost, quadratic):
 
 
 @double_integrator
-@pytest.mark.parametrize(("gradient", "tolerance"), [("adjoint", 1e-5), ("backprop", 1e-7), ("discrete", 1e-7)])
+@pytest.mark.parametrize(
+    ("gradient", "tolerance"), sample([("adjoint", 1e-5), ("backprop", 1e-7), ("discrete", 1e-7)], 5)
+)
 def test_every_route_differentiates_through_a_gradient(system, cost, law_by_autograd, x0, gradient, tolerance):
     laws = law_by_autograd, Cut(law_by_autograd)
     method = "dopri5" if gradient == "adjoint" else "rk4"  # held over steps, a law has no costate but the discrete one

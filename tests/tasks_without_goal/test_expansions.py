@@ -28,6 +28,7 @@ def test_optima_against_the_transcription(found):
     assert ((optimum.path.cost - optima[:STATES]).abs() < 1e-3 * optima.std()).all()
 
 
+@pytest.mark.gate
 def test_the_expansion_has_the_slope_and_the_curvature_of_optima_beside(found):
     """Central differences of optima that are sought anew, along each component in which X₀ extends."""
     problem, _, optimum = found

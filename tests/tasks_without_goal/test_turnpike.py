@@ -11,6 +11,7 @@ from tests.tasks_without_goal.turnpike import FOLDER, GOLDEN_RULE, HORIZONS, cha
 pytest.importorskip("casadi")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("years", HORIZONS[:2])
 def test_least_costs_are_those_of_the_task(years):
     problem, task = problem_in(FOLDER, *changes_for(years)), task_of(years)
@@ -32,7 +33,7 @@ def test_optima_of_a_long_horizon_share_their_middle(years, stays):
     assert bool(away < 0.02) is stays
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("years", HORIZONS)
 def test_training_is_right_over_any_horizon(years):
     run, found = train_and_measure(task_of(years), seed=0)

@@ -11,6 +11,8 @@ from lyapnet.checkpoint import read_checkpoint
 from lyapnet.random_streams import CERTIFICATION, TEST, TRAINING, VALIDATION, stream
 from tests.runs import SMALL, Desk, dies_at, logged, values, without_figures
 
+pytestmark = pytest.mark.gate
+
 TRAINING_OPTIONS = {**SMALL["training"], "iterations": 30, "validate_every": 10}
 CERTIFIED = {"certify_every": 2, "certified_states": 40, "confidence": 0.9}
 DISCRETE = {"gradient": "discrete", "compile": "off"}
@@ -59,7 +61,7 @@ def test_the_run_is_the_same_without_them(run, tmp_path):
     assert not set(BOUNDS) & fewer.keys(), "off by default"
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_killed_run_resumes_with_the_same_curves(run, tmp_path):
     desk = Desk(
         tmp_path,

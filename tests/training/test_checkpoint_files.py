@@ -61,6 +61,7 @@ def change(path):
     torch.save(content, path)
 
 
+@pytest.mark.gate
 def test_plain_trainer_writes_the_digest_and_verifies_it(parts, tmp_path, caplog):
     path = fit(parts, tmp_path, 2)
     assert DIGEST in torch.load(path, weights_only=True)

@@ -47,6 +47,7 @@ def law_of(checkpoint):
     return type(lyapnet.load(checkpoint).closed_loop.policy)
 
 
+@pytest.mark.gate
 def test_the_law_that_costs_much_less_is_trained_and_stays_the_run_s(brief, capsys):
     run = lyapnet.train(brief, FEW)
     assert SAID in capsys.readouterr().out
@@ -60,6 +61,7 @@ def test_the_law_that_costs_much_less_is_trained_and_stays_the_run_s(brief, caps
     assert (more.folder, law_of(more.last)) == (run.folder, LookaheadPolicy)
 
 
+@pytest.mark.gate
 def test_a_law_that_is_named_stays(brief, capsys):
     run = lyapnet.train(brief, [*FEW, "rollout.policy=sampled"])
     assert SAID in capsys.readouterr().out

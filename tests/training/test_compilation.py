@@ -18,6 +18,7 @@ from lyapnet.graphs.number_kernel import assembly
 from lyapnet.networks import FCN, NETWORKS
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.stages import PATIENCE, Stages
+from tests.marks import sample
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
 SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "training.iterations=1"]
@@ -71,18 +72,22 @@ def train(tmp_path, capsys, *overrides, resume=()):
 
 @pytest.mark.parametrize(
     ("overrides", "compiled"),
-    [
-        ([], True),
-        (["rollout.compile=on"], True),
-        (["rollout.compile=off"], False),
-        (["rollout.gradient=backprop"], False),
-    ],
+    sample(
+        [
+            ([], True),
+            (["rollout.compile=on"], True),
+            (["rollout.compile=off"], False),
+            (["rollout.gradient=backprop"], False),
+        ],
+        4,
+    ),
 )
 def test_a_run_compiles_where_it_may(tmp_path, overrides, compiled, machine_code, capsys):
     assert train(tmp_path, capsys, *overrides)[0] is compiled
     assert machine_code == ([(3, 2)] if compiled else [])
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("compiled", [True, False])
 def test_resumed_runs_go_on_as_they_were(tmp_path, compiled, machine_code, capsys):
     """Machine code rounds differently."""
@@ -95,6 +100,7 @@ def test_resumed_runs_go_on_as_they_were(tmp_path, compiled, machine_code, capsy
     assert bool(machine_code) is compiled
 
 
+@pytest.mark.gate
 def test_a_compilation_that_fails_is_not_on_record(tmp_path, machine_code, capsys):
     machine_code.failure = "Expected luck, got none"
     compiled, lines = train(tmp_path, capsys, "rollout.compile=on")

@@ -51,12 +51,13 @@ def gradient_on(name, *overrides, processes):
     return torch.cat([g.flatten() for g in torch.autograd.grad(loss, list(module.V.parameters()))])
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("name", "gradient", "two"),
     [
         ("double_integrator", "discrete", FORKED),
-        pytest.param("double_integrator", "discrete", TWO, marks=pytest.mark.slow),
-        pytest.param("double_integrator_value", "adjoint", TWO, marks=pytest.mark.slow),
+        pytest.param("double_integrator", "discrete", TWO, marks=pytest.mark.gate),
+        pytest.param("double_integrator_value", "adjoint", TWO, marks=pytest.mark.gate),
     ],
 )
 def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, gradient, two):
@@ -70,7 +71,7 @@ def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, grad
     assert (taken - alone).norm() / joint.norm() > 1e-3
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_a_run_goes_on_with_another_number_of_processes(tmp_path):
     name, options = "double_integrator", ["rollout.gradient=adjoint", f"logs={tmp_path}", "training.iterations=1"]
     lyapnet.train(SCRATCH / f"{name}.yaml", [*SMALL, *options])

@@ -98,6 +98,7 @@ def distance(one, other):
     return max(float((weights[key] - others[key]).abs().max() / others[key].abs().max()) for key in weights)
 
 
+@pytest.mark.gate
 def test_member_is_the_run_of_its_seed(ensemble, single):
     alone = single.best()
     assert distance(ensemble.best("seed_4"), alone) == 0
@@ -106,6 +107,7 @@ def test_member_is_the_run_of_its_seed(ensemble, single):
         assert distance(ensemble.best(wrong), alone) > 1e-3
 
 
+@pytest.mark.gate
 def test_curves_of_a_member_are_those_of_its_run(ensemble, single):
     member, alone = logged(ensemble.run / "seed_4"), logged(single.run)
     pictures = {tag for tag in logged(ensemble.run / "seed_3") if tag not in member}
@@ -155,6 +157,7 @@ def test_batches_are_those_of_the_seeds():
         assert not torch.equal(batch[0], batch[1])
 
 
+@pytest.mark.gate
 def test_ensemble_of_a_checkpoint_starts_from_its_weights(ensemble, tmp_path):
     source, desk = ensemble.best("seed_5"), desk_of(tmp_path)
     assert desk.train("--finetune", str(source), "training.iterations=1", prepare=without_figures)[0] == 0
@@ -175,6 +178,7 @@ def controller_cost(path, seed):
 # What a user sees
 
 
+@pytest.mark.gate
 def test_folder_of_an_ensemble(ensemble):
     assert {path.name for path in ensemble.run.iterdir()} == {
         ".lock", "config.yaml", "run.json", "evaluation.json", "checkpoints", *FOLDERS
@@ -185,6 +189,7 @@ def test_folder_of_an_ensemble(ensemble):
     assert steps == list(range(1, STEPS + 1))
 
 
+@pytest.mark.gate
 def test_best_checkpoint_of_a_member_is_an_ordinary_one(ensemble, tmp_path, capsys):
     controller = lyapnet.load(ensemble.best("seed_5"))
     assert (controller.config.seed, controller.config.seeds) == (SEED + 2, 1)
@@ -199,11 +204,13 @@ def test_best_checkpoint_of_a_member_is_an_ordinary_one(ensemble, tmp_path, caps
     )
 
 
+@pytest.mark.gate
 def test_checkpoint_of_all_seeds_is_refused_where_one_is_needed(ensemble):
     with pytest.raises(CheckpointError, match=r"holds several; use .*best.ckpt"):
         lyapnet.load(ensemble.last)
 
 
+@pytest.mark.gate
 def test_evaluation_has_the_mean_and_the_spread(ensemble):
     stored = json.loads((ensemble.run / "evaluation.json").read_text())
     assert [one["seed"] for one in stored["seeds"]] == [SEED + k for k in range(SEEDS)]
@@ -214,6 +221,7 @@ def test_evaluation_has_the_mean_and_the_spread(ensemble):
     assert not {"seed", "samples"} & stored["mean"].keys()
 
 
+@pytest.mark.gate
 def test_terminal_shows_ranges_over_the_seeds(ensemble, single):
     shown, alone = ensemble.output.read_text(), single.output.read_text()
     (line,) = [line for line in shown.splitlines() if line.startswith("step 3/")]
@@ -248,7 +256,7 @@ def test_a_measure_that_fewer_states_have_says_how_many():
 # Interrupted, diverged, refused
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_interrupted_an_ensemble_goes_on_to_the_same_end(ensemble, tmp_path):
     desk = desk_of(tmp_path)
     process = desk.start(prepare=without_figures)
@@ -263,6 +271,7 @@ def test_interrupted_an_ensemble_goes_on_to_the_same_end(ensemble, tmp_path):
     assert (desk.run / "evaluation.json").read_text() == (ensemble.run / "evaluation.json").read_text()
 
 
+@pytest.mark.gate
 def test_ensembles_of_other_seeds_end_differently(ensemble, tmp_path):
     """A twin: what the comparison can see."""
     desk = desk_of(tmp_path, seed=SEED + 10)

@@ -177,6 +177,7 @@ def test_other_threads_are_heard():
     assert len(raised) == 1
 
 
+@pytest.mark.gate
 def test_the_last_step_shows_closed_loops_in_motion(tmp_path):
     config = {**CONFIG, "evaluation": {**CONFIG["evaluation"], "animate": True}}
     run = lyapnet.train(config, [f"logs={tmp_path}"])

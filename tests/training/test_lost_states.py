@@ -77,6 +77,7 @@ def test_excess_is_relative_to_what_v_says_or_to_the_typical_cost():
     assert excess(cost, value).tolist() == pytest.approx([1.0, 0.0, -0.5, 1.2 / 0.05])
 
 
+@pytest.mark.gate
 def test_what_is_kept_is_lost_under_the_weights_that_found_it(run):
     shares = values(run.run, "lost_fraction/val")
     assert [*shares] == VALIDATIONS
@@ -92,6 +93,7 @@ def test_what_is_kept_is_lost_under_the_weights_that_found_it(run):
     assert len(kept) == min(KEPT, sum(round(share * SOUGHT) for share in shares.values()))
 
 
+@pytest.mark.gate
 def test_training_on_them_is_another_training(run, tmp_path):
     without = trained(tmp_path / "without", training=SMALL["training"])
     mine, its = (checkpoint(desk, "last")["state_dict"] for desk in (run, without))
@@ -100,6 +102,7 @@ def test_training_on_them_is_another_training(run, tmp_path):
         values(without.run, "lost_fraction/val")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("place", [("lyapnet.training.modules:ValueModule", "training_step", 8)], ids=["step 8"])
 def test_a_killed_run_goes_on_with_the_same_states(place, run, tmp_path):
     desk = Desk(tmp_path, **LOSING)
@@ -110,6 +113,7 @@ def test_a_killed_run_goes_on_with_the_same_states(place, run, tmp_path):
     assert values(desk.run, "lost_fraction/val") == values(run.run, "lost_fraction/val")
 
 
+@pytest.mark.gate
 def test_each_member_of_an_ensemble_has_its_own(run, tmp_path):
     desk = trained(tmp_path / "ensemble", seeds=2)
     assert values(desk.run / "seed_0", "lost_fraction/val") == pytest.approx(values(run.run, "lost_fraction/val"))
@@ -126,6 +130,7 @@ def test_an_ensemble_draws_for_each_seed_what_its_run_alone_would():
         assert torch.equal(both_seeds.further(5, 2)[k], alone.further(5, 2))
 
 
+@pytest.mark.gate
 def test_a_search_that_diverges_changes_nothing(tmp_path):
     desk = Desk(tmp_path, **LOSING)
     status, _, errors = desk.train(prepare=partial(both, without_figures, _diverges))

@@ -141,6 +141,7 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     assert after[1] < before[1] / 20
 
 
+@pytest.mark.gate
 def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(swing, monkeypatch):
     """At most ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
     problem, seen, _ = swing
@@ -178,6 +179,7 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     assert kept == pytest.approx(costs[4], rel=1e-6)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 def test_the_compiled_loop_leads_where_the_law_does(swing, method):
     """Also where some states diverge; a loop whose controls are not held leads elsewhere, and is not taken."""

@@ -1,4 +1,4 @@
-"""Shipped trainings at full length, held to what the README promises. Minutes each: pytest -m slow."""
+"""Shipped trainings at full length, held to what the README promises. Minutes each: pytest -m nightly."""
 
 import json
 
@@ -6,7 +6,7 @@ import pytest
 
 from lyapnet.cli import main
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 def trained(name, folder, capsys, *overrides):

@@ -116,6 +116,7 @@ def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     assert any(not torch.equal(w, weights(best(run))[name]) for name, w in weights(checkpoint).items())
 
 
+@pytest.mark.gate
 def test_a_region_is_refined_with_the_weight_of_its_program(tmp_path):
     region = ["program.name=region", "program.constraint=0", "program.margin=null", "program.bound=null"]
     run = train(tmp_path, *region, "horizon.stationary=true", "cost.Q_T=null", "network.name=stationary")
@@ -168,6 +169,7 @@ def region_run(tmp_path_factory):
     return folder / "van_der_pol_region/version_0"
 
 
+@pytest.mark.gate
 def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
     before = load_config(region_run / "config.yaml")
     options = ["--set=-4.8:4.8,-10.8:10.8", "--seconds", "5", "--refine", "1", "--json"]
@@ -189,6 +191,7 @@ def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
     assert float((fall > -0.01 * value).double().mean()) > 0.5, "V rises there, or hardly falls; others are undecided"
 
 
+@pytest.mark.gate
 def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
     controller = lyapnet.load(best(region_run))
     claim = partial(
@@ -208,6 +211,7 @@ def test_the_same_command_does_not_train_again(run, monkeypatch):
     assert runs(run / "refine_1") == ["version_0"]
 
 
+@pytest.mark.gate
 def test_a_second_round_starts_from_the_first_and_keeps_its_points(run):
     refine(run)
     checkpoint, _ = refine(run, rounds=2)
@@ -224,6 +228,7 @@ def interrupted(*_):
     raise KeyboardInterrupt
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("place", "name", "written"),
     [
@@ -260,11 +265,13 @@ def test_where_nothing_fails_it_still_trains(run):
     assert points_of(run / "refine_1")[1].numel() == 0
 
 
+@pytest.mark.gate
 def test_single_precision_is_refined(tmp_path):
     refine(train(tmp_path, "training.precision=float32"))
     assert runs(tmp_path / "double_integrator_from_scratch/version_0/refine_1") == ["version_0"]
 
 
+@pytest.mark.gate
 def test_the_command(run, capsys, monkeypatch):
     class Made(SoundCertificate):
         def numbers(self):

@@ -62,6 +62,8 @@ from tests.runs import (
     without_figures,
 )  # fmt: skip
 
+pytestmark = pytest.mark.gate
+
 ROOT = Path(__file__).parents[2]
 STEPS = SMALL["training"]["iterations"]
 VALIDATIONS = [0, 5, 10, 15, 17]
@@ -270,7 +272,7 @@ def survives(desk, moments, arguments=()):
         arguments = ("--resume", "last")
 
 
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.gate)])
 def test_killed_at_chosen_moments_a_run_ends_the_same(every, desk, reference):
     survives(desk, MOMENTS[2 if every > 1 else 0 :: every])
     assert desk.train("--resume", "last")[0] == 0
@@ -641,7 +643,7 @@ def test_run_in_progress_is_not_resumed_by_another_process(desk, ask):
     assert (status, errors) == (0, "")
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_of_two_that_resume_at_the_same_time_one_is_refused(finished, tmp_path):
     (tmp_path / "other").mkdir()
     desks = [finished, Desk(tmp_path / "other")]

@@ -14,6 +14,8 @@ from lyapnet.training.settling import COOLING, WINDOW, Settling, end_of
 from lyapnet.training.stages import Stages
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, without_figures
 
+pytestmark = pytest.mark.gate
+
 EVERY = 20
 LONG = {
     "training": {**SMALL["training"], "iterations": 400, "validate_every": EVERY, "least_gain": 1e6},

@@ -69,6 +69,7 @@ def test_a_linear_task_is_solved_before_the_first_step(monkeypatch):
     assert_close(learner.V(torch.zeros(()), x), exact.value(0, x), rtol=1e-9, atol=0)
 
 
+@pytest.mark.gate
 def test_what_training_starts_from_stays_the_best_where_nothing_is_better(tmp_path):
     run = train(
         {**LINEAR, "logs": str(tmp_path)},
@@ -87,6 +88,7 @@ def test_the_learning_rate_rises_before_it_falls():
     assert config_from_plain(LINEAR).training.warmup > 0
 
 
+@pytest.mark.gate
 def test_far_from_the_goal_optima_are_the_best_start(swing):
     learner, start, told = swing
     stages = ["the optimum from the centre of X₀", "optima from 12 states of X₀ within 30 s of work",
@@ -107,6 +109,7 @@ def test_far_from_the_goal_optima_are_the_best_start(swing):
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
 
 
+@pytest.mark.gate
 def test_within_limits_optima_are_a_start_too(swing, tmp_path, capsys):
     """Without limits, the best start costs less, and its controls are larger."""
     limited = {**SWING, "controls": {"lower": -9, "upper": 9}, "logs": str(tmp_path)}
@@ -144,6 +147,7 @@ def test_every_seed_of_an_ensemble_starts_from_it():
     assert not torch.equal(weights[0], weights[1]), "their networks differ all the same"
 
 
+@pytest.mark.gate
 def test_states_that_V_ignores_are_left_out_of_the_expansion():
     task = LINEAR | {
         "system": {"name": "linear", "parameters": {"A": [[0, 1, 0], [0, 0, 0], [0, 0, -1]], "B": [[0], [1], [0]]}},
@@ -160,6 +164,7 @@ def test_states_that_V_ignores_are_left_out_of_the_expansion():
     assert start.chosen.cost == pytest.approx(same.chosen.cost, rel=0.3)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("wrong", [False, True])
 def test_a_fit_does_not_begin_with_an_expansion_that_is_worse_than_nothing(wrong, monkeypatch):
     def bent(problem, *told):
@@ -176,6 +181,7 @@ def test_a_fit_does_not_begin_with_an_expansion_that_is_worse_than_nothing(wrong
     assert bool(learner.V.curvature(t).any()), "what stands for V_xx in the law comes from the optima then"
 
 
+@pytest.mark.gate
 def test_fitting_to_optima_is_kept_where_it_is_better_and_taken_back_where_not(monkeypatch):
     """A cart-pole that is to be balanced: Riccati's law costs a few per cent more than the optimum."""
     task = LINEAR | {
@@ -196,6 +202,7 @@ def test_a_network_without_a_place_for_it_starts_as_it_is():
     assert started(LINEAR, "network.name=fcn")[1] is None
 
 
+@pytest.mark.gate
 def test_a_run_records_its_start_and_loads_with_it(tmp_path, capsys):
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
              "rollout.compile=off"]  # fmt: skip
@@ -229,6 +236,7 @@ class Rooted(ControlAffineSystem):
         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape[:-1], 2, 1)
 
 
+@pytest.mark.gate
 def test_optima_are_sought_where_there_is_no_expansion():
     """Around a goal at which f has no slope, where the centre of X₀ says nothing."""
     task = {**LINEAR, "system": {"name": "mine:Rooted"}, "initial_states": {"lower": [-2, -1], "upper": [2, 1]}}

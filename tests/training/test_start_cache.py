@@ -76,6 +76,7 @@ def begun(*overrides):
     return members, kept_or_chosen(members)
 
 
+@pytest.mark.gate
 def test_the_same_task_begins_at_once_where_it_began(kept, sought):
     (first, start), (again, at_once) = kept, begun()
     assert start is not None
@@ -86,6 +87,7 @@ def test_the_same_task_begins_at_once_where_it_began(kept, sought):
     assert not all(map(torch.equal, weights_of(drawn()), weights_of(again)))
 
 
+@pytest.mark.gate
 def test_facts_say_that_their_seconds_are_those_of_an_earlier_search():
     def found():
         (learner,) = build_module(config_from_plain(TASK)).members
@@ -121,6 +123,7 @@ def test_a_file_that_is_no_start_is_sought_again(damage, sought):
     assert all(map(torch.equal, weights, weights_of(drawn())))
 
 
+@pytest.mark.gate
 @pytest.mark.usefixtures("kept")
 def test_what_training_starts_from_is_saved_before_anything_else(tmp_path, monkeypatch):
     """A run that is broken off before its first step leaves the controller that it would have begun with."""

@@ -61,6 +61,7 @@ def test_everything_follows_the_module_to_a_device(name):
     assert module.problem.initial_states.sample(3).device.type == "meta"
 
 
+@pytest.mark.gate
 def test_passed_system_takes_the_precision_of_the_run_and_stays_as_it_was(without_figures, tmp_path):
     path = trained("cartpole_balancing", tmp_path)
     parameters = lyapnet.load(path).config.system.parameters
@@ -117,7 +118,7 @@ def test_figure_that_cannot_be_drawn_does_not_stop_a_run(tmp_path, monkeypatch):
         trained("double_integrator", tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.gate
 def test_two_processes_draw_different_batches_and_agree(without_figures, tmp_path):
     """Distributed data parallel on the CPU; a process of its own, since it forks."""
     arguments = [*SHORT, "trainer.devices=2", "trainer.strategy=ddp_fork", f"logs={tmp_path}", "network.hidden=[8,8]"]

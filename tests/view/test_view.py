@@ -20,6 +20,8 @@ from lyapnet.sets import Box
 from lyapnet.view import page, page_of
 from tests.problems import Formula, untrained
 
+pytestmark = pytest.mark.gate
+
 pytest.importorskip("plotly")
 BROWSER = shutil.which("chromium-headless-shell") or shutil.which("chromium")
 FIXTURE = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"

@@ -16,6 +16,7 @@ from lyapnet.cli import main
 from lyapnet.config import load_config
 from lyapnet.errors import UsageError
 from lyapnet.zoo import entry, making
+from tests.marks import sample
 
 ROOT = Path(__file__).parents[2]
 NAMES = zoo_names()
@@ -34,7 +35,7 @@ def test_every_checkpoint_has_its_record_and_its_command():
     assert all((ROOT / arguments[0]).is_file() for arguments in making.TASKS.values())
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", sample(NAMES, 6))
 def test_a_controller_is_as_good_as_its_record_says(name):
     one = entry(name)
     trajectory, ratio, error = one.measured(one.load())
@@ -89,6 +90,7 @@ def test_the_wheel_holds_them():
     assert {"zoo/*.ckpt", "zoo/*.json"} <= set(data)
 
 
+@pytest.mark.gate
 def test_demo_and_zoo(tmp_path, capsys):
     assert main(["demo", ONE, "--out", str(tmp_path / "shown")]) == 0
     printed = capsys.readouterr().out
@@ -151,6 +153,7 @@ def test_a_command_takes_one(capsys):
     assert "zoo:NAME" in capsys.readouterr().err
 
 
+@pytest.mark.gate
 def test_making_strips_and_measures(tmp_path, monkeypatch):
     pytest.importorskip("casadi")
     pytest.importorskip("onnxscript")

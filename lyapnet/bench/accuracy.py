@@ -58,8 +58,9 @@ def gradient_accuracy(case: Case, batch: int = 4, halvings: int = 4) -> list[Acc
     """Gradients of the mean trajectory cost J over the same T, in ever more steps or at ever tighter tolerances.
 
     The steps are the task's, halved `halvings` times to once. J alone, since its gradient has a limit as Δt → 0 under
-    any program; the limit is taken from rk4 in the task's own number of steps. Evaluations are counted where
-    torchdiffeq makes them; discrete evaluates s stages at N + 1 nodes and linearises each of them once: 2s(N + 1).
+    any program; the limit is taken from rk4 in the task's own number of steps. The law is read at every t, which is the
+    limit of those that are held over a step. Evaluations are counted where torchdiffeq makes them; discrete evaluates s
+    stages at N + 1 nodes and linearises each of them once: 2s(N + 1).
     """
     case = case._replace(program=ValueProgram(constraint=0.0, trajectory_cost=1.0, normalise=False))
     x0, N = case.sample(batch), case.problem.horizon.steps
@@ -83,7 +84,7 @@ def gradient_accuracy(case: Case, batch: int = 4, halvings: int = 4) -> list[Acc
 
 def _counted(case: Case, x0: State, route: str, **options: Any) -> tuple[Tensor, int]:
     """The gradient by a route, and its evaluations of the closed loop."""
-    rollout = case.rollout(route, **options)
+    rollout = case.rollout(route, policy="hjb", **options)
     calls: list[None] = []
     rollout.closed_loop.register_forward_hook(lambda *_: calls.append(None))
     gradient = flat(case.gradient(rollout, x0))

@@ -219,9 +219,7 @@ def test_chain_of_integrators_moves_its_last_state_by_its_control():
 @pytest.mark.gate
 def test_accuracy_orders_of_convergence():
     by_route = {}
-    for point in bench.gradient_accuracy(
-        case_of("horizon.steps=40", "horizon.dt=0.02", "rollout.policy=hjb"), batch=2, halvings=2
-    ):
+    for point in bench.gradient_accuracy(case_of("horizon.steps=40", "horizon.dt=0.02"), batch=2, halvings=2):
         by_route.setdefault((point.route, point.method), []).append(point)
     for method, order, stages in (("euler", 1, 1), ("rk4", 4, 4)):
         coarse, fine = by_route["discrete", method]  # twice the steps

@@ -192,6 +192,8 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
             _refuse_scalar(
                 key, value, "a number or a list of numbers" if of_floats else "a list", f.metadata.get("doc", "")
             )
+            if annotation in ("list[float]", "list[float] | None") and isinstance(value, list):
+                _refuse_all_but_numbers(key, dict(enumerate(value)), f.metadata.get("doc", ""))
         elif annotation == "dict[str, float]":
             _refuse_all_but_numbers(key, value, f.metadata.get("doc", ""))
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):

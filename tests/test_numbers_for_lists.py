@@ -45,6 +45,20 @@ def test_one_state_needs_no_list():
     assert_close(problem.goal, torch.tensor([0.9]))
 
 
+@pytest.mark.parametrize("entry", [[1], ["a", "b"], "x", True, {"a": 1}])
+@pytest.mark.parametrize("key", ["pointwise.region", "initial_states.lower", "target_control", "network.state_scale"])
+def test_an_entry_that_is_no_number_is_refused(key, entry):
+    section, _, name = key.rpartition(".")
+    given = {section: {**TASK.get(section, {}), name: [entry]}} if section else {name: [entry]}
+    with pytest.raises(UsageError, match=rf"Expected {key}.0 as a number, got"):
+        config_from_plain({**TASK, **given})
+
+
+def test_an_entry_may_be_a_number_in_quotes_or_another_value():
+    config = config_from_plain({**TASK, "seed": 3, "pointwise": {"region": ["2.5", "${seed}"]}})
+    assert config.pointwise.region == [2.5, 3.0]
+
+
 @pytest.mark.parametrize("side", ["lower", "upper"])
 @pytest.mark.parametrize(
     ("limits", "reason"),

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
+import torch
 from torch import Tensor
 from torch.library import custom_op
 
@@ -31,6 +32,7 @@ def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Make a function torch's operator lyapnet::NAME too, which it is `as_operators`.
 
     Its arguments are tensors, its result has the shape and the type of the first one, and no gradient runs through it.
+    Under torch.func.vmap and the like it is what it is written as.
     """
     named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
     whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")
@@ -38,6 +40,7 @@ def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
     @functools.wraps(function)
     def called(*tensors: Tensor) -> Tensor:
-        return whole(*tensors) if are_operators() else function(*tensors)
+        wrapped = any(map(torch._C._functorch.is_functorch_wrapped_tensor, tensors))  # pyright: ignore[reportAttributeAccessIssue]
+        return whole(*tensors) if are_operators() and not wrapped else function(*tensors)
 
     return called

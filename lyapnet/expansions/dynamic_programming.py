@@ -33,7 +33,8 @@ from lyapnet.types import Control, ControlPath, PerState, State, StatePath
 
 STEP_SIZES = tuple(0.5**k for k in range(10))
 FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
-NEAR, SETTLED = 1e-3, 1e-9  # shares of J_N to gain at which second derivatives of F join, and that are none
+NEAR = 1e-3  # share of J_N of which no more is expected or gained when the second derivatives of F join
+SETTLED, OPTIMAL = 1e-9, 1e-12  # with them: share that the last search gains, and that is left of an optimum
 HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
 ROUNDING = 1e-12  # of the largest eigenvalue of Q_uu, below which the others are lost in it
 TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
@@ -116,7 +117,7 @@ def optimal_trajectories(
         return path_under(problem, lambda n, _: controls[n], x0)
 
     def descended(problem: Problem, programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
-        descent = _Descent(problem, programs, now, curved, NEAR if kind < kinds - 1 else SETTLED)
+        descent = _Descent(problem, programs, now, curved)
         descent.run(iterations, rivals, lambda count: progress((kind * b + count) // kinds, b), until)
         return descent
 
@@ -152,18 +153,19 @@ def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path
 
 
 class _Descent:
-    """Line searches until no trajectory is expected to gain more than a share of its cost; each has its own damping.
+    """Line searches until no trajectory gains, or is expected to gain, more than a share of its cost.
 
-    What a pass without damping expects is its V_0(x₀) beside J_N: to second order what the full step leads to.
+    What a pass without damping expects is its V_0(x₀) beside J_N: to second order what the full step leads to. Each
+    trajectory has its own damping.
 
     Args:
         now: trajectories to begin with.
         curved: with the second derivatives of F.
-        enough: the share.
     """
 
-    def __init__(self, problem: Problem, programs: StepPrograms, now: Path, curved: bool, enough: float):
-        self.problem, self.programs, self.curved, self.enough = problem, programs, curved, enough
+    def __init__(self, problem: Problem, programs: StepPrograms, now: Path, curved: bool):
+        self.problem, self.programs, self.curved = problem, programs, curved
+        self._gained, self._expected = (SETTLED, OPTIMAL) if curved else (NEAR, NEAR)
         self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (rows, the pass that expected no more of them)
 
     def run(self, iterations: int, rivals: bool, progress: Callable[[int], None], until: float) -> None:
@@ -177,10 +179,10 @@ class _Descent:
                 break
             was, backward = self._pass(rows, damping[rows])
             expected = (was.cost - backward.expansion.value[0]).abs()
-            going = (damping[rows] > 0) | ~(expected <= self.enough * was.cost.abs())
-            self._passes.append((rows[~going], backward.member(~going)))
-            settled[rows[~going]] = True
-            rows, was, backward = rows[going], was.member(going), backward.member(going)
+            unsettled = (damping[rows] > 0) | ~(expected <= self._expected * was.cost.abs())
+            self._passes.append((rows[~unsettled], backward.member(~unsettled)))
+            settled[rows[~unsettled]] = True
+            rows, was, backward = rows[unsettled], was.member(unsettled), backward.member(unsettled)
             if len(rows):
                 tried = _line_search(self.problem, self.programs, was, backward)
                 better = tried.cost < was.cost
@@ -188,18 +190,19 @@ class _Descent:
                 self.now = exchanged(self.now, rows[better], tried.member(better))
                 failures[rows] = torch.where(better, 0, failures[rows] + 1)
                 damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
-                settled[rows] = better & (gain <= self.enough * was.cost.abs()) | (failures[rows] > TRIES)
+                settled[rows] = better & (gain <= self._gained * was.cost.abs()) | (failures[rows] > TRIES)
             if rivals and (self.curved or k >= GRACE) and settled.any():
                 least = self.now.cost[settled].min()
                 settled |= self.now.cost > least + (HOPELESS - 1) * least.abs()
 
     def optimum(self) -> Optimum:
-        """The trajectories, with V around each; there is no pass yet where the last search gained what is no gain."""
-        without = torch.ones_like(self.now.cost, dtype=torch.bool)
+        """The trajectories, with V around each; one without a kept pass gets its pass now."""
+        has_no_pass = torch.ones_like(self.now.cost, dtype=torch.bool)
         for rows, _ in self._passes:
-            without[rows] = False
-        left = torch.nonzero(without).flatten()
-        passes = [*self._passes, *([(left, self._pass(left)[1])] if len(left) else [])]
+            has_no_pass[rows] = False
+        others, passes = torch.nonzero(has_no_pass).flatten(), self._passes
+        if len(others):
+            passes = [*passes, (others, self._pass(others)[1])]
         order = torch.cat([rows for rows, _ in passes]).argsort()
         parts = zip(*(backward.expansion for _, backward in passes), strict=True)
         mended = torch.cat([backward.mended for _, backward in passes], 1)[:, order].sum(0)

@@ -76,6 +76,8 @@ def trace(
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
     _require_written_memory(graph_module.graph)
+    if any(str(node.target).startswith("lyapnet.") for node in graph_module.graph.nodes):
+        _require_same(graph_module, function, arguments)  # an operator may be another function of wrong arguments
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
     return graph_module

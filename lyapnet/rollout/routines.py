@@ -159,7 +159,7 @@ class TracedRoutines:
         self, module: nn.Module, arguments: list[Tensor], elsewhere: Sequence[Sequence[Tensor]] = ()
     ) -> GraphModule:
         with _tracing():
-            return trace(stateless(module), arguments, elsewhere, whole=True)
+            return trace(stateless(module), arguments, elsewhere, whole=self.x0.device.type == "cpu")
 
 
 @contextmanager

@@ -165,6 +165,15 @@ def test_further_starts_end_where_they_take_much_longer_than_the_first_minimum(m
     x0, rest = X0.sample(1)[0].numpy(), torch.zeros(oracle.problem.horizon.steps, 1).numpy()
     still = Candidate(rest.repeat(len(x0), 1), rest, math.inf)
     first = oracle.minimise(x0, still)
+    count = oracle._limit.done
+    assert 3 < count < 150
+    assert transcription_of("cartpole_swingup", iterations=count)[0].minimise(x0, still).cost == first.cost
+    short = transcription_of("cartpole_swingup", iterations=count - 1)[0].minimise(x0, still)
+    assert short == "IPOPT: Maximum_Iterations_Exceeded"
+    unknown = transcription_of("cartpole_swingup")[0]
+    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    assert unknown.minimise(x0, still, briefly=True).cost == first.cost, "nothing is known of how long one takes"
+    monkeypatch.undo()
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost
     monkeypatch.setattr(transcription, "BRIEF", (2, 150))
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost, "as long as the first one took, and longer"

@@ -35,13 +35,17 @@ def swings():
 
 def test_what_is_optimal_needs_one_pass_backwards_and_no_search(swings, monkeypatch):
     problem, x0, optimum = swings
-    searched = []
-    search = dynamic_programming._line_search
+    searched, passes = [], []
+    search, backward = dynamic_programming._line_search, dynamic_programming._backward
     monkeypatch.setattr(
         dynamic_programming, "_line_search", lambda *given: searched.append(len(given[2].cost)) or search(*given)
     )
-    again = optimal_trajectories(problem, x0, optimum.path.u)
+    monkeypatch.setattr(dynamic_programming, "_backward", lambda *given: passes.append(given[-1]) or backward(*given))
+    exact = optimal_trajectories(problem, x0, optimum.path.u).path.u
+    searched.clear(), passes.clear()
+    again = optimal_trajectories(problem, x0, exact)
     assert not searched
+    assert passes == [False, True], "one of each kind, and the second is V around the trajectories"
     assert_close(again.path.cost, optimum.path.cost, rtol=1e-12, atol=0)
     for part, expected in zip(again.expansion, optimum.expansion, strict=True):
         assert_close(part, expected, rtol=1e-6, atol=1e-8)
@@ -51,7 +55,7 @@ def test_what_is_optimal_needs_one_pass_backwards_and_no_search(swings, monkeypa
     assert searched
     assert max(searched) <= 2, "the others have been settled by what their passes expect"
     for part, expected in zip(beside.expansion, optimum.expansion, strict=True):
-        assert_close(part, expected, rtol=1e-3, atol=1e-4)
+        assert_close(part, expected, rtol=1e-4, atol=1e-6)
     assert_close(beside.path.cost, optimum.path.cost, rtol=1e-9, atol=0)
 
 

@@ -92,6 +92,29 @@ def test_inverses_and_their_slopes_are_torchs(d):
     assert_close(slope, -2 * torch.linalg.solve(A.mT, X) @ X.mT)
 
 
+@pytest.mark.parametrize("shapes", [[(4, 4), (5, 4)], [(2, 4, 4), (3, 2, 4)], [(0, 4, 4), (0, 4)]])
+def test_what_is_repeated_lies_once_in_memory(shapes):
+    controls, R, b = ControlBox(-0.5, 0.5), convex(m=4)[0].expand(shapes[0]), 4 * torch.randn(shapes[1])
+    graph = trace(lambda R, b: (controls.minimise(R.mT, b),), [R, b], whole=True)
+    assert_close(NumberKernel(graph, [R, b])(R, b)[0], controls.minimise(R, b), rtol=0, atol=1e-10)
+
+
+def test_a_matrix_that_is_not_symmetric_is_no_small_system():
+    """Up to six unknowns the upper triangle is never read; of more, torch reads it, and the instruction would not."""
+    A, B = torch.randn(5, 8, 8) + 8 * torch.eye(8), torch.randn(5, 8, 1)
+    with pytest.raises(ValueError, match="computes something else"):
+        trace(lambda A, B: (solve(A, B),), [A, B], whole=True)
+    A = A + A.mT
+    assert operators_of(trace(lambda A, B: (solve(A, B),), [A, B], whole=True)) == ["symmetric_inverse"]
+
+
+def test_under_vmap_functions_are_what_they_are_written_as():
+    controls, (R, b) = ControlBox(-1.0, 1.0), convex(5, m=3)
+    graph = trace(lambda R, b: (torch.func.vmap(controls.minimise)(R, b),), [R, b], whole=True)
+    assert not operators_of(graph)
+    assert_close(graph(R, b)[0], controls.minimise(R, b))
+
+
 def test_larger_systems_are_no_instruction():
     R, b = convex(3, m=33)
     graph = trace(lambda R, b: (solve(R, b[..., None]),), [R, b], whole=True)

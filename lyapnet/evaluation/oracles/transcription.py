@@ -78,8 +78,9 @@ class Transcription(Oracle):
         limits = self.problem.controls.limits
         domain = self.problem.domain
         bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
-        self._limit, self._solver = _solver(self.task, horizon.steps, bounded)
-        self._iterations, self._needed = iterations, 0  # at most; by a first minimum of a state so far
+        self._limit, self._solver = _solver(self.task, horizon.steps, iterations, bounded)
+        self._iterations = iterations
+        self._taken = 0  # most iterations of a first minimum so far; 0: none is known
         self._scales = Scales(self.problem)
         assert limits is not None  # oracle_of asks before
         free = torch.full((system.n,), torch.inf)
@@ -208,12 +209,12 @@ class Transcription(Oracle):
         most = self._iterations
         if briefly:
             least, most = BRIEF
-            most = min(most, self._iterations, max(least, LONGER * self._needed))
+            most = min(most, self._iterations, max(least, LONGER * self._taken) if self._taken else most)
         found = self._minimum(x0, start, most)
         if found == INVALID:  # where slopes do not exist at x₀ itself, as those of |v| at rest
             found = self._minimum(x0 + BESIDE * self._scales.of_states, start, most)
         if not briefly and not isinstance(found, str):
-            self._needed = max(self._needed, self._limit.done)
+            self._taken = max(self._taken, self._limit.done)
         return found
 
     def _minimum(self, x0: np.ndarray, start: Candidate, iterations: int) -> Candidate | str:
@@ -269,6 +270,8 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
 class _IterationLimit(casadi.Callback):
     """Ends IPOPT after a number of iterations that each call may choose, as CasADi has no such parameter.
 
+    IPOPT reports each iteration, and the start of a restoration phase too, which counts as one.
+
     Args:
         sizes: numbers in the variables x, the constraints g and the parameters p.
     """
@@ -283,7 +286,7 @@ class _IterationLimit(casadi.Callback):
         self.done, self.most = -1, most  # the start is reported too
 
     def is_reached(self) -> bool:
-        return self.done >= self.most
+        return self.done > self.most  # the last one may be the minimum
 
     def get_n_in(self) -> int:
         return casadi.nlpsol_n_out()
@@ -300,7 +303,7 @@ class _IterationLimit(casadi.Callback):
         return [int(self.is_reached())]
 
 
-def _solver(task: CasadiTask, steps: int, limited: bool) -> tuple[_IterationLimit, casadi.Function]:
+def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> tuple[_IterationLimit, casadi.Function]:
     """IPOPT for the transcribed task, with exact sparse derivatives, and what limits its iterations.
 
     Variables are (u, x) in units of their scales, parameters x₀, what J is divided by, and those scales.
@@ -322,6 +325,11 @@ def _solver(task: CasadiTask, steps: int, limited: bool) -> tuple[_IterationLimi
     acceptable = {f"ipopt.acceptable_{name}": value for name, value in enough.items()}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
     limit = _IterationLimit({name: problem[name].numel() for name in ("x", "g", "p")})
-    ends = {"iteration_callback": limit, "ipopt.max_wall_time": SECONDS, "ipopt.acceptable_iter": 5}
+    ends = {
+        "iteration_callback": limit,
+        "ipopt.max_iter": iterations,
+        "ipopt.max_wall_time": SECONDS,
+        "ipopt.acceptable_iter": 5,
+    }
     options = {**quiet, **exact, **acceptable, **ends}
     return limit, casadi.nlpsol("transcription", "ipopt", problem, options)

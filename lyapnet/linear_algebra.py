@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.overrides import handle_torch_function, has_torch_function_unary
 
-from lyapnet.operators import are_operators, operator
+from lyapnet.operators import are_operators, is_transformed, operator
 
 SMALL = 16  # products of entries that are cheaper without the library
 CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
@@ -124,4 +124,4 @@ class _Inverse(torch.autograd.Function):
 
 def has_values(x: Tensor) -> bool:
     """Whether a tensor has numbers that may be looked at, as none has in a trace or under vmap."""
-    return type(x) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
+    return type(x) is Tensor and not is_transformed(x)

@@ -5,12 +5,14 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.library import custom_op
 
 _AS_OPERATORS = ContextVar("functions are traced as operators", default=False)
+OPERATORS = set[Any]()  # as they stand in a trace
 
 
 @contextmanager
@@ -28,6 +30,11 @@ def are_operators() -> bool:
     return _AS_OPERATORS.get()
 
 
+def is_transformed(x: Tensor) -> bool:
+    """Whether a tensor is one of torch.func's, under vmap or grad."""
+    return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     """Make a function torch's operator lyapnet::NAME too, which it is `as_operators`.
 
@@ -37,10 +44,10 @@ def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
     whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")
     whole.register_fake(lambda first, *_: first.new_empty(first.shape))
+    OPERATORS.add(whole._opoverload)
 
     @functools.wraps(function)
     def called(*tensors: Tensor) -> Tensor:
-        wrapped = any(map(torch._C._functorch.is_functorch_wrapped_tensor, tensors))  # pyright: ignore[reportAttributeAccessIssue]
-        return whole(*tensors) if are_operators() and not wrapped else function(*tensors)
+        return whole(*tensors) if are_operators() and not any(map(is_transformed, tensors)) else function(*tensors)
 
     return called

@@ -116,8 +116,8 @@ def optimal_trajectories(
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
         return path_under(problem, lambda n, _: controls[n], x0)
 
-    def descended(problem: Problem, programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
-        descent = _Descent(problem, programs, now, curved)
+    def descended(programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
+        descent = _Descent(programs, now, curved)
         descent.run(iterations, rivals, lambda count: progress((kind * b + count) // kinds, b), until)
         return descent
 
@@ -126,11 +126,11 @@ def optimal_trajectories(
     if higher_order:
         roughly = problem.in_steps(method="euler")
         rough = StepPrograms(roughly, STEP_SIZES)
-        euler = descended(roughly, rough, under(u, roughly), curved=False, kind=0).now
+        euler = descended(rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
     programs = StepPrograms(problem, STEP_SIZES)
-    now = descended(problem, programs, now, curved=False, kind=kinds - 2).now
-    descent = descended(problem, programs, now, curved=True, kind=kinds - 1)
+    now = descended(programs, now, curved=False, kind=kinds - 2).now
+    descent = descended(programs, now, curved=True, kind=kinds - 1)
     if not programs.agrees(descent.now) and programs.forget():  # its numbers changed since programs were written
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     return descent.optimum()
@@ -159,12 +159,13 @@ class _Descent:
     trajectory has its own damping.
 
     Args:
+        programs: of the problem's steps.
         now: trajectories to begin with.
         curved: with the second derivatives of F.
     """
 
-    def __init__(self, problem: Problem, programs: StepPrograms, now: Path, curved: bool):
-        self.problem, self.programs, self.curved = problem, programs, curved
+    def __init__(self, programs: StepPrograms, now: Path, curved: bool):
+        self.programs, self.curved = programs, curved
         self._gained, self._expected = (SETTLED, OPTIMAL) if curved else (NEAR, NEAR)
         self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (rows, the pass that expected no more of them)
 
@@ -180,11 +181,12 @@ class _Descent:
             was, backward = self._pass(rows, damping[rows])
             expected = (was.cost - backward.expansion.value[0]).abs()
             unsettled = (damping[rows] > 0) | ~(expected <= self._expected * was.cost.abs())
-            self._passes.append((rows[~unsettled], backward.member(~unsettled)))
-            settled[rows[~unsettled]] = True
-            rows, was, backward = rows[unsettled], was.member(unsettled), backward.member(unsettled)
+            if not unsettled.all():
+                self._passes.append((rows[~unsettled], backward.member(~unsettled)))
+                settled[rows[~unsettled]] = True
+                rows, was, backward = rows[unsettled], was.member(unsettled), backward.member(unsettled)
             if len(rows):
-                tried = _line_search(self.problem, self.programs, was, backward)
+                tried = _line_search(self.programs.problem, self.programs, was, backward)
                 better = tried.cost < was.cost
                 gain = torch.where(better, was.cost - tried.cost, 0)
                 self.now = exchanged(self.now, rows[better], tried.member(better))
@@ -211,7 +213,7 @@ class _Descent:
     def _pass(self, rows: Tensor, damping: Tensor | None = None) -> tuple[Path, _Backward]:
         """Some of the trajectories, and the pass backwards along them."""
         path = self.now.member(rows)
-        return path, _backward(self.problem, self.programs, path.x, path.u, damping, self.curved)
+        return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved)
 
 
 def sizes(problem: Problem, cost: PerState) -> PerState:

@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
 from lyapnet.graphs.agreement import are_close
-from lyapnet.operators import as_operators
+from lyapnet.operators import OPERATORS, as_operators
 
 Tensors = tuple[Tensor, ...]
 
@@ -76,7 +76,7 @@ def trace(
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
     _require_written_memory(graph_module.graph)
-    if any(str(node.target).startswith("lyapnet.") for node in graph_module.graph.nodes):
+    if not OPERATORS.isdisjoint(node.target for node in graph_module.graph.nodes):
         _require_same(graph_module, function, arguments)  # an operator may be another function of wrong arguments
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])

@@ -4,48 +4,52 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from lyapnet.base.moved_modules import find_moved_modules
+
 try:
     __version__ = version("lyapnet")
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0.0.0"
 
+find_moved_modules()
+
 if TYPE_CHECKING:
-    from lyapnet.calculus import ValueFunction
-    from lyapnet.constraints import AllOf, Ball, Constraints, StateLimits
-    from lyapnet.controller import ArrayTrajectory, Controller
-    from lyapnet.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
-    from lyapnet.errors import LyapnetError
-    from lyapnet.horizon import Horizon
-    from lyapnet.interpolation import Table
-    from lyapnet.linear_algebra import norm
-    from lyapnet.loading import load
-    from lyapnet.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
-    from lyapnet.problem import Problem
-    from lyapnet.programs import LyapunovProgram, Program, Tolerances, ValueProgram
-    from lyapnet.rollout import Rollout, Trajectory
-    from lyapnet.sets import Box, ControlBox, ControlSet, Unbounded
-    from lyapnet.systems import SYSTEMS, ControlAffineSystem
+    from lyapnet.base.errors import LyapnetError
+    from lyapnet.base.interpolation import Table
+    from lyapnet.base.linear_algebra import norm
+    from lyapnet.controller.controller import ArrayTrajectory, Controller
+    from lyapnet.controller.loading import load
+    from lyapnet.loop.programs import LyapunovProgram, Program, Tolerances, ValueProgram
+    from lyapnet.loop.rollout import Rollout, Trajectory
+    from lyapnet.task.constraints import AllOf, Ball, Constraints, StateLimits
+    from lyapnet.task.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
+    from lyapnet.task.horizon import Horizon
+    from lyapnet.task.problem import Problem
+    from lyapnet.task.sets import Box, ControlBox, ControlSet, Unbounded
+    from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
     from lyapnet.training.data import InitialStateDataModule
     from lyapnet.training.experiment import train
     from lyapnet.training.modules import ValueModule
     from lyapnet.training.optimizer import OptimizerOptions
+    from lyapnet.value.calculus import ValueFunction
+    from lyapnet.value.policy import HJBPolicy, LookaheadPolicy, SampledPolicy, SontagPolicy
 
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
-    "calculus": ["ValueFunction"],
-    "constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
-    "controller": ["ArrayTrajectory", "Controller"],
-    "cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
-    "errors": ["LyapnetError"],
-    "interpolation": ["Table"],
-    "linear_algebra": ["norm"],
-    "loading": ["load"],
-    "policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
-    "horizon": ["Horizon"],
-    "problem": ["Problem"],
-    "programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
-    "rollout": ["Rollout", "Trajectory"],
-    "sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
-    "systems": ["SYSTEMS", "ControlAffineSystem"],
+    "value.calculus": ["ValueFunction"],
+    "task.constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
+    "controller.controller": ["ArrayTrajectory", "Controller"],
+    "task.cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
+    "base.errors": ["LyapnetError"],
+    "base.interpolation": ["Table"],
+    "base.linear_algebra": ["norm"],
+    "controller.loading": ["load"],
+    "value.policy": ["HJBPolicy", "LookaheadPolicy", "SampledPolicy", "SontagPolicy"],
+    "task.horizon": ["Horizon"],
+    "task.problem": ["Problem"],
+    "loop.programs": ["LyapunovProgram", "Program", "Tolerances", "ValueProgram"],
+    "loop.rollout": ["Rollout", "Trajectory"],
+    "task.sets": ["Box", "ControlBox", "ControlSet", "Unbounded"],
+    "task.systems": ["SYSTEMS", "ControlAffineSystem"],
     "training.data": ["InitialStateDataModule"],
     "training.experiment": ["train"],
     "training.modules": ["ValueModule"],

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
+from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
 
 CONF = Path(__file__).parents[1] / "conf"
 SCRATCH = CONF / "from_scratch"

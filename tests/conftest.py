@@ -66,11 +66,11 @@ jaxtyping.jaxtyped = _checked_at_first
 # Before the first import of lyapnet; the numeric tower lets 1 pass for 1.0, as Python's own type rules do.
 jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
-from lyapnet.certification import funnel, preconditions  # noqa: E402
-from lyapnet.cost import QuadraticCost  # noqa: E402
-from lyapnet.networks import FCN, Scaling  # noqa: E402
-from lyapnet.rollout import routines  # noqa: E402
-from lyapnet.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
+from lyapnet.claims import funnel, preconditions  # noqa: E402
+from lyapnet.loop.rollout import routines  # noqa: E402
+from lyapnet.task.cost import QuadraticCost  # noqa: E402
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
+from lyapnet.value.networks import FCN, Scaling  # noqa: E402
 from tests.problems import Quadratic  # noqa: E402
 
 torch.set_num_threads(1)

@@ -34,7 +34,7 @@ def imports(source: str, modules: Mapping[str, str]) -> Iterator[str]:
 
 
 def room(name: str) -> str:
-    """The top-level entry that a module belongs to: systems for lyapnet.systems.base; "" for lyapnet itself."""
+    """The top-level entry that a module belongs to: systems for lyapnet.task.systems.base; "" for lyapnet itself."""
     return name.partition(".")[2].partition(".")[0]
 
 

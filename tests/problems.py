@@ -6,18 +6,18 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
-from lyapnet.calculus import ValueFunction
-from lyapnet.config import load_config
-from lyapnet.controller import Controller
-from lyapnet.cost import Cost, QuadraticCost
-from lyapnet.horizon import Horizon
-from lyapnet.networks import ExpansionNetwork
-from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Problem
-from lyapnet.rollout import ClosedLoop
-from lyapnet.sets import Box, ControlSet, Unbounded
-from lyapnet.systems import ControlAffineSystem
+from lyapnet.controller.controller import Controller
+from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
+from lyapnet.experiment.config import load_config
+from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.task.cost import Cost, QuadraticCost
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box, ControlSet, Unbounded
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import ExpansionNetwork
+from lyapnet.value.policy import HJBPolicy
 
 CONF = Path(__file__).parents[1] / "conf"
 AMPLE = 300.0  # wall seconds that no proof of a test takes, on a busy machine too: what bounds it is its boxes

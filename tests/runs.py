@@ -21,8 +21,8 @@ import yaml
 from tensorboard.backend.event_processing.plugin_event_accumulator import EventAccumulator
 from tensorboard.util import tensor_util
 
-from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main, options
+from lyapnet.experiment.checkpoint import read_checkpoint
 
 SMALL = {
     "experiment": "small",

@@ -1,69 +1,38 @@
-"""The layout: which room imports which, that Lightning and OmegaConf stay at the edge, and that imports are light."""
+"""The layout: which folder imports which, that Lightning and OmegaConf stay at the edge, and that imports are light."""
 
+import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
 
 import pytest
 
-from tests.layout import files, functions, imports, levels, room, rooms, sources
+from tests.layout import imports, room, rooms, sources
+from tests.pages import ROOT
 
-# Each line imports only lines above it.
-LEVELS = (
-    {
-        "drawing",
-        "errors",
-        "findings",
-        "interpolation",
-        "machine",
-        "operators",
-        "provenance",
-        "random_streams",
-        "recipe",
-        "shapes",
-        "tables",
-        "types",
-    },
-    {"linear_algebra", "sizes"},
-    {"files"},
-    {"cluster", "constraints", "contracts", "cost", "derivatives", "devices", "horizon", "schema", "sets", "systems"},
-    {"domain"},
-    {"calculus", "checkpoint", "graphs", "operating_points", "problem"},
-    {"expansions", "family", "networks"},
-    {"after_horizon", "linearisation", "policy", "regulator"},
-    {"beyond", "rollout"},
-    {"programs"},
-    {"config"},
-    {"build"},
-    {"controller"},
-    {"evaluation", "export", "importing", "loading"},
-    {"certification"},
-    {"bench", "training", "view", "zoo"},
-    {"comparison"},
-    {"cli"},
-    {"__main__"},
-)
-MATHEMATICS = {
-    "after_horizon", "beyond", "calculus", "constraints", "contracts", "cost", "derivatives", "domain", "errors",
-    "expansions", "family", "files", "findings", "graphs", "horizon", "interpolation", "linear_algebra",
-    "linearisation", "networks", "operating_points", "operators", "policy", "problem", "programs", "random_streams",
-    "regulator", "rollout", "sets", "shapes", "systems", "types",
-}  # fmt: skip
+MATHEMATICS = {"base", "task", "value", "loop", "graphs", "prover"}
+PROVER_NEEDS_NONE_OF = {"controller", "experiment", "evaluation", "training", "claims", "exchange", "lab", "zoo", "cli"}
 EDGE = {"lightning", "omegaconf", "typer", "rich", "tensorboard", "matplotlib"}
-SHOWN = {"figures", "tables", "report"}  # files of other rooms that may draw or print
+SHOWN = {"drawing", "figures", "tables", "report"}  # files of other rooms that may draw or print
+
+
+def order_in_docs():
+    """The folders of the package in the order of the table in docs/architecture.md."""
+    return re.findall(r"^\| `(\w+)/` \|", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.M)
 
 
 def upward(modules):
-    """(room, what it imports) for every import of a room from the same line or a later one."""
-    line = {name: number for number, names in enumerate(LEVELS) for name in names}
+    """(folder, what it imports) for every import of a folder that the table has later, or not at all."""
+    order = order_in_docs()
     for here, imported in rooms(modules).items():
-        yield from ((here, other) for other in sorted(imported) if line.get(other, 99) >= line.get(here, -1))
+        if here != "__main__":
+            yield from ((here, other) for other in sorted(imported) if other not in order[: order.index(here)])
 
 
 def edge_imports(modules):
     """(module, what it imports) for every library of the edge in the mathematics, the oracles or the certificates."""
     for name, source in modules.items():
-        inner = room(name) in MATHEMATICS or name.startswith(("lyapnet.evaluation.oracles", "lyapnet.certification"))
+        inner = room(name) in MATHEMATICS or name.startswith(("lyapnet.evaluation.oracles", "lyapnet.claims"))
         if inner and name.rpartition(".")[2] not in SHOWN:
             yield from ((name, i) for i in imports(source, modules) if i.partition(".")[0] in EDGE)
 
@@ -80,19 +49,32 @@ def one_way(modules):
 
 
 @pytest.mark.gate
-def test_every_room_stands_on_its_level():
-    assert set().union(*LEVELS) == rooms(sources()).keys()
+def test_each_folder_imports_only_those_above_it_in_the_docs():
+    assert sorted([*order_in_docs(), "__main__"]) == sorted(rooms(sources()))
     assert not list(upward(sources()))
-    assert max(levels(rooms(sources())).values()) <= 18
+
+
+def test_there_are_about_fifteen_folders():
+    assert len(order_in_docs()) <= 16
+
+
+def test_the_prover_knows_no_controller():
+    found = {room(i) for name, source in sources().items() if room(name) == "prover" for i in imports(source, {})}
+    assert not found & PROVER_NEEDS_NONE_OF
+
+
+def test_the_command_line_alone_imports_the_lab():
+    graph = rooms(sources())
+    assert {name for name, imported in graph.items() if "lab" in imported} == {"cli"}
 
 
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("lyapnet.sets", "from lyapnet.rollout import Rollout"),
-        ("lyapnet.cost", "import lyapnet.problem"),
-        ("lyapnet.training.data", "from lyapnet.comparison.sweep import Point"),
-        ("lyapnet.programs.terms", "def late():\n    from lyapnet.config import Config"),
+        ("lyapnet.task.sets", "from lyapnet.loop.rollout import Rollout"),
+        ("lyapnet.task.cost", "import lyapnet.controller"),
+        ("lyapnet.training.data", "from lyapnet.lab.sweep import Point"),
+        ("lyapnet.loop.programs.terms", "def late():\n    from lyapnet.experiment.config import Config"),
     ],
 )
 def test_upward_import_is_found(module, line):
@@ -109,7 +91,8 @@ def test_circle_within_a_room_is_found():
     modules = sources()
     circle = {
         **modules,
-        "lyapnet.systems.base": modules["lyapnet.systems.base"] + "\nfrom lyapnet.systems import SYSTEMS\n",
+        "lyapnet.task.systems.base": modules["lyapnet.task.systems.base"]
+        + "\nfrom lyapnet.task.systems import SYSTEMS\n",
     }
     with pytest.raises(CycleError):
         one_way(circle)
@@ -130,16 +113,10 @@ def test_mathematics_does_not_import_the_edge():
     ],
 )
 @pytest.mark.parametrize(
-    "module", ["lyapnet.programs.new", "lyapnet.certification.new", "lyapnet.evaluation.oracles.new"]
+    "module", ["lyapnet.loop.programs.new", "lyapnet.claims.new", "lyapnet.evaluation.oracles.new"]
 )
 def test_mathematics_that_imports_the_edge_is_found(module, line):
     assert [name for name, _ in edge_imports({**sources(), module: line})] == [module]
-
-
-def test_files_and_functions_stay_short():
-    assert [(lines, name) for lines, name in files(sources()) if lines > 400] == []
-    long = [(lines, name) for lines, name in functions(sources()) if lines > 60 and not name.startswith("lyapnet.cli")]
-    assert long == []  # a command's function is its options
 
 
 def loaded(*statements):
@@ -158,16 +135,18 @@ def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
 
 @pytest.mark.gate
 def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning():
-    assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.config")
+    assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.experiment.config")
     slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
-    assert not slow & loaded("import lyapnet.build, lyapnet.training.build_learner, lyapnet.training.facts")
+    assert not slow & loaded(
+        "import lyapnet.experiment.assembly, lyapnet.training.build_learner, lyapnet.training.facts"
+    )
 
 
 @pytest.mark.gate
 def test_training_and_comparing_import_no_module_of_unix_alone():
     without = "sys.modules |= dict.fromkeys(['fcntl', 'resource'])"
     psutil = "import sys, psutil"  # which on Linux imports them itself
-    found = loaded(psutil, without, "import lyapnet.training.experiment, lyapnet.comparison.execution")
+    found = loaded(psutil, without, "import lyapnet.training.experiment, lyapnet.lab.comparison.execution")
     assert "lyapnet.training.run_lock" in found
 
 
@@ -175,4 +154,4 @@ def test_training_and_comparing_import_no_module_of_unix_alone():
 def test_training_loads_neither_bench_nor_comparison():
     found = loaded("import lyapnet", "lyapnet.train")
     assert "lyapnet.training.experiment" in found
-    assert not {"lyapnet.bench", "lyapnet.comparison", "gymnasium", "casadi", "stable_baselines3"} & found
+    assert not {"lyapnet.lab.bench", "lyapnet.lab.comparison", "gymnasium", "casadi", "stable_baselines3"} & found

@@ -11,12 +11,12 @@ import pytest
 import yaml
 from omegaconf import MISSING
 
-from lyapnet.build import REGISTRIES
-from lyapnet.comparison.plan import ComparisonConfig
-from lyapnet.config import Config
-from lyapnet.networks import NETWORKS
-from lyapnet.programs import PROGRAMS
-from lyapnet.recipe import STANDARD
+from lyapnet.experiment.assembly import REGISTRIES
+from lyapnet.experiment.config import Config
+from lyapnet.experiment.recipe import STANDARD
+from lyapnet.lab.comparison.plan import ComparisonConfig
+from lyapnet.loop.programs import PROGRAMS
+from lyapnet.value.networks import NETWORKS
 from tests.pages import PAGES, README, REPORT, ROOT
 
 WIDTH = 120

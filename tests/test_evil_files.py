@@ -14,8 +14,8 @@ import pytest
 import torch
 import yaml
 
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.cli import main
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 from tests.runs import TINY, tiny_checkpoint
 
 pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")

@@ -18,13 +18,13 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.certification.boxes import CutTree
-from lyapnet.certification.kept_proofs import FORMAT, read_proofs, write_proofs
-from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.base.files import appending
 from lyapnet.cli import main
-from lyapnet.files import appending
-from lyapnet.importing.onnx_file import read_onnx
-from tests.importing.models import linear, onnx
+from lyapnet.exchange.importing.onnx_file import read_onnx
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint
+from lyapnet.prover.boxes import CutTree
+from lyapnet.prover.kept_proofs import FORMAT, read_proofs, write_proofs
+from tests.exchange.importing.models import linear, onnx
 
 SECONDS = 2.0  # of this process, which other work of the machine does not lengthen
 HANGS = 60  # wall seconds after which it is taken to wait for ever
@@ -60,7 +60,7 @@ class Answer(NamedTuple):
 @pytest.fixture(scope="module", autouse=True)
 def _imported(tmp_path_factory):
     """What the commands import takes its seconds once, before they are counted."""
-    from lyapnet.certification import checking
+    from lyapnet.claims import checking
     from lyapnet.training import experiment
 
     assert checking, experiment

@@ -15,9 +15,9 @@ import pytest
 import torch
 import yaml
 
-from lyapnet import sizes
+from lyapnet.base import sizes
 from lyapnet.cli import main
-from lyapnet.config import Config
+from lyapnet.experiment.config import Config
 from tests.marks import at_the_gate
 
 SECONDS = 20
@@ -387,7 +387,7 @@ VERBS = ["evaluate broken.ckpt", "certify broken.ckpt", "certify sampled broken.
 
 def rewritten(change):
     """The bytes of the checkpoint with something else in it."""
-    from lyapnet.checkpoint import read_checkpoint, write_checkpoint
+    from lyapnet.experiment.checkpoint import read_checkpoint, write_checkpoint
 
     content = read_checkpoint(HERE / "best.ckpt")
     change(content)

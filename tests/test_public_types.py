@@ -147,7 +147,11 @@ def test_an_attribute_without_its_type_is_found(site):
     assert source.count(DECLARED) == 1
     problem.write_text(source.replace(DECLARED, ""), encoding="utf-8")
     unknown = {name for name, is_known in symbols(site).items() if not is_known}
-    assert {"lyapnet.problem.Problem.system", "lyapnet.problem.Problem", "lyapnet.loading.load"} <= unknown
+    assert {
+        "lyapnet.task.problem.Problem.system",
+        "lyapnet.task.problem.Problem",
+        "lyapnet.controller.loading.load",
+    } <= unknown
 
 
 @pytest.mark.gate

@@ -11,8 +11,8 @@ import typer
 
 import lyapnet
 from lyapnet.cli import app, main
-from lyapnet.comparison.plan import jobs_of, load_comparison
-from lyapnet.config import load_config
+from lyapnet.experiment.config import load_config
+from lyapnet.lab.comparison.plan import jobs_of, load_comparison
 from tests.fits import shorten_fits
 from tests.pages import PAGES, README, REPORT, ROOT, blocks
 from tests.problems import problem_of

@@ -8,10 +8,10 @@ import time
 import pytest
 import torch
 
-from lyapnet.certification import funnel
-from lyapnet.certification.branch_and_bound import Budget
+from lyapnet.base.errors import Interrupted, signals_taken
+from lyapnet.claims import funnel
 from lyapnet.cli import main
-from lyapnet.errors import Interrupted, signals_taken
+from lyapnet.prover.branch_and_bound import Budget
 from tests.problems import untrained
 
 CERTIFIED = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"
@@ -42,7 +42,7 @@ def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, few_seconds_f
 
 def test_what_waits_in_a_command_stops_at_once(monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.cli.options.read_checkpoint", lambda *_: time.sleep(60), raising=False)
-    monkeypatch.setattr("lyapnet.loading.read_checkpoint", lambda *_: time.sleep(60))
+    monkeypatch.setattr("lyapnet.controller.loading.read_checkpoint", lambda *_: time.sleep(60))
     before = signal.getsignal(signal.SIGTERM)
     told_after(0.5, signal.SIGTERM)
     started = time.monotonic()

@@ -7,21 +7,21 @@ import torch
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.after_horizon import choose_law
-from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
-from lyapnet.certification.sound_certificate import sound_certificate
+from lyapnet.base.errors import UsageError
+from lyapnet.claims.sampling_certificates import sampled_certificate, statistical_certificate
+from lyapnet.claims.sound_certificate import sound_certificate
 from lyapnet.cli import main
-from lyapnet.cost import ObstacleCost, spread
-from lyapnet.errors import UsageError
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.optimality import in_spreads
-from lyapnet.linearisation import Missing, riccati_or_reason
-from lyapnet.programs import LyapunovProgram, RegionProgram, ValueProgram
-from lyapnet.rollout import Rollout
+from lyapnet.loop.programs import LyapunovProgram, RegionProgram, ValueProgram
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.cost import ObstacleCost, spread
 from lyapnet.training.learner import Learner
 from lyapnet.training.lost_states import excess
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import silent
+from lyapnet.value.after_horizon import choose_law
+from lyapnet.value.linearisation import Missing, riccati_or_reason
 from tests.fits import shorten_fits
 
 R, T = 0.5, 1.0
@@ -243,7 +243,7 @@ def test_nothing_holds_a_goal_that_is_not_there():
 
 def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
     monkeypatch.setattr("lyapnet.training.relaxation.STATES", 4)
-    limit = lyapnet.constraints.StateLimits([0], [2.2], [1.0], [2.2], ["near"])
+    limit = lyapnet.task.constraints.StateLimits([0], [2.2], [1.0], [2.2], ["near"])
     problem = far().replaced(constraints=limit.double()).relaxed()
     found = find_relaxation(problem, silent)
     assert found.kept == 4

@@ -15,9 +15,9 @@ import torch
 from rich.console import Console
 
 import lyapnet
-from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
 from lyapnet.evaluation import evaluate
+from lyapnet.experiment.checkpoint import read_checkpoint
 
 FIXTURES = Path(__file__).parent / "fixtures" / "version_0.1"
 EVALUATED = sorted(FIXTURES.rglob("evaluate_*.json"))

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lyapnet.base.errors import Interrupted, LyapnetError, one_line, raised, signals_taken
 from lyapnet.cli import bench, certify
 from lyapnet.cli.animate import animate
 from lyapnet.cli.check import check
@@ -25,7 +26,6 @@ from lyapnet.cli.trim import trim
 from lyapnet.cli.tune import tune
 from lyapnet.cli.view import view
 from lyapnet.cli.zoo import demo, zoo
-from lyapnet.errors import Interrupted, LyapnetError, one_line, raised, signals_taken
 
 CLOSED_OUTPUT = 141  # the exit status of what the signal SIGPIPE ended, which not every system knows
 

@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import UsageError
 from lyapnet.cli.options import Debug, Given, of_a_controller
-from lyapnet.errors import UsageError
 
 
 @of_a_controller
@@ -30,8 +30,8 @@ def animate(
     The shapes are those of the system's `draw`; of a system without any, it is the plane of two states with level sets
     of V(t, ·).
     """
+    from lyapnet.base.random_streams import FIGURES, stream
     from lyapnet.evaluation.animation import Film
-    from lyapnet.random_streams import FIGURES, stream
 
     controller = given.load()
     if start is None:

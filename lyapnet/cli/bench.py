@@ -10,10 +10,10 @@ import typer
 from rich.console import Console
 from typer.core import TyperGroup
 
+from lyapnet.base.errors import UsageError
+from lyapnet.base.files import plain
+from lyapnet.base.sizes import THREADS
 from lyapnet.cli.options import Debug, Given, of_a_controller, stages_of
-from lyapnet.errors import UsageError
-from lyapnet.files import plain
-from lyapnet.sizes import THREADS
 
 DEFAULT = "gradient"
 
@@ -78,9 +78,9 @@ def gradient(
     lyapnet bench --task chain:2,chain:8,chain:32 --batch 64 --figures out
     lyapnet bench network.name=fcn program.name=value training.precision=float32
     """
-    from lyapnet import bench as benchmark
-    from lyapnet.bench.tables import bench_table
     from lyapnet.graphs.compilation import has_compiler
+    from lyapnet.lab import bench as benchmark
+    from lyapnet.lab.bench.tables import bench_table
 
     benchmark.use_threads(threads)
     cases = [benchmark.load_case(name, overrides or []) for name in _items(task) or ["double_integrator"]]
@@ -136,12 +136,12 @@ def certify(
     lyapnet bench certify --figures out
     lyapnet bench certify logs/double_integrator/version_0/checkpoints/best.ckpt --dimensions 2 --json
     """
-    from lyapnet.bench.conditions import condition_of_controller, condition_of_network
-    from lyapnet.bench.enclosures import enclosures_of
-    from lyapnet.bench.proofs import growth
-    from lyapnet.bench.tables import proofs_table, tightness_table
-    from lyapnet.bench.tightness import tightness
-    from lyapnet.loading import load
+    from lyapnet.controller.loading import load
+    from lyapnet.lab.bench.conditions import condition_of_controller, condition_of_network
+    from lyapnet.lab.bench.enclosures import enclosures_of
+    from lyapnet.lab.bench.proofs import growth
+    from lyapnet.lab.bench.tables import proofs_table, tightness_table
+    from lyapnet.lab.bench.tightness import tightness
 
     lengths = [_count("--dimensions", text) for text in _items([dimensions])]
     if figures is not None:
@@ -167,7 +167,7 @@ def certify(
     else:
         console.print(tightness_table(bounds, boxes), proofs_table(proofs, seconds))
     if figures is not None:
-        from lyapnet.bench.figures import certify_bench
+        from lyapnet.lab.bench.figures import certify_bench
 
         certify_bench(bounds, proofs).savefig(figures / "certify_bench.png", dpi=130)
         notes.print(f"wrote {figures / 'certify_bench.png'}", soft_wrap=True)
@@ -189,12 +189,12 @@ def law(
 
     lyapnet bench law logs/double_integrator/version_0/checkpoints/best.ckpt --seconds 60
     """
-    from lyapnet.bench.latency import latencies
-    from lyapnet.bench.tables import latency_table
+    from lyapnet.lab.bench.latency import latencies
+    from lyapnet.lab.bench.tables import latency_table
 
     controller, others = given.load(), None
     if beside:
-        from lyapnet.comparison.timing import alternatives
+        from lyapnet.lab.comparison.timing import alternatives
 
         others = alternatives(controller)
     given.report("writing, compiling, timing")
@@ -219,7 +219,7 @@ def _count(option: str, text: str) -> int:
 
 def _write_figures(folder: Path, first: Any, rows: list[Any]) -> list[Path]:
     """The figures that these rows fill, and the gradient errors of the first task."""
-    from lyapnet.bench import figures, gradient_accuracy, is_chain
+    from lyapnet.lab.bench import figures, gradient_accuracy, is_chain
 
     horizon = first.problem.horizon
     title = (

@@ -8,7 +8,7 @@ from typing import Any
 
 from typer.core import TyperGroup
 
-from lyapnet.errors import UsageError, did_you_mean
+from lyapnet.base.errors import UsageError, did_you_mean
 
 DEFAULT = "statistical"
 

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import UsageError
 from lyapnet.cli.by_kind import ByKind
 from lyapnet.cli.claims import (
     AsJson,
@@ -34,7 +35,6 @@ from lyapnet.cli.claims import (
 )
 from lyapnet.cli.options import Debug, Given, Parameter, of_a_controller
 from lyapnet.cli.refining import refined, require_refinable
-from lyapnet.errors import UsageError
 
 app = typer.Typer(cls=ByKind)
 
@@ -60,9 +60,9 @@ def sampled(
     debug: Debug = False,
 ) -> None:
     """The share of some states whose closed loop succeeds. It proves no more."""
-    from lyapnet.certification.draws import draws_of
-    from lyapnet.certification.report import require_writable
-    from lyapnet.certification.sampling_certificates import sampled_certificate
+    from lyapnet.claims.draws import draws_of
+    from lyapnet.claims.report import require_writable
+    from lyapnet.claims.sampling_certificates import sampled_certificate
 
     require_writable(figure, report)
     controller = given.load()
@@ -94,9 +94,9 @@ def statistical(
     debug: Debug = False,
 ) -> None:
     """A share of X₀ that succeeds, with a confidence."""
-    from lyapnet.certification.draws import draws_of
-    from lyapnet.certification.report import require_writable
-    from lyapnet.certification.sampling_certificates import statistical_certificate
+    from lyapnet.claims.draws import draws_of
+    from lyapnet.claims.report import require_writable
+    from lyapnet.claims.sampling_certificates import statistical_certificate
 
     require_writable(figure, report)
     controller = given.load()
@@ -142,10 +142,10 @@ def sound(
     require_refinable(refine, overrides, keep, given)
     if two_sided and (refine or disturbance):
         raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
-    from lyapnet.certification.report import require_writable
-    from lyapnet.certification.sound_certificate import parse_set, sound_certificate
-    from lyapnet.certification.tables import progress_told_to
-    from lyapnet.certification.two_sided_certificate import two_sided_certificate
+    from lyapnet.claims.report import require_writable
+    from lyapnet.claims.sound_certificate import parse_set, sound_certificate
+    from lyapnet.claims.tables import progress_told_to
+    from lyapnet.claims.two_sided_certificate import two_sided_certificate
 
     if states is not None:
         parse_set(states)
@@ -212,11 +212,11 @@ def region(
         raise UsageError(f"Expected --refine with one checkpoint and one disturbance, got {got}; drop it.")
     if several and (keep is not None or report is not None or ray is not None):
         raise UsageError("Expected one disturbance with --keep, --report or --ray, got several; name one for each.")
-    from lyapnet.certification.disturbances.regions import regions_under_pushes
-    from lyapnet.certification.region_certificate import region_certificate
-    from lyapnet.certification.report import require_writable
-    from lyapnet.certification.sound_certificate import parse_set
-    from lyapnet.certification.tables import progress_told_to
+    from lyapnet.claims.disturbances.regions import regions_under_pushes
+    from lyapnet.claims.region_certificate import region_certificate
+    from lyapnet.claims.report import require_writable
+    from lyapnet.claims.sound_certificate import parse_set
+    from lyapnet.claims.tables import progress_told_to
 
     if states is not None:
         parse_set(states)
@@ -266,11 +266,11 @@ def tube(
 ) -> None:  # fmt: skip
     """Where all closed loops from X₀ go up to T, and what they cost: proved."""
     begun = time.monotonic()
-    from lyapnet.certification.report import require_writable
-    from lyapnet.certification.sound_certificate import parse_set
-    from lyapnet.certification.tables import progress_told_to
-    from lyapnet.certification.tubes.certificate import tube_certificate
-    from lyapnet.certification.tubes.two_sided import two_sided_tube
+    from lyapnet.claims.report import require_writable
+    from lyapnet.claims.sound_certificate import parse_set
+    from lyapnet.claims.tables import progress_told_to
+    from lyapnet.claims.tubes.certificate import tube_certificate
+    from lyapnet.claims.tubes.two_sided import two_sided_tube
 
     alone = [name for name, value in (("--beta", beta), ("--delta", delta), ("--set", states)) if value is not None]
     if alone and not two_sided:
@@ -300,9 +300,9 @@ def check(
     debug: Debug = False,
 ) -> None:
     """Whether a kept proof proves its claim: its leaves are bounded anew, without a search."""
-    from lyapnet.certification.checking import check as checked
-    from lyapnet.certification.checking import labels_of
-    from lyapnet.certification.tables import certificate_table, progress_told_to
+    from lyapnet.claims.checking import check as checked
+    from lyapnet.claims.checking import labels_of
+    from lyapnet.claims.tables import certificate_table, progress_told_to
 
     given = given.with_functions(value, law)
     controller = given.load()
@@ -324,7 +324,7 @@ def _record(certificate: Any, draws: Any) -> None:
 
 def _show(certificate: Any, given: Given, as_json: bool) -> None:
     """The certificate as a table, unless JSON is asked for."""
-    from lyapnet.certification.tables import certificate_table
+    from lyapnet.claims.tables import certificate_table
 
     given.report("comparing with the optimum")
     certificate.result  # noqa: B018  # computed now, where it is told
@@ -336,8 +336,8 @@ def _show(certificate: Any, given: Given, as_json: bool) -> None:
 
 def _show_several(regions: Any, given: Given, as_json: bool, figure: Path | None) -> None:
     """Regions under pushes of several sizes as a table or JSON, and their figure."""
-    from lyapnet.certification.disturbances.tables import table
-    from lyapnet.certification.report import write_figure
+    from lyapnet.claims.disturbances.tables import table
+    from lyapnet.claims.report import write_figure
 
     given.report.rest()
     if as_json:
@@ -351,7 +351,7 @@ def _show_several(regions: Any, given: Given, as_json: bool, figure: Path | None
 
 def _write(certificate: Any, given: Given, as_json: bool, figure: Path | None, report: Path | None) -> None:
     """The certificate as JSON, and its figure and report, where they are asked for."""
-    from lyapnet.certification.report import write_outputs
+    from lyapnet.claims.report import write_outputs
 
     if as_json:
         print(json.dumps(certificate.result, allow_nan=False))

@@ -15,8 +15,8 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
+from lyapnet.base.errors import Interrupted, signals_taken
 from lyapnet.cli.options import Debug
-from lyapnet.errors import Interrupted, signals_taken
 
 NAMES = 14  # columns for the names of facts
 WIDEST = 120
@@ -78,7 +78,7 @@ def check(
 
 def _tell_what_is_written(config: Path, overrides: list[str], known: Any) -> str:
     """Tell the facts that need no torch; the name of the experiment."""
-    from lyapnet.config import outline
+    from lyapnet.experiment.config import outline
     from lyapnet.training.fact import facts_of_config
 
     written = outline(config, overrides)
@@ -93,8 +93,8 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
     try:
         import torch
 
-        from lyapnet.build import default_of, parts_of
-        from lyapnet.config import load_config
+        from lyapnet.experiment.assembly import default_of, parts_of
+        from lyapnet.experiment.config import load_config
         from lyapnet.training.build_learner import build_learner, build_problem_to_train
         from lyapnet.training.facts import facts_of
     finally:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperOption
 
-from lyapnet.errors import UsageError
-from lyapnet.sizes import THREADS
+from lyapnet.base.errors import UsageError
+from lyapnet.base.sizes import THREADS
 
 
 def number(holds: Callable[[float], bool], expected: str, remedy: str, help: str) -> Any:

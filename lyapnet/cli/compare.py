@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.sizes import THREADS
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.sizes import THREADS
 from lyapnet.training.stages import Stages, silent
 
 
@@ -49,8 +49,8 @@ def compare(
     console = Console(highlight=False, markup=False)
     with stages_of("compare") as stages:
         stages(f"importing torch and Lightning for {config}")
-        from lyapnet.comparison.execution import require_same, run_job
-        from lyapnet.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
+        from lyapnet.lab.comparison.execution import require_same, run_job
+        from lyapnet.lab.comparison.plan import begun_jobs, job_named, jobs_of, load_comparison
 
         comparison = load_comparison(config, overrides or [])
     if job is not None:
@@ -81,7 +81,7 @@ def _names(listed: str | None) -> list[str] | None:
 
 def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
     """A line for each task whose costs will stand alone, before hours are spent on it."""
-    from lyapnet.comparison.scoring import why_no_optimum
+    from lyapnet.lab.comparison.scoring import why_no_optimum
 
     for job in {job.task: job for job in jobs}.values():
         if (reason := why_no_optimum(job.bounded)) is not None:
@@ -90,8 +90,8 @@ def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
 
 def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console, stages: Stages) -> int:
     """Run the jobs, with a line for each that ends, and in a log one for what runs; how many failed."""
-    from lyapnet.comparison.progress import progress
-    from lyapnet.comparison.workers import run_jobs
+    from lyapnet.lab.comparison.progress import progress
+    from lyapnet.lab.comparison.workers import run_jobs
 
     if not jobs:
         return 0
@@ -106,12 +106,12 @@ def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console
 
 def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console, stages: Stages) -> None:
     """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
-    from lyapnet.comparison.execution import controllers_of
-    from lyapnet.comparison.plan import begun_jobs, jobs_of
-    from lyapnet.comparison.report import brief_alternatives, summary, write_report
-    from lyapnet.comparison.results import PLANNED, with_cold_compilation, with_common_optima
-    from lyapnet.comparison.statistics import compared
-    from lyapnet.tables import terminal
+    from lyapnet.base.tables import terminal
+    from lyapnet.lab.comparison.execution import controllers_of
+    from lyapnet.lab.comparison.plan import begun_jobs, jobs_of
+    from lyapnet.lab.comparison.report import brief_alternatives, summary, write_report
+    from lyapnet.lab.comparison.results import PLANNED, with_cold_compilation, with_common_optima
+    from lyapnet.lab.comparison.statistics import compared
 
     jobs = list({job.name: job for job in (*jobs_of(config, check=False), *chosen, *begun_jobs(config))}.values())
     finished = [result for job in jobs if (result := job.result) is not None]

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import UsageError
 from lyapnet.cli.options import Debug, Given, of_a_controller
-from lyapnet.errors import UsageError
 
 if TYPE_CHECKING:
-    from lyapnet.controller import Controller
+    from lyapnet.controller.controller import Controller
     from lyapnet.evaluation.afterwards import Afterwards
     from lyapnet.evaluation.measurement import Evaluation
 

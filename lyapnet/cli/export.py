@@ -25,7 +25,7 @@ def export(
     c is C99 without a library: policy.h, policy.c, main.c and CMakeLists.txt. onnx is a model (t, x) ↦ (u, V) of one
     state, with p beside x for a family; torch is the same for torch.export.load.
     """
-    from lyapnet.export import export as write
+    from lyapnet.exchange.export import export as write
 
     controller = given.load() if beyond is None else given.load().continued(beyond)
     given.report("writing and verifying")

@@ -49,7 +49,7 @@ class Given:
     @property
     def title(self) -> str:
         """What a table calls the controller."""
-        from lyapnet.checkpoint import ZOO
+        from lyapnet.experiment.checkpoint import ZOO
 
         name = f"zoo:{self.checkpoint.stem}" if self.checkpoint.parent == ZOO else str(self.checkpoint)
         return ", ".join([name, *(self.at or []), *(path.name for path in self.functions or ())])
@@ -66,7 +66,7 @@ class Given:
 
     def with_functions(self, value: Path | None, law: Path | None) -> "Given":
         """The same with V and u of their own files, where there are both; a config in the place of a checkpoint."""
-        from lyapnet.errors import UsageError
+        from lyapnet.base.errors import UsageError
 
         if value is None and law is None:
             return self
@@ -81,9 +81,9 @@ class Given:
 
     def parts(self) -> Any:
         """The user's own parts, made with the config of the checkpoint."""
-        from lyapnet.build import Parts, parts_named
-        from lyapnet.checkpoint import read_checkpoint
-        from lyapnet.loading import config_of
+        from lyapnet.controller.loading import config_of
+        from lyapnet.experiment.assembly import Parts, parts_named
+        from lyapnet.experiment.checkpoint import read_checkpoint
 
         if not self.named:
             return Parts()
@@ -93,14 +93,14 @@ class Given:
         """The controller."""
         import torch
 
-        from lyapnet.build import DTYPES
-        from lyapnet.loading import load
+        from lyapnet.controller.loading import load
+        from lyapnet.experiment.assembly import DTYPES
 
         self.report(f"loading {self.title}")
         if self.functions is None:
             controller = load(self.checkpoint, **vars(self.parts()))
         else:
-            from lyapnet.importing import imported_controller
+            from lyapnet.exchange.importing import imported_controller
 
             controller = imported_controller(self.checkpoint, *self.functions, self.named)
         torch.set_num_threads(controller.config.training.threads)
@@ -128,7 +128,7 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
             report(f"importing torch for {checkpoint}")
             import torch
 
-            from lyapnet.checkpoint import located  # takes seconds
+            from lyapnet.experiment.checkpoint import located  # takes seconds
 
             before = torch.get_default_dtype()
             try:
@@ -156,7 +156,7 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
 
 def member_of(controller: Any, at: list[str]) -> Any:
     """The controller of one member of a family, from NAME=VALUE of its parameters."""
-    from lyapnet.errors import UsageError
+    from lyapnet.base.errors import UsageError
 
     try:
         parameters = {name: float(value) for name, _, value in (each.partition("=") for each in at)}

@@ -5,8 +5,8 @@ from typing import Any
 
 from rich.console import Console
 
+from lyapnet.base.errors import UsageError
 from lyapnet.cli.options import Given
-from lyapnet.errors import UsageError
 
 
 def require_refinable(rounds: int, overrides: list[str] | None, keep: str | None, given: Given) -> None:

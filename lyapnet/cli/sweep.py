@@ -7,9 +7,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import LyapnetError
+from lyapnet.base.sizes import THREADS
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.errors import LyapnetError
-from lyapnet.sizes import THREADS
 
 
 def sweep(
@@ -36,10 +36,10 @@ def sweep(
     console = Console(highlight=False, markup=False)
     with stages_of("sweep") as report:
         report("importing torch and Lightning")
-        from lyapnet.comparison.sweep.points import points_of
-        from lyapnet.comparison.sweep.runs import sweep as run
-        from lyapnet.comparison.sweep.runs import sweep_csv
-        from lyapnet.comparison.sweep.tables import sweep_table
+        from lyapnet.lab.sweep.points import points_of
+        from lyapnet.lab.sweep.runs import sweep as run
+        from lyapnet.lab.sweep.runs import sweep_csv
+        from lyapnet.lab.sweep.tables import sweep_table
 
         points = points_of(config or [], vary, overrides or [])
         if out is not None:
@@ -58,7 +58,7 @@ def sweep(
     if out is not None and rows:
         (out / "sweep.csv").write_text(sweep_csv(rows), encoding="utf-8")
         if vary:
-            from lyapnet.comparison.sweep.figures import swept
+            from lyapnet.lab.sweep.figures import swept
 
             swept(rows).savefig(out / "sweep.png", dpi=150)
     if failed:

@@ -10,8 +10,8 @@ def systems(debug: Debug = False) -> None:
     """List the registered systems with their states, controls and parameters; and what else a config can name."""
     import inspect
 
-    from lyapnet.build import REGISTRIES
-    from lyapnet.systems import SYSTEMS
+    from lyapnet.experiment.assembly import REGISTRIES
+    from lyapnet.task.systems import SYSTEMS
 
     columns = (Column(name, overflow="fold") for name in ("system", "states", "controls", "parameters (default)"))
     table = Table(*columns, title="system.name in a config")

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import Interrupted, UsageError
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.errors import Interrupted, UsageError
 
 
 def train(
@@ -25,7 +25,7 @@ def train(
     """Train one experiment; python train.py is the same command."""
     if config is None:
         raise UsageError("Expected --config PATH, got none; for example --config conf/double_integrator.yaml.")
-    from lyapnet.config import load_config, outline
+    from lyapnet.experiment.config import load_config, outline
 
     outline(config, overrides or [])  # what is misspelt is refused before torch is imported
     console = Console(highlight=False, markup=False)
@@ -33,7 +33,7 @@ def train(
     try:
         with stages_of("train") as report:
             report(f"importing torch and Lightning for {config}")
-            from lyapnet.build import default_of  # takes seconds
+            from lyapnet.experiment.assembly import default_of  # takes seconds
             from lyapnet.training.experiment import fit
             from lyapnet.training.plan import plan_run
 
@@ -60,9 +60,9 @@ def _program(script: str) -> list[str]:
 
 
 def _print_result(console: Console, plan: Any, result: dict[str, Any], command: str) -> None:
-    from lyapnet.build import own_parts
-    from lyapnet.build.named_parts import python_of
     from lyapnet.evaluation.tables import evaluation_table, table_over_seeds
+    from lyapnet.experiment.assembly import own_parts
+    from lyapnet.experiment.assembly.named_parts import python_of
 
     title, members = f"{plan.config.experiment}, best checkpoint", plan.run.members(plan.config)
     console.print(

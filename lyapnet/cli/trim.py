@@ -18,9 +18,9 @@ def trim(
     debug: Debug = False,
 ) -> None:
     """Print the operating point of a task: the state x* that its target asks for, and the control u* that holds it."""
-    from lyapnet.build import operating_point, parts_of
-    from lyapnet.config import load_config
-    from lyapnet.errors import UsageError
+    from lyapnet.base.errors import UsageError
+    from lyapnet.experiment.assembly import operating_point, parts_of
+    from lyapnet.experiment.config import load_config
 
     resolved = load_config(config, overrides or [])
     if resolved.family:

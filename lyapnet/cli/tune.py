@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import Interrupted, LyapnetError, UsageError
+from lyapnet.base.sizes import THREADS
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.errors import Interrupted, LyapnetError, UsageError
-from lyapnet.sizes import THREADS
 
 
 def tune(
@@ -43,8 +43,8 @@ def tune(
         raise UsageError('Expected Optuna for a search, got none; pip install "lyapnet[tune]".')
     with stages_of("tune") as report:
         report(f"importing torch and Lightning for {config}")
-        from lyapnet.comparison.tuning.search import best_of, open_study, search, task_of, train_anew
-        from lyapnet.comparison.tuning.tables import final_line
+        from lyapnet.lab.tuning.search import best_of, open_study, search, task_of, train_anew
+        from lyapnet.lab.tuning.tables import final_line
         from lyapnet.training.run_lock import RunLock
 
         say = partial(report.console.print, soft_wrap=True)
@@ -74,8 +74,8 @@ def tune(
 
 def _show(task: Any, study: Any) -> None:
     """Show the trials, and write them down."""
-    from lyapnet.comparison.tuning.search import write_best
-    from lyapnet.comparison.tuning.tables import search_csv, search_rows, search_table, summary
+    from lyapnet.lab.tuning.search import write_best
+    from lyapnet.lab.tuning.tables import search_csv, search_rows, search_table, summary
 
     console = Console(highlight=False, markup=False)
     if not search_rows(task, study):

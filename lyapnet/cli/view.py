@@ -22,8 +22,8 @@ def view(
 
     The page is one file that needs no server and no network.
     """
-    from lyapnet.certification.checking import kept_funnel
-    from lyapnet.view import write_page
+    from lyapnet.claims.checking import kept_funnel
+    from lyapnet.exchange.view import write_page
 
     controller = given.load()
     given.report("writing the page")

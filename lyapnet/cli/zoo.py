@@ -22,7 +22,7 @@ def zoo(
     """List the controllers that come with lyapnet, each to be named as zoo:NAME wherever a checkpoint is."""
     with stages_of("zoo") as report:
         report("importing torch")
-        from lyapnet.certification.tables import floored
+        from lyapnet.claims.tables import floored
         from lyapnet.zoo import entries
 
     console = Console(highlight=False, markup=False)
@@ -58,11 +58,11 @@ def demo(
         report(f"importing torch for {name}")
         import torch
 
-        from lyapnet.after_horizon import HELD
-        from lyapnet.certification.sampling_certificates import statistical_certificate
+        from lyapnet.claims.sampling_certificates import statistical_certificate
         from lyapnet.evaluation.afterwards import share_at_goal
         from lyapnet.evaluation.animation import Film
         from lyapnet.evaluation.figures import trajectories
+        from lyapnet.value.after_horizon import HELD
         from lyapnet.zoo import entry
 
         torch.set_num_threads(1)  # of such small networks more threads wait for one another on a busy machine
@@ -110,7 +110,7 @@ def _exports(found: list[Any]) -> Table:
 
 def _after(found: list[Any]) -> Table:
     """The law after T of each, how many closed loops it holds, and how far from the goal they are."""
-    from lyapnet.after_horizon import HELD
+    from lyapnet.value.after_horizon import HELD
 
     multiples = list(found[0].record["afterwards"]["distance"])
     headings = ("‖x − x*‖ at T" if k == "1" else f"at {k} T" for k in multiples)
@@ -127,7 +127,7 @@ def _after(found: list[Any]) -> Table:
 
 
 def _table(name: str, states: int, measured: dict[str, str], certificate: Any) -> Table:
-    from lyapnet.certification.tables import floored
+    from lyapnet.claims.tables import floored
 
     table = Table("measure", "value", title=f"zoo:{name}, {states} states of X₀ that no training saw")
     for what, value in measured.items():

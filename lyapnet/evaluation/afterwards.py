@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.after_horizon import LAWS, LONGEST, MULTIPLE, is_held
-from lyapnet.controller import Controller
-from lyapnet.errors import DivergenceError, UsageError
-from lyapnet.sizes import require_memory, size_of_loops
-from lyapnet.types import State
+from lyapnet.base.errors import DivergenceError, UsageError
+from lyapnet.base.sizes import require_memory, size_of_loops
+from lyapnet.base.types import State
+from lyapnet.controller.controller import Controller
+from lyapnet.value.after_horizon import LAWS, LONGEST, MULTIPLE, is_held
 
 DIVERGES = "the closed loop diverges"
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from matplotlib.figure import Figure
 
-from lyapnet.controller import Controller
-from lyapnet.drawing import CYCLE, legend_below, numpy_of
+from lyapnet.base.drawing import CYCLE, legend_below, numpy_of
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.afterwards import Afterwards
 
 LEAST, FAR = 1e-12, 1e3  # ends of the axis at the most, times the greatest distance before T

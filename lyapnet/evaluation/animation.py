@@ -18,15 +18,15 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
-from lyapnet.errors import UsageError, one_line
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, numpy_of
+from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.files import write_atomically
+from lyapnet.base.shapes import Shape, corners_of
+from lyapnet.base.types import Value
 from lyapnet.evaluation.figures import Slice
 from lyapnet.evaluation.scenes import artist_of, plane_axes, set_plane, set_stage, shapes_of
-from lyapnet.files import write_atomically
-from lyapnet.problem import Problem
-from lyapnet.rollout import Trajectory
-from lyapnet.shapes import Shape, corners_of
-from lyapnet.types import Value
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.problem import Problem
 
 SHORTEST, LONGEST = 3.0, 10.0  # seconds of an animation whose speed nobody gave
 BEHIND = 0.18  # opacity of all closed loops but the first, where their shapes overlap

@@ -14,15 +14,15 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 from torch import Tensor
 
-from lyapnet.constraints import StateLimits, parts_of
-from lyapnet.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.base.types import State, Value
 from lyapnet.evaluation.states import StateTable
-from lyapnet.problem import Problem
-from lyapnet.programs.terms import hinge, satisfied
-from lyapnet.rollout import Trajectory
-from lyapnet.sets import Box
-from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import State, Value
+from lyapnet.loop.programs.terms import hinge, satisfied
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.constraints import StateLimits, parts_of
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import ControlAffineSystem
 
 MOST_NAMED = 4  # states beside those of a slice whose numbers fit into a line
 

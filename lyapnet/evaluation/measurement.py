@@ -8,23 +8,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.after_horizon import LOOPS
-from lyapnet.constraints import names_of
-from lyapnet.controller import Controller
-from lyapnet.domain import ROUNDED, SLACK
-from lyapnet.errors import DivergenceError, OracleError
+from lyapnet.base.errors import DivergenceError, OracleError
+from lyapnet.base.files import plain
+from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.sizes import require_memory, size_of_loops
+from lyapnet.base.tables import csv_text
+from lyapnet.base.types import PerState
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.afterwards import share_at_goal
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
-from lyapnet.files import plain
-from lyapnet.problem import Problem
-from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import Trajectory
-from lyapnet.sizes import require_memory, size_of_loops
-from lyapnet.tables import csv_text
-from lyapnet.types import PerState
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.constraints import names_of
+from lyapnet.task.domain import ROUNDED, SLACK
+from lyapnet.task.problem import Problem
+from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
 

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from lyapnet.cost import spread
+from lyapnet.task.cost import spread
 
 
 def mean_optimum(optima: Tensor) -> float | None:

@@ -6,11 +6,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from lyapnet.constraints import Ball, parts_of
-from lyapnet.cost import Cost, MadeOfAnother, ObstacleCost
-from lyapnet.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
-from lyapnet.problem import Problem
-from lyapnet.rollout import Trajectory
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, legend_below, numpy_of
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.constraints import Ball, parts_of
+from lyapnet.task.cost import Cost, MadeOfAnother, ObstacleCost
+from lyapnet.task.problem import Problem
 
 
 def has_plane(problem: Problem) -> bool:

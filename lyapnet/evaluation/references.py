@@ -5,11 +5,11 @@ from collections.abc import Callable
 import torch
 from torch import nn
 
-from lyapnet.expansions import in_float64, path_under, regulator
-from lyapnet.horizon import Horizon
-from lyapnet.linear_algebra import apply
-from lyapnet.problem import Problem
-from lyapnet.types import Control, PerState, State
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import Control, PerState, State
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.value.expansions import in_float64, path_under, regulator
 
 SUBSTEPS = 4  # of fourth order within Δt, for continuous time
 

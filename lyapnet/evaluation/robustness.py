@@ -7,18 +7,18 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lyapnet.build import knows, with_parameters
-from lyapnet.controller import Controller
-from lyapnet.errors import DivergenceError, OracleError
+from lyapnet.base.errors import DivergenceError, OracleError
+from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.types import Control, State, Time
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import mean_optimum, ratio_of_means
 from lyapnet.evaluation.oracles import oracle_of
-from lyapnet.family import FamilySystem
-from lyapnet.problem import Problem
-from lyapnet.random_streams import TEST, stream
-from lyapnet.rollout import ADAPTIVE_METHODS, Rollout
-from lyapnet.sets import Box
-from lyapnet.systems import ControlAffineSystem
-from lyapnet.types import Control, State, Time
+from lyapnet.experiment.assembly import knows, with_parameters
+from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
+from lyapnet.task.family import FamilySystem
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import ControlAffineSystem
 
 BEYOND = 0.2  # relative to X₀'s extent, and to each physical parameter
 NOISE = 0.01  # standard deviation at each evaluation of the policy, relative to the undisturbed loop's largest |x_i|

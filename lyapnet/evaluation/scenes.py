@@ -10,11 +10,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, FancyArrowPatch
 from matplotlib.patches import Polygon as Patch
 
-from lyapnet.drawing import BLUE, GREY, ORANGE, VERMILION, numpy_of, pixels
-from lyapnet.errors import UsageError, one_line
+from lyapnet.base.drawing import BLUE, GREY, ORANGE, VERMILION, numpy_of, pixels
+from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
 from lyapnet.evaluation.figures import widest_axes
-from lyapnet.problem import Problem
-from lyapnet.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
+from lyapnet.task.problem import Problem
 
 SIDE = 4.4  # inches
 
@@ -141,12 +141,12 @@ def shapes_of(problem: Problem, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]
     except Exception as error:  # of any kind: the system may be the user's
         raise UsageError(
             f"Expected {system.title}.draw(x, u) of arrays ({system.n},) and ({system.m},), got {one_line(error)}; "
-            "return Line, Disk, Polygon and Arrow of lyapnet.shapes."
+            "return Line, Disk, Polygon and Arrow of lyapnet.base.shapes."
         ) from error
     if not finite:
         raise UsageError(
-            f"Expected {system.title}.draw to return Line, Disk, Polygon and Arrow of lyapnet.shapes at finite points "
-            f"(x, y), got {shapes}; correct it."
+            f"Expected {system.title}.draw to return Line, Disk, Polygon and Arrow of lyapnet.base.shapes at finite "
+            f"points (x, y), got {shapes}; correct it."
         )
     return shapes
 

@@ -7,13 +7,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lyapnet.base.types import ControlPath, PerState, State
 from lyapnet.evaluation.optimality import in_spreads, mean_optimum, ratio_of_means
-from lyapnet.problem import Problem
-from lyapnet.programs import Program
-from lyapnet.programs.terms import falls, hinge, largest_rise, satisfied
-from lyapnet.rollout import Trajectory
-from lyapnet.sets import ControlSet
-from lyapnet.types import ControlPath, PerState, State
+from lyapnet.loop.programs import Program
+from lyapnet.loop.programs.terms import falls, hinge, largest_rise, satisfied
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import ControlSet
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from typing import Any
 from rich.table import Column, Table
 from rich.text import Text
 
-from lyapnet.after_horizon import HELD
-from lyapnet.tables import DIVERGED, ratio
+from lyapnet.base.tables import DIVERGED, ratio
+from lyapnet.value.after_horizon import HELD
 
 REGRET = "regret, mean (cost − optimum) / spread of the optimum"
 ROWS = {

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.fx import GraphModule, Interpreter, Node
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import ExportError, one_line
+from lyapnet.base.errors import ExportError, one_line
 from lyapnet.graphs.c_rules import RULES
 from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
-from lyapnet.errors import OracleError
+from lyapnet.base.errors import OracleError
 from lyapnet.graphs.tracing import SHAPED, Tensors, core_trace, is_view, name_of
 
 Symbols = np.ndarray  # dtype object: its entries are scalar casadi.SX

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
-from lyapnet.errors import CompilationError, LyapnetError, one_line
-from lyapnet.files import digest_of_file, write_atomically
+from lyapnet.base.errors import CompilationError, LyapnetError, one_line
+from lyapnet.base.files import digest_of_file, write_atomically
 
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-fPIC", "-shared", "-w")
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.func import vmap
 from torch.fx import GraphModule, Node
 
-from lyapnet.errors import LyapnetError, UntraceableError
+from lyapnet.base.errors import LyapnetError, UntraceableError
+from lyapnet.base.types import State, StatePath
 from lyapnet.graphs.tracing import Tensors, core_trace, name_of
-from lyapnet.types import State, StatePath
 
 HALVINGS = 50  # of the step in which a denominator changes its sign
 GROWTH = 1e3  # by which the function is larger there than at both ends of the step, if that is a pole

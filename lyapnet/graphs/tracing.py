@@ -15,9 +15,9 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.fx.node import map_arg
 from torch.overrides import TorchFunctionMode
 
-from lyapnet.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
+from lyapnet.base.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
+from lyapnet.base.operators import OPERATORS, as_operators
 from lyapnet.graphs.agreement import are_close
-from lyapnet.operators import OPERATORS, as_operators
 
 Tensors = tuple[Tensor, ...]
 

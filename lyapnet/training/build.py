@@ -2,10 +2,10 @@
 
 import lightning as L
 
-from lyapnet.build import Parts, parts_of, resolve
-from lyapnet.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
-from lyapnet.errors import UsageError
-from lyapnet.problem import Problem
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly import Parts, parts_of, resolve
+from lyapnet.experiment.config import Config, TrainingConfig, configs_of_seeds, label_of, to_plain
+from lyapnet.task.problem import Problem
 from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.modules import EnsembleModule, TrainingModule, ValueModule

@@ -7,16 +7,23 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from lyapnet.build import Parts, build_problem, build_program, build_rollout, build_value_function, entry_per_state
-from lyapnet.config import Config, to_plain
-from lyapnet.errors import UsageError
-from lyapnet.files import read_file
-from lyapnet.linearisation import rounded
-from lyapnet.problem import Problem
-from lyapnet.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
-from lyapnet.rollout import Rollout
-from lyapnet.sets import Box
+from lyapnet.base.errors import UsageError
+from lyapnet.base.files import read_file
+from lyapnet.experiment.assembly import (
+    Parts,
+    build_problem,
+    build_program,
+    build_rollout,
+    build_value_function,
+    entry_per_state,
+)
+from lyapnet.experiment.config import Config, to_plain
+from lyapnet.loop.programs import PointwiseCondition, Program, RegionCondition, RegionProgram
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
 from lyapnet.training.learner import Learner
+from lyapnet.value.linearisation import rounded
 
 
 def build_problem_to_train(config: Config, parts: Parts) -> Problem:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from lyapnet.linearisation import Missing
+from lyapnet.value.linearisation import Missing
 
 MISSED = 0.02  # of the cost: what steps may miss of continuous time without a word
 ALIKE = 5e-4  # of a cost: candidates that differ by less are told as equal

@@ -2,8 +2,8 @@
 
 from lightning.pytorch import LightningModule, Trainer
 
-from lyapnet.certification import StatisticalClaim, statistical_claim
-from lyapnet.random_streams import CERTIFICATION, stream
+from lyapnet.base.random_streams import CERTIFICATION, stream
+from lyapnet.claims import StatisticalClaim, statistical_claim
 from lyapnet.training.curves import log_scalars, with_loggers
 from lyapnet.training.learner import Learner
 from lyapnet.training.recurring import Recurring

@@ -4,7 +4,7 @@ from typing import Any
 
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 
 ALONE = "weights_alone"  # of a file that a forked process leaves for the one that started it
 

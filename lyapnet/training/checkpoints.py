@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint
 
-from lyapnet.errors import Interrupted
+from lyapnet.base.errors import Interrupted
 from lyapnet.training.learner import mean_over_processes
 from lyapnet.training.modules import labelled
 from lyapnet.training.runs import Run

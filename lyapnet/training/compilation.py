@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from lyapnet.errors import CompilationError, UntraceableError
+from lyapnet.base.errors import CompilationError, UntraceableError
 from lyapnet.graphs.number_kernel.assembly import is_built
 from lyapnet.training.stages import Stages
 

@@ -6,7 +6,7 @@ from typing import Any
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from lyapnet.config import Config, to_plain, to_yaml
+from lyapnet.experiment.config import Config, to_plain, to_yaml
 from lyapnet.training.curves import loggers_of_each, members_of
 
 # a panel for each measure, a chart for each curve in it: TensorBoard gives all curves of a run one colour

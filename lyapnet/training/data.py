@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from lyapnet.errors import CheckpointError
-from lyapnet.problem import Problem
-from lyapnet.random_streams import LOST, TRAINING, VALIDATION, stream
-from lyapnet.types import State
+from lyapnet.base.errors import CheckpointError
+from lyapnet.base.random_streams import LOST, TRAINING, VALIDATION, stream
+from lyapnet.base.types import State
+from lyapnet.task.problem import Problem
 
 
 class InitialStateDataModule(L.LightningDataModule):

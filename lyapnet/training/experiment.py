@@ -13,15 +13,14 @@ import torch
 from rich.console import Console
 from rich.text import Text
 
-from lyapnet.build import Parts, default_of
-from lyapnet.checkpoint import AFTER_HORIZON, note_in_checkpoint
-from lyapnet.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
-from lyapnet.errors import DivergenceError, Interrupted, LyapnetError
+from lyapnet.base.errors import DivergenceError, Interrupted, LyapnetError
+from lyapnet.base.files import write_atomically, write_json
+from lyapnet.base.machine import peak_memory
+from lyapnet.controller.loading import load
 from lyapnet.evaluation import evaluate
-from lyapnet.files import write_atomically, write_json
-from lyapnet.loading import load
-from lyapnet.machine import peak_memory
-from lyapnet.networks import WithPenalty
+from lyapnet.experiment.assembly import Parts, default_of
+from lyapnet.experiment.checkpoint import AFTER_HORIZON, note_in_checkpoint
+from lyapnet.experiment.config import Config, config_from_plain, configs_of_seeds, load_config, to_plain, to_yaml
 from lyapnet.training.build import build_data
 from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
@@ -36,6 +35,7 @@ from lyapnet.training.stages import PATIENCE, Stages, silent
 from lyapnet.training.start import REMEDY, has_place_for_start
 from lyapnet.training.start_cache import kept_or_chosen
 from lyapnet.training.trainer import build_trainer
+from lyapnet.value.networks import WithPenalty
 
 DRAWN = "start: V as it is drawn, in which nothing is known yet; the first steps cost far more than the optimum"
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from lyapnet.config import Config
+from lyapnet.experiment.config import Config
 
 
 class Fact(NamedTuple):

@@ -7,13 +7,24 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
-from lyapnet.build.classes import float64_defaults
-from lyapnet.contracts import SLOPE, jumps
-from lyapnet.cost import PenaltyCost
-from lyapnet.domain import as_written
-from lyapnet.expansions import in_float64, path_under
-from lyapnet.horizon import TABLEAUX
-from lyapnet.linearisation import (
+from lyapnet.base.contracts import SLOPE, jumps
+from lyapnet.base.random_streams import START, stream
+from lyapnet.experiment.assembly.classes import float64_defaults
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.cost import PenaltyCost
+from lyapnet.task.domain import as_written
+from lyapnet.task.horizon import TABLEAUX
+from lyapnet.task.operating_points import HELD
+from lyapnet.task.problem import Problem
+from lyapnet.training.candidates import CALM, Candidate, Start
+from lyapnet.training.fact import Fact, listed
+from lyapnet.training.learner import Learner
+from lyapnet.training.relaxation import find_relaxation
+from lyapnet.training.stages import Report, silent
+from lyapnet.training.start import REMEDY, SMALLER, STATES
+from lyapnet.training.start_cache import kept_or_chosen
+from lyapnet.value.expansions import in_float64, path_under
+from lyapnet.value.linearisation import (
     NAME_A_GOAL,
     LinAlgError,
     Linearisation,
@@ -23,17 +34,6 @@ from lyapnet.linearisation import (
     singular,
     smoothed_part,
 )
-from lyapnet.operating_points import HELD
-from lyapnet.problem import Problem
-from lyapnet.random_streams import START, stream
-from lyapnet.rollout import Rollout
-from lyapnet.training.candidates import CALM, Candidate, Start
-from lyapnet.training.fact import Fact, listed
-from lyapnet.training.learner import Learner
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import REMEDY, SMALLER, STATES
-from lyapnet.training.start_cache import kept_or_chosen
 
 STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
 REACHED = 1e-10  # of A, with states and controls in units of their own, above which one state acts on another

@@ -9,12 +9,12 @@ from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from matplotlib.figure import Figure
 from tensorboard.compat.proto.summary_pb2 import Summary  # pyright: ignore[reportAttributeAccessIssue]
 
-from lyapnet.drawing import pixels
-from lyapnet.errors import DivergenceError
+from lyapnet.base.drawing import pixels
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.random_streams import FIGURES, stream
 from lyapnet.evaluation import figures
 from lyapnet.evaluation.animation import Film
 from lyapnet.evaluation.path_figure import has_plane, paths
-from lyapnet.random_streams import FIGURES, stream
 from lyapnet.training.curves import with_loggers
 from lyapnet.training.learner import Learner
 from lyapnet.training.recurring import Recurring

@@ -5,14 +5,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.calculus import ValueFunction
-from lyapnet.cost import is_quadratic_about_target
-from lyapnet.expansions import Expansion, Optimum, sizes, without_penalty
-from lyapnet.networks import ExpansionNetwork, IgnoringStates, StationaryNetwork, WithPenalty, kept_states, learned_part
-from lyapnet.networks.near_borders import SPREAD
+from lyapnet.base.types import State
+from lyapnet.task.cost import is_quadratic_about_target
 from lyapnet.training.learner import Learner
 from lyapnet.training.pretraining import typical
-from lyapnet.types import State
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import Expansion, Optimum, sizes, without_penalty
+from lyapnet.value.networks import (
+    ExpansionNetwork,
+    IgnoringStates,
+    StationaryNetwork,
+    WithPenalty,
+    kept_states,
+    learned_part,
+)
+from lyapnet.value.networks.near_borders import SPREAD
 
 AROUND = 0.25  # of how far optima go: how far beside them a goal may be that they begin or end at
 

@@ -8,17 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lyapnet.calculus import ValueFunction
-from lyapnet.cost import PenaltyCost, spread
-from lyapnet.errors import CompilationError, UntraceableError, UsageError
+from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
+from lyapnet.base.random_streams import POINTS, VALIDATION, stream
+from lyapnet.base.types import PerState, State
 from lyapnet.evaluation.states import StateTable, measure
-from lyapnet.expansions import Path, in_float64, path_of, path_under
-from lyapnet.policy import LookaheadPolicy
-from lyapnet.problem import Problem
-from lyapnet.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
-from lyapnet.random_streams import POINTS, VALIDATION, stream
-from lyapnet.rollout import Rollout, Trajectory
-from lyapnet.types import PerState, State
+from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
+from lyapnet.loop.rollout import Rollout, Trajectory
+from lyapnet.task.cost import PenaltyCost, spread
+from lyapnet.task.problem import Problem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import Path, in_float64, path_of, path_under
+from lyapnet.value.policy import LookaheadPolicy
 
 
 class Learner(nn.Module):

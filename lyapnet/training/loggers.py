@@ -10,8 +10,8 @@ from typing import Any
 
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
-from lyapnet.config import Config, to_plain
-from lyapnet.errors import UsageError
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.config import Config, to_plain
 from lyapnet.training.metrics_file import METRICS, MetricsFile
 from lyapnet.training.runs import Run
 

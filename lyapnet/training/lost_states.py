@@ -5,13 +5,13 @@ from typing import Any, cast
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from lyapnet.cost import spread
-from lyapnet.errors import DivergenceError
-from lyapnet.programs.terms import promised
-from lyapnet.rollout import Trajectory
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.types import PerState
+from lyapnet.loop.programs.terms import promised
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.cost import spread
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
-from lyapnet.types import PerState
 
 SOUGHT, KEPT = 512, 256  # states of X₀ that are tried at each validation; lost ones, those found last
 EXCESS = 0.05  # of V(0, x₀), by which a closed loop that is lost costs more

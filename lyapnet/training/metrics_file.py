@@ -10,7 +10,7 @@ from typing import Any
 from lightning.fabric.utilities import rank_zero_only
 from lightning.pytorch.loggers import Logger
 
-from lyapnet.files import appending, read_file, write_atomically
+from lyapnet.base.files import appending, read_file, write_atomically
 
 METRICS = "metrics.csv"
 STEP, WALL_TIME = "step", "wall_time"  # wall_time: seconds since the Epoch

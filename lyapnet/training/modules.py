@@ -16,19 +16,19 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor, nn
 
 from lyapnet import __version__
-from lyapnet.calculus import ValueFunction
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
-from lyapnet.cost import PenaltyCost
-from lyapnet.errors import CheckpointError, DivergenceError, UsageError
-from lyapnet.policy import HJBPolicy, known_law
-from lyapnet.problem import Problem
-from lyapnet.programs import PointwiseCondition, Program
-from lyapnet.random_streams import POINTS
-from lyapnet.rollout import ADAPTIVE_METHODS, Rollout, Trajectory
+from lyapnet.base.errors import CheckpointError, DivergenceError, UsageError
+from lyapnet.base.random_streams import POINTS
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.loop.programs import PointwiseCondition, Program
+from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout, Trajectory
+from lyapnet.task.cost import PenaltyCost
+from lyapnet.task.problem import Problem
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.curves import ScalarLogger, Stopwatch
 from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import HJBPolicy, known_law
 
 
 class TrainingModule(L.LightningModule):

@@ -8,8 +8,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lyapnet.base.random_streams import START, stream
+from lyapnet.base.types import Control, ControlPath, State
 from lyapnet.evaluation.oracles import Optima, optimal_cost
-from lyapnet.expansions import (
+from lyapnet.task.problem import Problem
+from lyapnet.training.stages import Report, silent
+from lyapnet.value.expansions import (
     Expansion,
     Optimum,
     Path,
@@ -23,10 +27,6 @@ from lyapnet.expansions import (
     path_under,
     sizes,
 )
-from lyapnet.problem import Problem
-from lyapnet.random_streams import START, stream
-from lyapnet.training.stages import Report, silent
-from lyapnet.types import Control, ControlPath, State
 
 OPTIMA, SOUGHT, FAR = 512, 96, 16  # in all; of which sought from scratch; of which by the oracle too
 SMALL = {1: 48}  # in all, for tasks of one state, where they are close to one another so

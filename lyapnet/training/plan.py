@@ -12,14 +12,14 @@ import lightning as L
 import numpy as np
 import torch
 
-from lyapnet.build import Parts, parts_of
-from lyapnet.build.target import named_entries
-from lyapnet.checkpoint import KEY, read_checkpoint
-from lyapnet.config import Config, differing_keys, load_config
-from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.loading import config_of, load_value_function, require_parts
-from lyapnet.problem import Problem
-from lyapnet.sizes import check_training_sizes
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.sizes import check_training_sizes
+from lyapnet.controller.loading import config_of, load_value_function, require_parts
+from lyapnet.experiment.assembly import Parts, parts_of
+from lyapnet.experiment.assembly.target import named_entries
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint
+from lyapnet.experiment.config import Config, differing_keys, load_config
+from lyapnet.task.problem import Problem
 from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule

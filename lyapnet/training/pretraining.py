@@ -10,20 +10,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lyapnet.calculus import ValueFunction
-from lyapnet.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.random_streams import START, stream
+from lyapnet.base.types import Control, PerState, State, StatePath
 from lyapnet.graphs.loss_gradient import gradient_of_loss
 from lyapnet.graphs.stateless import trained_of
-from lyapnet.linear_algebra import apply
-from lyapnet.policy import LookaheadPolicy
-from lyapnet.problem import Problem
-from lyapnet.random_streams import START, stream
-from lyapnet.sets import ControlSet, Unbounded
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import ControlSet, Unbounded
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
 from lyapnet.training.stages import Report, silent
-from lyapnet.types import Control, PerState, State, StatePath
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
+from lyapnet.value.policy import LookaheadPolicy
 
 BATCH = 512  # examples in a step
 BRIEF = 200  # steps that tell what a fit can begin with

@@ -12,19 +12,19 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from rich.console import Console
 
-from lyapnet.checkpoint import read_checkpoint
-from lyapnet.contracts import TO_WRITE, without_slope
-from lyapnet.cost import spread
-from lyapnet.domain import as_written
-from lyapnet.errors import DivergenceError
-from lyapnet.expansions import in_float64
-from lyapnet.policy import HJBPolicy
+from lyapnet.base.contracts import TO_WRITE, without_slope
+from lyapnet.base.errors import DivergenceError
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.task.cost import spread
+from lyapnet.task.domain import as_written
 from lyapnet.training.curves import members_of
 from lyapnet.training.facts import stiffness
 from lyapnet.training.learner import Learner
 from lyapnet.training.loggers import take_back_after
 from lyapnet.training.plan import Plan
 from lyapnet.training.start import Start
+from lyapnet.value.expansions import in_float64
+from lyapnet.value.policy import HJBPolicy
 
 RETURNS = 4  # at the most
 SLOWER = 3.0  # by which each divides the learning rate

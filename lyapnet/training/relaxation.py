@@ -6,8 +6,12 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from lyapnet.cost import PenaltyCost
-from lyapnet.expansions import (
+from lyapnet.base.random_streams import START, stream
+from lyapnet.task.cost import PenaltyCost
+from lyapnet.task.problem import Problem
+from lyapnet.training.stages import Report
+from lyapnet.training.start import expansions_of
+from lyapnet.value.expansions import (
     Expansion,
     Path,
     at_rest,
@@ -18,10 +22,6 @@ from lyapnet.expansions import (
     path_under,
     sizes,
 )
-from lyapnet.problem import Problem
-from lyapnet.random_streams import START, stream
-from lyapnet.training.stages import Report
-from lyapnet.training.start import expansions_of
 
 STATES = 24  # of X₀, from which optima are sought
 FIRST, FACTOR, WEIGHTS = 1e-2, 10**0.25, 60  # the least weight, in units of the cost per second, and further ones

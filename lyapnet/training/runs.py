@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lyapnet.config import Config, configs_of_seeds, label_of
-from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.files import read_json, write_json
-from lyapnet.provenance import RUN_RECORD, commit, versions
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.files import read_json, write_json
+from lyapnet.base.provenance import RUN_RECORD, commit, versions
+from lyapnet.experiment.config import Config, configs_of_seeds, label_of
 from lyapnet.training.run_lock import RunLock
 
 LAST, BEST = "last", "best"

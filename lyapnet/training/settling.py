@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from lyapnet.config import Config
+from lyapnet.experiment.config import Config
 from lyapnet.training.curves import members_of
 from lyapnet.training.learner import Learner, mean_over_processes
 from lyapnet.training.stages import Stages

@@ -9,8 +9,17 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lyapnet.base.random_streams import START, stream
+from lyapnet.base.types import State
 from lyapnet.evaluation.references import costs_of_holding, costs_of_plant
-from lyapnet.expansions import (
+from lyapnet.task.problem import Problem
+from lyapnet.training.candidates import CALM, MUCH, Candidate, Start
+from lyapnet.training.initial_networks import network_of, take, take_nothing
+from lyapnet.training.learner import Learner
+from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
+from lyapnet.training.pretraining import Examples, examples_of, fit, fit_briefly, looks_ahead, misfit, relative_misfit
+from lyapnet.training.stages import Report, silent
+from lyapnet.value.expansions import (
     TRIES,
     Expansion,
     Optimum,
@@ -21,17 +30,8 @@ from lyapnet.expansions import (
     path_under,
     sizes,
 )
-from lyapnet.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_reason, singular
-from lyapnet.policy import LookaheadPolicy, SampledPolicy
-from lyapnet.problem import Problem
-from lyapnet.random_streams import START, stream
-from lyapnet.training.candidates import CALM, MUCH, Candidate, Start
-from lyapnet.training.initial_networks import network_of, take, take_nothing
-from lyapnet.training.learner import Learner
-from lyapnet.training.optima import OPTIMA, how_many, minima, optima_for, waves
-from lyapnet.training.pretraining import Examples, examples_of, fit, fit_briefly, looks_ahead, misfit, relative_misfit
-from lyapnet.training.stages import Report, silent
-from lyapnet.types import State
+from lyapnet.value.linearisation import TO_WRITE, LinAlgError, Missing, riccati_or_reason, singular
+from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
 
 STATES = 64  # of X₀, on which a start is tried
 GUESSES = 6  # random controls from which the optimum from the centre of X₀ is sought, besides none and Riccati's

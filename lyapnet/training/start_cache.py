@@ -11,12 +11,10 @@ from typing import Any
 
 import torch
 
-from lyapnet.errors import LyapnetError
-from lyapnet.expansions import in_float64
-from lyapnet.files import write_atomically
+from lyapnet.base.errors import LyapnetError
+from lyapnet.base.files import write_atomically
 from lyapnet.graphs.compilation import cache_folder, constants_of
 from lyapnet.graphs.tracing import trace
-from lyapnet.linearisation import Missing
 from lyapnet.training import optima, pretraining
 from lyapnet.training import start as search
 from lyapnet.training.candidates import Candidate, Start
@@ -24,6 +22,8 @@ from lyapnet.training.initial_networks import kept_of
 from lyapnet.training.learner import Learner
 from lyapnet.training.stages import Report, silent
 from lyapnet.training.start import choose_start, has_place_for_start
+from lyapnet.value.expansions import in_float64
+from lyapnet.value.linearisation import Missing
 
 VERSION = 9  # of what a start is: to be raised where the search for one changes
 

@@ -5,7 +5,7 @@ from functools import partial
 import lightning as L
 from rich.console import Console
 
-from lyapnet.config import configs_of_seeds
+from lyapnet.experiment.config import configs_of_seeds
 from lyapnet.training.certified_share import CertifiedShare
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from lyapnet.training.checkpoints import Checkpoints, KeptStart

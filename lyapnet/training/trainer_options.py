@@ -9,9 +9,9 @@ from typing import Any
 
 import lightning as L
 
-from lyapnet.config import Config
-from lyapnet.errors import UsageError, did_you_mean, one_line
-from lyapnet.sizes import require_memory
+from lyapnet.base.errors import UsageError, did_you_mean, one_line
+from lyapnet.base.sizes import require_memory
+from lyapnet.experiment.config import Config
 
 TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",

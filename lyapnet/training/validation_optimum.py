@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 from torch.nn.functional import pad
 
-from lyapnet.errors import OracleError
+from lyapnet.base.errors import OracleError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner

@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lyapnet.checkpoint import ZOO, located, zoo_names
-from lyapnet.controller import Controller
-from lyapnet.files import read_json
-from lyapnet.loading import load
-from lyapnet.rollout import Trajectory
+from lyapnet.base.files import read_json
+from lyapnet.controller.controller import Controller
+from lyapnet.controller.loading import load
+from lyapnet.experiment.checkpoint import ZOO, located, zoo_names
+from lyapnet.loop.rollout import Trajectory
 
 
 class Entry(NamedTuple):

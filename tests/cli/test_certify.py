@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from lyapnet.certification import checking, funnel
-from lyapnet.certification.region_certificate import region_certificate
-from lyapnet.certification.sampling_certificates import sampled_certificate, statistical_certificate
-from lyapnet.certification.sound_certificate import SoundCertificate, parse_set, sound_certificate
+from lyapnet.base.errors import UsageError
+from lyapnet.claims import checking, funnel
+from lyapnet.claims.region_certificate import region_certificate
+from lyapnet.claims.sampling_certificates import sampled_certificate, statistical_certificate
+from lyapnet.claims.sound_certificate import SoundCertificate, parse_set, sound_certificate
 from lyapnet.cli import certify, main
-from lyapnet.controller import Controller
-from lyapnet.errors import UsageError
-from lyapnet.systems import DoubleIntegrator
-from tests.certification import planted
+from lyapnet.controller.controller import Controller
+from lyapnet.task.systems import DoubleIntegrator
+from tests.claims import planted
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 

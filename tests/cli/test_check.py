@@ -7,10 +7,10 @@ import pytest
 import torch
 import yaml
 
-from lyapnet.build import build_problem
 from lyapnet.cli import main
-from lyapnet.config import config_from_plain
-from lyapnet.systems import Linear
+from lyapnet.experiment.assembly import build_problem
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.facts import facts_of, unreached_modes
 from lyapnet.training.start import Candidate, Start

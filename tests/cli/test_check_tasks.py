@@ -13,10 +13,10 @@ import torch
 import yaml
 
 import lyapnet
-from lyapnet.build import Parts, build_problem, parts_of
+from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
-from lyapnet.config import config_from_plain, load_config
-from lyapnet.errors import UsageError
+from lyapnet.experiment.assembly import Parts, build_problem, parts_of
+from lyapnet.experiment.config import config_from_plain, load_config
 from lyapnet.training.build_learner import build_learner, build_problem_to_train
 from lyapnet.training.facts import facts_of, unreached_modes
 from tests.fits import shorten_fits
@@ -220,7 +220,7 @@ def test_an_interrupt_that_an_import_keeps_to_itself_counts(tmp_path, capfd, mon
 
     path = tmp_path / "short.yaml"
     path.write_text(yaml.safe_dump(LONG))
-    monkeypatch.setattr("lyapnet.config.load_config", keeps)
+    monkeypatch.setattr("lyapnet.experiment.config.load_config", keeps)
     assert main(["check", str(path)]) == 130
     shown = capfd.readouterr()
     assert shown.out.splitlines()[1].startswith("horizon ")

@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 import lyapnet
+from lyapnet.base.errors import OracleError
 from lyapnet.cli import main
 from lyapnet.cli.compare import tell_of_missing_optima
-from lyapnet.comparison.plan import jobs_of, load_comparison
-from lyapnet.comparison.results import LEARNED, OURS, Result, with_common_optima
-from lyapnet.errors import OracleError
 from lyapnet.evaluation.measurement import evaluate
+from lyapnet.lab.comparison.plan import jobs_of, load_comparison
+from lyapnet.lab.comparison.results import LEARNED, OURS, Result, with_common_optima
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "conf" / "compare_smoke.yaml"
@@ -215,7 +215,7 @@ def test_costs_without_their_optimum_are_told_before_anything_is_trained(monkeyp
     def none(*_):
         raise OracleError("Expected an oracle.")
 
-    monkeypatch.setattr("lyapnet.comparison.scoring.oracle_of", none)
+    monkeypatch.setattr("lyapnet.lab.comparison.scoring.oracle_of", none)
     tell_of_missing_optima(jobs, Console())
     said = capsys.readouterr().out.splitlines()
     assert said == [

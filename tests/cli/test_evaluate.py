@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from lyapnet.checkpoint import read_checkpoint
 from lyapnet.cli import main
+from lyapnet.controller.loading import load
 from lyapnet.evaluation.measurement import evaluation
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.evaluation.robustness import disturbances
-from lyapnet.loading import load
+from lyapnet.experiment.checkpoint import read_checkpoint
 
 CONF = Path(__file__).parents[2] / "conf"
 

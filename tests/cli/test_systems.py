@@ -8,12 +8,12 @@ import sys
 import pytest
 
 from lyapnet.cli import main
-from lyapnet.constraints import CONSTRAINTS
-from lyapnet.cost import COSTS
-from lyapnet.networks import NETWORKS
-from lyapnet.programs import PROGRAMS
-from lyapnet.sets import CONTROL_SETS
-from lyapnet.systems import SYSTEMS
+from lyapnet.loop.programs import PROGRAMS
+from lyapnet.task.constraints import CONSTRAINTS
+from lyapnet.task.cost import COSTS
+from lyapnet.task.sets import CONTROL_SETS
+from lyapnet.task.systems import SYSTEMS
+from lyapnet.value.networks import NETWORKS
 
 
 def test_systems_command_lists_every_registered_system(capsys, monkeypatch, build_system):

@@ -11,11 +11,11 @@ import time
 
 import pytest
 
-from lyapnet.certification.sound_certificate import sound_certificate
-from lyapnet.certification.tables import progress_told_to
+from lyapnet.claims.sound_certificate import sound_certificate
+from lyapnet.claims.tables import progress_told_to
 from lyapnet.cli import main
 from lyapnet.cli.options import stages_of
-from lyapnet.loading import load
+from lyapnet.controller.loading import load
 from lyapnet.training.plan import plan_run
 from tests.runs import tiny_checkpoint
 
@@ -36,7 +36,7 @@ def loading_for(monkeypatch, seconds):
         time.sleep(seconds)
         return load(*arguments, **options)
 
-    monkeypatch.setattr("lyapnet.loading.load", slowly)
+    monkeypatch.setattr("lyapnet.controller.loading.load", slowly)
 
 
 def test_a_command_that_loads_slowly_says_so_and_its_result_stays(checkpoint, monkeypatch, capsys, telling):

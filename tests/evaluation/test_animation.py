@@ -7,13 +7,13 @@ import pytest
 import torch
 from PIL import Image
 
+from lyapnet.base.errors import UsageError
+from lyapnet.base.shapes import Arrow, Disk, Line, Polygon, chain, corners_of, oblique, rectangle
 from lyapnet.cli import main
-from lyapnet.controller import Controller
-from lyapnet.errors import UsageError
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import animation
 from lyapnet.evaluation.animation import Film
-from lyapnet.shapes import Arrow, Disk, Line, Polygon, chain, corners_of, oblique, rectangle
-from lyapnet.systems import SYSTEMS, ControlAffineSystem, IntegratorChain, Pendulum, Quadrotor, Reacher
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, IntegratorChain, Pendulum, Quadrotor, Reacher
 from tests.problems import Quadratic, problem_of, untrained
 
 FIXTURE = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"

@@ -5,10 +5,10 @@ import itertools
 import pytest
 import torch
 
-from lyapnet.controller import Controller
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.measurement import dearest_corner
-from lyapnet.sets import Box
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import DoubleIntegrator
 from tests.problems import Formula, problem_of
 
 

@@ -9,11 +9,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
-from lyapnet.build import build_problem, build_rollout, build_value_function
-from lyapnet.calculus import ValueFunction
-from lyapnet.config import load_config
 from lyapnet.evaluation import figures
 from lyapnet.evaluation.states import StateTable
+from lyapnet.experiment.assembly import build_problem, build_rollout, build_value_function
+from lyapnet.experiment.config import load_config
+from lyapnet.value.calculus import ValueFunction
 
 CONF = Path(__file__).parents[2] / "conf"
 TASKS = ("double_integrator", "cartpole_swingup", "reacher")

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.oracles.multistart import Candidate
-from lyapnet.expansions import optimal_trajectories
-from lyapnet.sets import Box, ControlBox
-from lyapnet.systems import Linear
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.sets import Box, ControlBox
+from lyapnet.task.systems import Linear
+from lyapnet.value.expansions import optimal_trajectories
 from tests.marks import sample
 from tests.problems import problem_of
 

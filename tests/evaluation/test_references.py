@@ -7,14 +7,14 @@ import torch
 from rich.console import Console
 from torch.testing import assert_close
 
-from lyapnet.controller import Controller
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import evaluate, oracle_of
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.tables import evaluation_table
-from lyapnet.policy import SampledPolicy
-from lyapnet.programs.terms import falls, largest_rise
-from lyapnet.sets import ControlBox
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.loop.programs.terms import falls, largest_rise
+from lyapnet.task.sets import ControlBox
+from lyapnet.task.systems import DoubleIntegrator
+from lyapnet.value.policy import SampledPolicy
 from tests.problems import Formula, Quadratic, problem_of
 
 COST = torch.linspace(1, 0.01, 50)[:, None]  # of each step

@@ -11,8 +11,7 @@ import scipy.linalg
 import torch
 from torch import Tensor
 
-from lyapnet.cost import QuadraticCost
-from lyapnet.errors import OracleError
+from lyapnet.base.errors import OracleError
 from lyapnet.evaluation.oracles import (
     RiccatiOracle,
     RiccatiSolution,
@@ -22,12 +21,13 @@ from lyapnet.evaluation.oracles import (
     oracle_of,
 )
 from lyapnet.evaluation.oracles.transcription import Transcription
-from lyapnet.horizon import Horizon
-from lyapnet.policy import HJBPolicy
-from lyapnet.problem import Problem
-from lyapnet.rollout import Rollout
-from lyapnet.sets import Box
-from lyapnet.systems import Cartpole, ControlAffineSystem, DoubleIntegrator, Linear, is_linear
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import Cartpole, ControlAffineSystem, DoubleIntegrator, Linear, is_linear
+from lyapnet.value.policy import HJBPolicy
 from tests.problems import Quadratic, problem_of
 
 F64 = torch.float64

@@ -7,13 +7,13 @@ import torch
 from scipy.linalg import solve_continuous_are
 from torch.testing import assert_close
 
-from lyapnet.controller import Controller
-from lyapnet.cost import QuadraticCost
+from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import robustness
 from lyapnet.evaluation.robustness import disturbances
-from lyapnet.policy import SampledPolicy
-from lyapnet.rollout import Rollout
-from lyapnet.systems import DoubleIntegrator, Linear
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.systems import DoubleIntegrator, Linear
+from lyapnet.value.policy import SampledPolicy
 from tests.problems import Formula, Quadratic, problem_of, untrained
 
 SMALL = ["network.hidden=[4,4]", "horizon.steps=20"]

@@ -9,16 +9,16 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.build import build_problem
-from lyapnet.config import load_config
-from lyapnet.cost import QuadraticCost
-from lyapnet.errors import OracleError
+from lyapnet.base.errors import OracleError
 from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of, transcription
 from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
-from lyapnet.horizon import Horizon
-from lyapnet.sets import Box
-from lyapnet.systems import Cartpole, DoubleIntegrator, Linear, Reacher
+from lyapnet.experiment.assembly import build_problem
+from lyapnet.experiment.config import load_config
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import Cartpole, DoubleIntegrator, Linear, Reacher
 from tests.problems import problem_of
 
 CONF = Path(__file__).parents[2] / "conf"

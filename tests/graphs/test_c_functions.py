@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.errors import ExportError
+from lyapnet.base.errors import ExportError
 from lyapnet.graphs import c_rules
 from lyapnet.graphs.c_functions import c_function, helpers
 from lyapnet.graphs.c_text import Tables, literal

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.errors import OracleError
+from lyapnet.base.errors import OracleError
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from lyapnet.build import build_problem, build_rollout, build_value_function
-from lyapnet.config import load_config
-from lyapnet.errors import CompilationError, UntraceableError
+from lyapnet.base.errors import CompilationError, UntraceableError
+from lyapnet.experiment.assembly import build_problem, build_rollout, build_value_function
+from lyapnet.experiment.config import load_config
 from lyapnet.graphs import compilation
 from lyapnet.graphs.number_kernel import assembly
 

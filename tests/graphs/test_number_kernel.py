@@ -10,8 +10,7 @@ from torch import nn
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.calculus import ValueFunction
-from lyapnet.config import config_from_plain
+from lyapnet.experiment.config import config_from_plain
 from lyapnet.graphs.compilation import has_compiler
 from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.assembly import SOURCE
@@ -20,9 +19,10 @@ from lyapnet.graphs.number_kernel.program import OPERATIONS
 from lyapnet.graphs.number_kernel.rewriting import rewritten
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
-from lyapnet.networks import FCN, NETWORKS
-from lyapnet.rollout import Rollout
-from lyapnet.systems import SYSTEMS, Pendulum
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.systems import SYSTEMS, Pendulum
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import FCN, NETWORKS
 from tests.configs import objects
 from tests.marks import sample
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.expansions import path_under
 from lyapnet.graphs.poles import poles_of
+from lyapnet.value.expansions import path_under
 
 ONE = torch.tensor([1.0], dtype=torch.float64)
 ACROSS = torch.tensor([[1.0], [0.4], [-0.3], [-1.0]], dtype=torch.float64)  # a path over x = 0

@@ -7,12 +7,12 @@ import pytest
 import torch
 from torch.testing import assert_close
 
+from lyapnet.base.linear_algebra import solve
+from lyapnet.base.operators import are_operators, as_operators, operator
 from lyapnet.graphs.compilation import has_compiler
 from lyapnet.graphs.number_kernel.kernel import NumberKernel
 from lyapnet.graphs.tracing import name_of, trace
-from lyapnet.linear_algebra import solve
-from lyapnet.operators import are_operators, as_operators, operator
-from lyapnet.sets import ControlBox
+from lyapnet.task.sets import ControlBox
 
 pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler")
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.errors import UntraceableError, UsageError
+from lyapnet.base.errors import UntraceableError, UsageError
 from lyapnet.graphs.tracing import cut, trace
 
 

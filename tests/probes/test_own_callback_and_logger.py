@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import lyapnet
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.training import figure_logger, loggers
 from tests.probes.own_parts import ListLogger
 from tests.runs import SMALL

@@ -12,12 +12,12 @@ import yaml
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.checkpoint import KEY, read_checkpoint
+from lyapnet.base.errors import OracleError, UsageError
 from lyapnet.cli import main
-from lyapnet.errors import OracleError, UsageError
 from lyapnet.evaluation.oracles import oracle_of
-from lyapnet.networks import FCN, Scaling
-from lyapnet.policy import HJBPolicy
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint
+from lyapnet.value.networks import FCN, Scaling
+from lyapnet.value.policy import HJBPolicy
 
 MODULE = '''
 import torch

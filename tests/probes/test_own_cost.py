@@ -11,11 +11,11 @@ from scipy.optimize import minimize
 from torch.testing import assert_close
 
 import lyapnet
+from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
-from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.oracles.transcription import Transcription
-from lyapnet.networks import FCN, Scaling
+from lyapnet.value.networks import FCN, Scaling
 
 MODULE = '''
 import torch

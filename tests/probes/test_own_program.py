@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.build import build_program
+from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
-from lyapnet.config import config_from_plain
-from lyapnet.errors import UsageError
+from lyapnet.experiment.assembly import build_program
+from lyapnet.experiment.config import config_from_plain
 from tests.probes.own_parts import AbsoluteProgram
 from tests.runs import SMALL
 

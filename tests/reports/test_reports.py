@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.build import parts_of
-from lyapnet.config import load_config
-from lyapnet.errors import UsageError
+from lyapnet.base.errors import UsageError
 from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.experiment.assembly import parts_of
+from lyapnet.experiment.config import load_config
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import silent
 from tests.cli.test_check_tasks import facts_before_optima

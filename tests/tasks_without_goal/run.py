@@ -20,8 +20,8 @@ import psutil
 import torch
 
 import lyapnet
-from lyapnet.build import parts_of
-from lyapnet.config import load_config
+from lyapnet.experiment.assembly import parts_of
+from lyapnet.experiment.config import load_config
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, inside, optima_of, simulate
 
 LIMIT = 300.0  # CPU seconds

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.build import build_problem, parts_of
-from lyapnet.config import load_config
-from lyapnet.problem import Problem
+from lyapnet.experiment.assembly import build_problem, parts_of
+from lyapnet.experiment.config import load_config
+from lyapnet.task.problem import Problem
 
 HERE = Path(__file__).parent
 WORKING = ("advertising", "chemotherapy", "battery", "rocket", "glider")

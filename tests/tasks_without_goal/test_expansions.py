@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lyapnet.expansions import at_rest, optimal_trajectories, path_under
+from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under
 from tests.tasks_without_goal.tasks import optima_of, problem_of
 
 STATES = 4

@@ -5,7 +5,7 @@ import pytest
 import torch
 import yaml
 
-from lyapnet.cost import reason_for_no_goal
+from lyapnet.task.cost import reason_for_no_goal
 from tests.marks import sample
 from tests.pages import ROOT, blocks
 from tests.tasks_without_goal.optima import AGREES, TASKS, Transcription

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.certification import statistical_claim
-from lyapnet.checkpoint import read_checkpoint
-from lyapnet.random_streams import CERTIFICATION, TEST, TRAINING, VALIDATION, stream
+from lyapnet.base.random_streams import CERTIFICATION, TEST, TRAINING, VALIDATION, stream
+from lyapnet.claims import statistical_claim
+from lyapnet.experiment.checkpoint import read_checkpoint
 from tests.runs import SMALL, Desk, dies_at, logged, values, without_figures
 
 pytestmark = pytest.mark.gate

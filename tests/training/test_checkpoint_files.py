@@ -9,10 +9,10 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from lyapnet import InitialStateDataModule, LyapunovProgram, ValueModule
-from lyapnet.build import build_problem, build_value_function
-from lyapnet.checkpoint import DIGEST, read_checkpoint
-from lyapnet.config import config_from_plain
-from lyapnet.errors import CheckpointError
+from lyapnet.base.errors import CheckpointError
+from lyapnet.experiment.assembly import build_problem, build_value_function
+from lyapnet.experiment.checkpoint import DIGEST, read_checkpoint
+from lyapnet.experiment.config import config_from_plain
 from lyapnet.training.checkpoint_files import CheckpointFiles
 from tests.runs import SMALL
 

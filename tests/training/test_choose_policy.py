@@ -4,16 +4,16 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.build import build_problem
-from lyapnet.config import config_from_plain
-from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.references import costs_of_holding
-from lyapnet.expansions import riccati
-from lyapnet.policy import LookaheadPolicy, SampledPolicy
-from lyapnet.systems import Linear
+from lyapnet.experiment.assembly import build_problem
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
 from lyapnet.training.candidates import Candidate, Start
 from lyapnet.training.start import _gain_by_looking_ahead
+from lyapnet.value.expansions import riccati
+from lyapnet.value.policy import LookaheadPolicy, SampledPolicy
 from tests.fits import shorten_fits
 from tests.problems import Formula, problem_of
 

@@ -10,14 +10,14 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from rich.console import Console
 
-from lyapnet.calculus import ValueFunction
+from lyapnet.base.errors import CompilationError
 from lyapnet.cli import main
-from lyapnet.errors import CompilationError
 from lyapnet.graphs import compilation
 from lyapnet.graphs.number_kernel import assembly
-from lyapnet.networks import FCN, NETWORKS
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.stages import PATIENCE, Stages
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import FCN, NETWORKS
 from tests.marks import sample
 
 CONFIG = Path(__file__).parents[2] / "conf" / "from_scratch" / "double_integrator.yaml"
@@ -56,7 +56,7 @@ def machine_code(monkeypatch):
         if asked.failure:
             raise CompilationError(asked.failure)
 
-    monkeypatch.setattr("lyapnet.rollout.discrete_adjoint.DiscreteAdjoint.compile", compile)
+    monkeypatch.setattr("lyapnet.loop.rollout.discrete_adjoint.DiscreteAdjoint.compile", compile)
     return asked
 
 

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from lyapnet.errors import CheckpointError
-from lyapnet.random_streams import FIGURES, TEST, TRAINING, VALIDATION, stream
-from lyapnet.sets import Box
-from lyapnet.systems import Linear
+from lyapnet.base.errors import CheckpointError
+from lyapnet.base.random_streams import FIGURES, TEST, TRAINING, VALIDATION, stream
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import Linear
 from lyapnet.training.data import InitialStateDataModule
 from tests.problems import problem_of
 

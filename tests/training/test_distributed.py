@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.checkpoint import read_checkpoint
-from lyapnet.config import load_config
-from lyapnet.rollout import GRADIENTS
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.experiment.config import load_config
+from lyapnet.loop.rollout import GRADIENTS
 from lyapnet.training.build import build_module
 from lyapnet.training.data import InitialStateDataModule
 

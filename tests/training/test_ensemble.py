@@ -13,20 +13,20 @@ from matplotlib.figure import Figure
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.calculus import ValueFunction
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.base.errors import CheckpointError, DivergenceError, UntraceableError
 from lyapnet.cli import main
-from lyapnet.config import load_config
-from lyapnet.errors import CheckpointError, DivergenceError, UntraceableError
 from lyapnet.evaluation.states import StateTable
-from lyapnet.networks import FCN, NETWORKS
-from lyapnet.rollout import Rollout
-from lyapnet.sets import Box
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.experiment.config import load_config
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.training import figure_logger
 from lyapnet.training.build import build_module
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.progress import about_means, mean_and_range
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import FCN, NETWORKS
 from tests.problems import problem_of
 from tests.runs import MEASURED_TIME, SMALL, Desk, differences, logged, values, without_figures
 

@@ -12,7 +12,7 @@ from tensorboard.compat.proto.event_pb2 import Event
 from tensorboard.summary.writer.event_file_writer import EventFileWriter
 
 import lyapnet
-from lyapnet.files import write_atomically
+from lyapnet.base.files import write_atomically
 from lyapnet.training import figure_logger
 from lyapnet.training.loggers import quiet_writers
 from lyapnet.training.metrics_file import MetricsFile, read_curves

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.checkpoint import read_checkpoint
-from lyapnet.errors import DivergenceError
-from lyapnet.random_streams import LOST, stream
-from lyapnet.sets import Box
-from lyapnet.systems import Linear
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.random_streams import LOST, stream
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import Linear
 from lyapnet.training import lost_states
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
 from lyapnet.training.lost_states import EXCESS, KEPT, SOUGHT, excess

@@ -8,12 +8,12 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet.evaluation.oracles import Optima
-from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
-from lyapnet.systems import IntegratorChain, Linear
+from lyapnet.task.systems import IntegratorChain, Linear
 from lyapnet.training import optima
 from lyapnet.training.optima import how_many, optima_for
-from tests.expansions.test_expansions import hanging
+from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under, riccati
 from tests.problems import problem_of
+from tests.value.expansions.test_expansions import hanging
 
 
 def test_as_many_trajectories_as_fit_into_memory(monkeypatch):

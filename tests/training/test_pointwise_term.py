@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.build import build_problem, build_program, build_rollout, build_value_function
-from lyapnet.config import config_from_plain
-from lyapnet.errors import UsageError
-from lyapnet.programs import LyapunovProgram, ValueProgram
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.training.build import build_data, build_module
 from lyapnet.training.build_learner import build_pointwise
 

@@ -4,24 +4,24 @@ import pytest
 import torch
 from torch.testing import assert_close
 
-from lyapnet.constraints import StateLimits
-from lyapnet.cost import QuadraticCost
 from lyapnet.evaluation.oracles import discrete_riccati
-from lyapnet.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.graphs.compilation import has_compiler
-from lyapnet.networks import FCN, Scaling
-from lyapnet.policy import SampledPolicy
-from lyapnet.programs import ValueProgram
-from lyapnet.rollout import Rollout
-from lyapnet.sets import ControlBox
-from lyapnet.systems import Linear, Pendulum
+from lyapnet.loop.programs import ValueProgram
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.constraints import StateLimits
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.sets import ControlBox
+from lyapnet.task.systems import Linear, Pendulum
 from lyapnet.training import pretraining
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
 from lyapnet.training.pretraining import errors, examples_of, examples_visited, fit
-from tests.expansions.test_expansions import hanging
+from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under, riccati
+from lyapnet.value.networks import FCN, Scaling
+from lyapnet.value.policy import SampledPolicy
 from tests.fits import shorten_fits
 from tests.problems import Formula, problem_of
+from tests.value.expansions.test_expansions import hanging
 
 GENERATOR = torch.Generator().manual_seed(0)
 

@@ -8,11 +8,11 @@ import torch
 from lightning import Trainer
 from rich.console import Console
 
-from lyapnet.checkpoint import read_checkpoint
-from lyapnet.config import config_from_plain
-from lyapnet.errors import DivergenceError
-from lyapnet.files import read_json
-from lyapnet.systems import ControlAffineSystem
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.files import read_json
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner

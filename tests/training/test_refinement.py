@@ -18,17 +18,17 @@ from rich.console import Console
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.build import Parts
-from lyapnet.certification import DecreaseCondition, SoundClaim, sound_certificate
-from lyapnet.certification.region import RegionClaim
-from lyapnet.certification.region_certificate import RegionCertificate
-from lyapnet.certification.sound_certificate import SoundCertificate
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.base.errors import Interrupted, UsageError
+from lyapnet.claims import DecreaseCondition, SoundClaim, sound_certificate
+from lyapnet.claims.region import RegionClaim
+from lyapnet.claims.region_certificate import RegionCertificate
+from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.cli import main
-from lyapnet.config import load_config
-from lyapnet.errors import Interrupted, UsageError
-from lyapnet.programs import RegionProgram
-from lyapnet.sets import Box
+from lyapnet.experiment.assembly import Parts
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.experiment.config import load_config
+from lyapnet.loop.programs import RegionProgram
+from lyapnet.task.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
 from lyapnet.training.runs import Run
@@ -293,7 +293,7 @@ def test_the_command(run, capsys, monkeypatch):
 
 PART = """
 from pathlib import Path
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.task.systems import DoubleIntegrator
 import lightning as L
 
 Path({mark!r}).touch()
@@ -338,7 +338,7 @@ def undecided(monkeypatch):
         "sound_certificate",
         lambda controller, *_, **__: claimed(best(Path()), controller=controller),
     )
-    monkeypatch.setattr("lyapnet.certification.tables.certificate_table", lambda *_: "")
+    monkeypatch.setattr("lyapnet.claims.tables.certificate_table", lambda *_: "")
     monkeypatch.setattr(SoundCertificate, "numbers", lambda self: {"system": type(self.controller.system).__name__})
 
 
@@ -384,7 +384,7 @@ def test_a_round_that_lies_there_is_trained_with_nothing_that_it_names(what, run
 def test_parts_from_python_are_trained_with(run):
     """Also where their class cannot be imported; and their name stands in for what the checkpoint said."""
 
-    class Heavy(lyapnet.systems.DoubleIntegrator):
+    class Heavy(lyapnet.task.systems.DoubleIntegrator):
         pass
 
     rewrite(best(run), system={"name": "trap:Cart", "parameters": {}})

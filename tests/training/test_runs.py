@@ -30,20 +30,20 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.plugins.custom_scalar.layout_pb2 import Layout
 
 import lyapnet
-from lyapnet.build import build_problem, build_value_function
-from lyapnet.checkpoint import read_checkpoint, write_checkpoint
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.random_streams import VALIDATION, stream
 from lyapnet.cli import main
-from lyapnet.config import config_from_plain, load_config
-from lyapnet.controller import Controller
-from lyapnet.errors import LyapnetError, UsageError
-from lyapnet.loading import load_value_function
-from lyapnet.networks import FCN
-from lyapnet.random_streams import VALIDATION, stream
-from lyapnet.systems import DoubleIntegrator
+from lyapnet.controller.controller import Controller
+from lyapnet.controller.loading import load_value_function
+from lyapnet.experiment.assembly import build_problem, build_value_function
+from lyapnet.experiment.checkpoint import read_checkpoint, write_checkpoint
+from lyapnet.experiment.config import config_from_plain, load_config
+from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.training import loggers, metrics_file
 from lyapnet.training.plan import plan_run
 from lyapnet.training.run_lock import RunLock
 from lyapnet.training.runs import new_run
+from lyapnet.value.networks import FCN
 from tests.runs import (
     MEASURED_TIME,
     SMALL,
@@ -762,7 +762,7 @@ def test_read_only_folders_are_one_line(finished):
 OWN = """
 import torch
 from lyapnet import ControlAffineSystem
-from lyapnet.networks import FCN
+from lyapnet.value.networks import FCN
 
 class Cart(ControlAffineSystem):
     state_names, state_units = ("position", "velocity"), ("m", "m/s")

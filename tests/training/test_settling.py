@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 from rich.console import Console
 
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.runs import Run
 from lyapnet.training.settling import COOLING, WINDOW, Settling, end_of

@@ -9,18 +9,18 @@ import torch
 from torch.testing import assert_close
 
 from lyapnet import ControlAffineSystem, load, train
-from lyapnet.build import Parts
-from lyapnet.checkpoint import read_checkpoint
+from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
-from lyapnet.config import config_from_plain
-from lyapnet.errors import UsageError
 from lyapnet.evaluation.oracles import discrete_riccati
-from lyapnet.expansions import optimal_trajectories
+from lyapnet.experiment.assembly import Parts
+from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.experiment.config import config_from_plain
 from lyapnet.training import pretraining
 from lyapnet.training.build import build_module
 from lyapnet.training.candidates import CALM
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.start import choose_start, expansions_of
+from lyapnet.value.expansions import optimal_trajectories
 from tests.fits import few_optima
 
 LINEAR = {

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from lyapnet import train
-from lyapnet.config import config_from_plain
-from lyapnet.loading import load
+from lyapnet.controller.loading import load
+from lyapnet.experiment.config import config_from_plain
 from lyapnet.training import start_cache
 from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints

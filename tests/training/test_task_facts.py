@@ -8,11 +8,11 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.base.errors import CheckpointError, DivergenceError
 from lyapnet.cli import main
-from lyapnet.config import load_config
-from lyapnet.errors import CheckpointError, DivergenceError
-from lyapnet.systems import Cartpole
+from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.experiment.config import load_config
+from lyapnet.task.systems import Cartpole
 from lyapnet.training.build import build_module
 
 ROOT = Path(__file__).parents[2]

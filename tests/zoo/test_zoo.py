@@ -11,11 +11,20 @@ import pytest
 import torch
 
 import lyapnet
-from lyapnet.checkpoint import KEY, ZOO, located, note_in_checkpoint, read_checkpoint, write_checkpoint, zoo_names
+from lyapnet.base.errors import UsageError
 from lyapnet.cli import main
-from lyapnet.config import load_config
-from lyapnet.errors import UsageError
-from lyapnet.zoo import entry, making
+from lyapnet.experiment.checkpoint import (
+    KEY,
+    ZOO,
+    located,
+    note_in_checkpoint,
+    read_checkpoint,
+    write_checkpoint,
+    zoo_names,
+)
+from lyapnet.experiment.config import load_config
+from lyapnet.lab import zoo_making as making
+from lyapnet.zoo import entry
 from tests.marks import sample
 
 ROOT = Path(__file__).parents[2]

@@ -2,8 +2,7 @@
 
 import importlib.util
 
-from lyapnet.cost import is_quadratic
-from lyapnet.errors import OracleError, one_line
+from lyapnet.base.errors import OracleError, one_line
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.of_rounded import OracleOfRounded
 from lyapnet.evaluation.oracles.riccati import (
@@ -12,10 +11,11 @@ from lyapnet.evaluation.oracles.riccati import (
     continuous_riccati,
     discrete_riccati,
 )
-from lyapnet.linearisation import SOLVED, rounded
-from lyapnet.problem import Problem
-from lyapnet.rollout import ADAPTIVE_METHODS
-from lyapnet.systems import is_linear
+from lyapnet.loop.rollout import ADAPTIVE_METHODS
+from lyapnet.task.cost import is_quadratic
+from lyapnet.task.problem import Problem
+from lyapnet.task.systems import is_linear
+from lyapnet.value.linearisation import SOLVED, rounded
 
 __all__ = [
     "Optima",

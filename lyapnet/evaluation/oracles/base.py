@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from lyapnet.types import ControlPath, PerState, State
+from lyapnet.base.types import ControlPath, PerState, State
 
 Report = Callable[[int, int], None]  # (initial states done, of how many)
 

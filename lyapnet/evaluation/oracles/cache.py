@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
-from lyapnet.files import write_atomically
+from lyapnet.base.files import write_atomically
+from lyapnet.base.types import Control
 from lyapnet.graphs.compilation import cache_folder, constants_of
-from lyapnet.sets import ControlSet
-from lyapnet.types import Control
+from lyapnet.task.sets import ControlSet
 
 
 class OptimaCache:

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
+from lyapnet.base.types import Control, PerState, State
 from lyapnet.graphs.casadi_functions import require_equal, symbolic, traced
 from lyapnet.graphs.tracing import Tensors
-from lyapnet.problem import Problem
-from lyapnet.types import Control, PerState, State
+from lyapnet.task.problem import Problem
 
 
 class CasadiTask:

@@ -4,10 +4,10 @@ import math
 
 import torch
 
+from lyapnet.base.types import ControlPath, State
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
-from lyapnet.expansions import in_float64, path_under
-from lyapnet.problem import Problem
-from lyapnet.types import ControlPath, State
+from lyapnet.task.problem import Problem
+from lyapnet.value.expansions import in_float64, path_under
 
 
 class OracleOfRounded(Oracle):

@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lyapnet.cost import QuadraticCost
+from lyapnet.base.types import Control, ControlPath, PerState, State
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
-from lyapnet.horizon import Horizon
-from lyapnet.systems import Linear
-from lyapnet.types import Control, ControlPath, PerState, State
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.systems import Linear
 
 SUBSTEPS = 10_000  # restarts within one step of Δt, at most: a task of 100 steps takes a minute then
 

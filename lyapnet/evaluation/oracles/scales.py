@@ -5,9 +5,9 @@ import math
 import numpy as np
 import torch
 
-from lyapnet.expansions import Path, at_rest, cheapest, greedy_law, path_under, riccati, sizes
-from lyapnet.problem import Problem
-from lyapnet.types import State
+from lyapnet.base.types import State
+from lyapnet.task.problem import Problem
+from lyapnet.value.expansions import Path, at_rest, cheapest, greedy_law, path_under, riccati, sizes
 
 TRIED = 16  # states of X₀ from which paths are tried
 

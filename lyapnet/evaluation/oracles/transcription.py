@@ -15,15 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lyapnet.contracts import copied
-from lyapnet.errors import Interrupted, signals_taken
+from lyapnet.base.contracts import copied
+from lyapnet.base.errors import Interrupted, signals_taken
+from lyapnet.base.types import ControlPath, PerState, State, StatePath
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.casadi_task import CasadiTask
 from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, SAME, Candidate, MultiStart, is_better
 from lyapnet.evaluation.oracles.scales import Scales
-from lyapnet.problem import Problem
-from lyapnet.types import ControlPath, PerState, State, StatePath
+from lyapnet.task.problem import Problem
 
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 ACCEPTABLE = 1e-7  # tolerances in units of the scales, at which IPOPT may end after five iterations that gain nothing

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.fx import GraphModule
 
-from lyapnet.errors import LyapnetError
+from lyapnet.base.errors import LyapnetError
 from lyapnet.graphs.agreement import THIRD, are_close
 from lyapnet.graphs.number_kernel.assembly import AssembledProgram
 from lyapnet.graphs.number_kernel.rewriting import rewritten

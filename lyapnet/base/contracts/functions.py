@@ -1,0 +1,159 @@
+"""The one gate for functions of states that others wrote: f, g, the cost and V are held against what is asked of them.
+
+They are tried on states at random. What passes may still break its contract at a state that was not among them; a
+certificate does not rely on this gate (docs/trust.md).
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.contracts.derivatives import at_state, check_derivative
+from lyapnet.base.contracts.memory import reaches_own_code
+from lyapnet.base.errors import UsageError, raised
+
+REMEDIES = {  # what an error of torch's says ↦ what to do
+    "before Module.__init__() call": "call super().__init__() first in __init__",
+    "' already exists": "give that attribute of your class another name, which no buffer of it has",
+    "has no setter": "n, m, title and the like are reserved names of every system: give that attribute another one",
+    "object is not callable": "an attribute may hide a function of that name: give it another one",
+    "Boolean value of Tensor": "write torch.where(x > 0, a, b) in the place of an if",
+    "converted to Python scalars": "stay in torch: no float(x) and no x.item()",
+    "numpy": "stay in torch: torch.sin for np.sin, and lyapnet.Table for np.interp",
+}
+
+
+def _advice(got: tuple[int, ...] | str, batch: int, expected: tuple[int, ...]) -> str:
+    """What to do about a result of another shape than (batch, *expected)."""
+    if got == expected:
+        return f"append .expand({', '.join(['*x.shape[:-1]', *map(str, expected)])}), which gives it to each state"
+    if expected and expected[-1] == 1 and got == (batch, *expected[:-1]):
+        return "append [..., None], which adds the last axis"
+    if len(got) == 1 + len(expected) and got[0] == batch:
+        axis = next(k for k, (one, other) in enumerate(zip(got[1:], expected, strict=True), 1) if one != other)
+        return f"give its axis {axis} {expected[axis - 1]} entries, not {got[axis]}"
+    return "return one result for each state"
+
+
+def check_function(
+    name: str,
+    function: Callable[..., Any],
+    arguments: Sequence[Tensor],
+    shape: Sequence[int],
+    differentiable: bool = True,
+    any_size: bool = True,
+) -> None:
+    """Hold a function of states against its contract.
+
+    It returns finite tensors in the precision of its arguments; each state's result is of that state alone, in a
+    batch of any shape; it changes no argument; and autograd's derivative is its derivative.
+
+    Args:
+        name: as messages say it, "Pendulum.f(x)".
+        arguments: batches (b, …) of float64 numbers, b even.
+        shape: of one state's result.
+        differentiable: whether its derivative is asked for too.
+        any_size: whether it is traced for batches of every size too, where it is the user's own.
+
+    Raises:
+        UsageError: it breaks one of these; names which, and where.
+    """
+    given = [argument.detach().clone().requires_grad_() for argument in arguments]
+    value = called(name, function, given)
+    batch = len(given[0])
+    got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
+    if got != ((batch, *shape), given[0].dtype):
+        shapes = " and ".join(str(tuple(argument.shape)) for argument in given)
+        precision = "append .to(x), which gives it the precision of x"
+        advice = precision if got[0] == (batch, *shape) else _advice(got[0], batch, tuple(shape))
+        raise UsageError(
+            f"Expected {name} as a tensor of {(batch, *shape)} and {given[0].dtype} for arguments of shape {shapes}, "
+            f"got {got}; {advice}."
+        )
+    if any(not torch.equal(one, before) for one, before in zip(given, arguments, strict=True)):
+        raise UsageError(f"Expected {name} to leave its arguments as they are, got others; clone them first.")
+    value = value.detach()
+    bad = torch.nonzero(~value.isfinite().reshape(batch, -1).all(-1)).flatten()
+    if len(bad):
+        raise UsageError(
+            f"Expected finite {name}, got {_first_bad(value[bad[0]])} at {at_state(arguments, int(bad[0]))}; correct "
+            "it, or choose an X₀ that avoids this state."
+        )
+    if any_size and reaches_own_code(function):
+        from lyapnet.base.contracts.batch_sizes import check_batch_sizes  # loads sympy: a second
+
+        check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
+    _check_each_for_itself(name, function, arguments, value)
+    if differentiable:
+        check_derivative(name, lambda *batches: called(name, function, batches), arguments)
+
+
+def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
+    """What a function of others returns; whatever it raises, sys.exit() included, as one line."""
+    try:
+        return function(*arguments)
+    except (Exception, SystemExit) as error:
+        shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
+        raise UsageError(
+            f"Expected {name} for arguments of shape {shapes}, got {raised(error)}; {remedy(error)}."
+        ) from error
+
+
+def remedy(error: BaseException) -> str:
+    """What to do about an error of a function of others."""
+    return next((advice for words, advice in REMEDIES.items() if words in str(error)), "correct it there")
+
+
+def initialised(part: Any) -> Any:
+    """A part of a problem that is a module, or none; one whose __init__ forgot the module's is refused.
+
+    Raises:
+        UsageError: it is one.
+    """
+    if isinstance(part, nn.Module) and "_modules" not in vars(part):
+        raise UsageError(
+            f"Expected {type(part).__name__}.__init__ to call super().__init__(), got one that does not; call it first."
+        )
+    return part
+
+
+def copied(module: nn.Module) -> Any:
+    """A float64 copy of a module on the CPU.
+
+    Raises:
+        UsageError: it holds what cannot be copied.
+    """
+    try:
+        return copy.deepcopy(module).double().cpu()
+    except Exception as error:
+        raise UsageError(
+            f"Expected a {type(module).__name__} that can be copied, got {raised(error)}; call what it holds there by "
+            "its global name."
+        ) from error
+
+
+def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
+    """Refuse results that depend on the other states of a batch, on its shape, or on chance."""
+    tolerance = torch.finfo(value.dtype).eps ** 0.5
+    folded = called(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
+    first = called(name, function, [argument[:1] for argument in arguments])
+    alone = [called(name, function, [argument[i] for argument in arguments]) for i in range(3)]
+    batches = (folded, value.reshape(2, -1, *value.shape[1:])), (first, value[:1])
+    for some, expected in (*batches, *zip(alone, value[:3], strict=True)):
+        if (
+            not isinstance(some, Tensor)
+            or some.shape != expected.shape
+            or not torch.allclose(some, expected, rtol=tolerance, atol=tolerance * float(value.abs().max()))
+        ):
+            raise UsageError(
+                f"Expected {name} to be a function of each state by itself, in batches of any shape, got another "
+                f"result for a batch of {tuple(expected.shape[: expected.ndim - value.ndim + 1]) or 'one state'}; use "
+                "x[..., i], sums over the last axis alone, torch.where in the place of an if, and no random numbers."
+            )
+
+
+def _first_bad(result: Tensor) -> float:
+    return float(result[~result.isfinite()][0])

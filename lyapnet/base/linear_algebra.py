@@ -1,0 +1,127 @@
+"""Linear algebra in the sizes that mechanics asks for: small matrices, one for each state of a batch.
+
+A library takes such matrices one after the other. Written as multiplications of whole batches, the same work is
+faster, and a compiler joins it with its neighbours. Large matrices go to torch.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import handle_torch_function, has_torch_function_unary
+
+from lyapnet.base.operators import are_operators, is_transformed, operator
+
+SMALL = 16  # products of entries that are cheaper without the library
+CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
+UNROLLED = 6  # unknowns of a linear system, up to which it is solved in whole batches
+
+
+def norm(v: Tensor, dim: int = -1) -> Tensor:
+    """‖v‖ = √(Σ v²) along an axis, exactly, with slope 0 at v = 0 and all further derivatives finite there.
+
+    The root's own slope is infinite at 0, and autograd makes not a number of it: at rest, v‖v‖ has no derivative with
+    torch.sqrt, and no second one with torch.linalg.vector_norm.
+
+    Args:
+        v: (…, k, …), in any unit.
+        dim: the axis that is summed over, the last one unless said otherwise.
+    """
+    if has_torch_function_unary(v):  # a cost that is rounded, say, wants a norm and not what it is computed by
+        return handle_torch_function(norm, (v,), v, dim=dim)
+    squared = (v * v).sum(dim)
+    away = squared > 0
+    # the root of 1 in the place of that of 0, so that its infinite slope is not even computed
+    return torch.where(away, torch.sqrt(torch.where(away, squared, 1.0)), 0.0)
+
+
+def multiply(A: Tensor, B: Tensor) -> Tensor:
+    """AB for A of shape (*batch, k, d) and B of shape (*batch, d, l)."""
+    if A.shape[-2] * A.shape[-1] * B.shape[-1] > SMALL:
+        return A @ B
+    return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
+
+
+def apply(A: Tensor, v: Tensor) -> Tensor:
+    """Av for A of shape (*batch, k, d) or (k, d), and v of shape (*batch, d)."""
+    if A.ndim == 2 and A.numel() > SMALL:
+        return v @ A.mT
+    return multiply(A, v[..., None])[..., 0]
+
+
+def solve(A: Tensor, B: Tensor) -> Tensor:
+    """A⁻¹B for A of shape (*batch, d, d) and B of shape (*batch, d, k); symmetric positive definite A for d > 2."""
+    d = A.shape[-1]
+    if d == 1:
+        return B / A
+    if d > UNROLLED and not are_operators():
+        return torch.linalg.solve(A, B)
+    if d > 2:
+        return multiply(_Inverse.apply(A), B)  # pyright: ignore[reportArgumentType]
+    a, b, c, e = A[..., :1, :1], A[..., :1, 1:], A[..., 1:, :1], A[..., 1:, 1:]  # Cramer's rule
+    first, second = B[..., :1, :], B[..., 1:, :]
+    return torch.cat([e * first - b * second, a * second - c * first], -2) / (a * e - b * c)
+
+
+def is_positive_definite(A: Tensor) -> Tensor:
+    """Whether each symmetric A (*batch, d, d) has positive pivots; Booleans of shape (*batch,)."""
+    d, definite = A.shape[-1], A[..., 0, 0] > 0
+    if d > UNROLLED:
+        return torch.linalg.cholesky_ex(A).info == 0
+    for _ in range(d - 1):
+        pivot = A[..., :1, :1]
+        A = A[..., 1:, 1:] - A[..., 1:, :1] * A[..., :1, 1:] / torch.where(pivot > 0, pivot, 1.0)
+        definite = definite & (A[..., 0, 0] > 0)
+    return definite
+
+
+def convex_or(A: Tensor, floor: Tensor, otherwise: Tensor) -> Tensor:
+    """Each symmetric A (*batch, d, d) that exceeds CONVEX times a positive definite floor, else another matrix."""
+    return torch.where(is_positive_definite(A - CONVEX * floor)[..., None, None], A, otherwise)
+
+
+@operator
+def symmetric_inverse(A: Tensor) -> Tensor:
+    """A⁻¹ of symmetric positive definite A (*batch, d, d), from its lower triangle, entry by entry over the batch.
+
+    Each pivot p in turn takes a_pp to −1/a_pp, a_ip to a_ip/a_pp and a_ij to a_ij − a_ip a_jp/a_pp: after the last one
+    the matrix is −A⁻¹. No rows are exchanged, which such matrices do not need.
+    Source: Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979.
+    """
+    d = A.shape[-1]
+    a = {(i, j): A[..., i, j] for i in range(d) for j in range(i + 1)}
+    for p in range(d):
+        reciprocal = 1 / a[p, p]
+        column = [a[max(i, p), min(i, p)] for i in range(d)]
+        scaled = [entry * reciprocal for entry in column]
+        for i, j in a:
+            if p in (i, j):
+                a[i, j] = -reciprocal if i == j else scaled[i + j - p]
+            else:
+                a[i, j] = a[i, j] - scaled[i] * column[j]
+    rows = [torch.stack([-a[max(i, j), min(i, j)] for j in range(d)], -1) for i in range(d)]
+    return torch.stack(rows, -2)
+
+
+class _Inverse(torch.autograd.Function):
+    """symmetric_inverse with its derivative −A⁻ᵀ Ā A⁻ᵀ."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(A: Tensor) -> Tensor:
+        return symmetric_inverse(A)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(output)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> Tensor:
+        (inverse,) = ctx.saved_tensors
+        return -multiply(inverse.mT, multiply(bar, inverse.mT))
+
+
+def has_values(x: Tensor) -> bool:
+    """Whether a tensor has numbers that may be looked at, as none has in a trace or under vmap."""
+    return type(x) is Tensor and not is_transformed(x)

@@ -1,0 +1,74 @@
+"""Modules of lyapnet under the names that they had until 0.3: imports, configs and checkpoints that name them go on."""
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from types import ModuleType
+
+_FOLDERS = {  # of today ↦ what was beside them
+    "base": "cluster contracts devices drawing errors files findings interpolation linear_algebra machine operators "
+    "provenance random_streams shapes sizes tables types",
+    "task": "constraints cost domain family horizon operating_points problem sets systems",
+    "value": "after_horizon beyond calculus derivatives expansions linearisation networks policy regulator",
+    "loop": "programs rollout",
+    "experiment": "checkpoint config recipe schema",
+    "controller": "loading",
+    "exchange": "importing view",
+    "lab": "bench comparison",
+}
+_BOUNDS = "bound_kernel bound_rules bounds branches elementary_functions linear_systems rounding simplification taylor"
+_SEARCH = "boxes branch_and_bound condition counterexamples kept_proofs proof stopping verdict workers"
+MOVED = {
+    **{name: f"{folder}.{name}" for folder, names in _FOLDERS.items() for name in names.split()},
+    **{f"graphs.{name}": f"prover.{name}" for name in _BOUNDS.split()},
+    **{f"certification.{name}": f"prover.{name}" for name in _SEARCH.split()},
+    "build": "experiment.assembly",
+    "certification": "claims",
+    "comparison.sweep": "lab.sweep",
+    "comparison.tuning": "lab.tuning",
+    "zoo.making": "lab.zoo_making",
+}
+"""A module of 0.3 ↦ that of today, both without "lyapnet."; modules within it move along."""
+
+
+class MovedModules(MetaPathFinder):
+    """Finds a module by its former name: the same module, not a copy."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        package, *parts = fullname.split(".")
+        if package != "lyapnet" or not parts:
+            return None
+        if parts[0] == "export":
+            raise ModuleNotFoundError(
+                "lyapnet.export is a function since 0.4: lyapnet.export(controller, path, to='c'); what else was in "
+                "that module is in lyapnet.exchange.export.",
+                name=fullname,
+            )
+        for k in (2, 1):
+            if (today := MOVED.get(".".join(parts[:k]))) is not None:
+                name = ".".join(["lyapnet", today, *parts[k:]])
+                return ModuleSpec(fullname, _ModuleOfToday(name), is_package=True)
+        return None
+
+
+class _ModuleOfToday(Loader):
+    def __init__(self, name: str):
+        self.name = name
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        module = import_module(self.name)
+        self.spec = module.__spec__
+        return module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self.spec  # importlib has put the former name there
+
+
+def find_moved_modules() -> None:
+    """Have Python look here first: a former name leads to a folder of today, in which it would load a copy."""
+    if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
+        sys.meta_path.insert(0, MovedModules())

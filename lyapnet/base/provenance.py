@@ -1,0 +1,33 @@
+"""With what a result was made: versions, platform, and the commit of lyapnet's own source tree."""
+
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lyapnet import __version__
+
+RUN_RECORD = "run.json"  # what made a run; its presence marks a run's folder
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """The versions of lyapnet, of those packages that are installed, and of Python; and the platform."""
+    found = {name: known for name in packages if (known := _version(name))}
+    return {"lyapnet": __version__, **found, "python": platform.python_version(), "platform": platform.platform()}
+
+
+def commit() -> str | None:
+    """The commit of lyapnet's own source tree, where it is one."""
+    try:
+        here = Path(__file__).parents[1]
+        git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return git.stdout.strip()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,189 @@
+"""A kept proof, checked: what others can do with its file and the checkpoint, without trusting either search."""
+
+import copy
+import math
+import shlex
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from lyapnet.base.contracts import copied
+from lyapnet.base.errors import UsageError
+from lyapnet.base.files import plain
+from lyapnet.base.types import State
+from lyapnet.claims.funnel import sound_claim
+from lyapnet.claims.kept_regions import kept_region
+from lyapnet.claims.least_cost import DEGREE, RiseCondition, lower_claim
+from lyapnet.claims.plants import plants_of
+from lyapnet.claims.preconditions import over_time
+from lyapnet.claims.region import region_claim
+from lyapnet.claims.region_certificate import RegionCertificate
+from lyapnet.claims.sound_certificate import SoundCertificate
+from lyapnet.claims.two_sided_certificate import TwoSidedCertificate
+from lyapnet.controller.controller import Controller
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition, bounded_condition
+from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, refusing
+from lyapnet.prover.proof import Progress
+from lyapnet.task.sets import Box
+
+UNLIMITED = 1e9  # seconds: the leaves are an end
+NOT_PROVED = "a leaf is not proved"
+Report = Callable[[Progress], None] | None
+
+
+def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
+    """What `lyapnet certify check --json` prints: whether a file proves the claim that it was kept of.
+
+    What the claim is about (α, δ, D, w; λ, B, Y, c) is read from the file, the condition is built from the controller,
+    and all that the claim rests on is computed anew: the levels of X₀ and of the boundary of D, the bounds of the
+    condition and of W on every leaf of the cuts, contraction on B, share and volume, κ, e. The verdict is certified or
+    refused, with the reason. A funnel has to hold all of X₀, and a bound from below too; a region is certified up to
+    the ρ of the file, and how much of X₀ it holds is part of the answer.
+    """
+    started, kind, numbers, share = time.monotonic(), None, {}, None
+    try:
+        kind, again = kind_of(path)
+        found = again(controller, path, Budget(UNLIMITED, workers=workers), report)
+        numbers, reason = found.numbers, found.reason
+        share = found.seconds / found.searched if found.searched > 0 else None
+    except UsageError as error:
+        reason = str(error)
+    verdict = "certified" if reason is None else "refused"
+    numbers = {**numbers, "reason": reason, "seconds": time.monotonic() - started, "share_of_search": share}
+    return plain({"kind": "check", "of": kind, "verdict": verdict, **numbers})
+
+
+def labels_of(result: Mapping[str, Any]) -> dict[str, str]:
+    """What a table calls the numbers of a check."""
+    labels = {"region": RegionCertificate, "two-sided": TwoSidedCertificate}.get(result["of"], SoundCertificate).labels
+    return {"of": "of", **labels, "share_of_search": "seconds for the leaves / for their search"}
+
+
+class Checked(NamedTuple):
+    """A claim that was made again from a file, without a search."""
+
+    numbers: dict[str, Any]
+    reason: str | None  # why it is refused
+    seconds: float  # for the leaves
+    searched: float  # those of the search, as the file says
+
+
+Again = Callable[[Controller, Path, Budget, Report], Checked]
+
+
+def kind_of(path: Path) -> tuple[str, Again]:
+    """(the kind of claim that the proofs in a file make, how it is made again).
+
+    Raises:
+        UsageError: there is no such file, or it is another.
+    """
+    proofs = read_proofs(path)
+    with refusing(path):
+        return KINDS[tuple(sorted(proofs))]
+
+
+class KeptSide(NamedTuple):
+    """The funnel {V(t, x) ≤ ρ + δt} within D that a file records as proved, or {W ≤ c} from below, with c as ρ."""
+
+    alpha: float
+    delta: float  # in cost per second
+    states: Box  # D; without width along states that nothing depends on
+    disturbance: State | None
+    degree: int  # of the forms
+    rho: float
+    seconds: float  # of the search
+
+
+def kept_funnel(controller: Controller, path: Path) -> KeptSide:
+    """What the file of a finished proof says of a controller; no leaf is bounded anew.
+
+    Raises:
+        UsageError: it is another file, an unfinished proof, or that of another controller; or as bounded_condition.
+    """
+    return _kept_side(controller, path, "above")
+
+
+def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
+    """As kept_funnel, of the proof of that name."""
+    content = part_of(read_proofs(path), name, path)
+    with refusing(path):
+        of = content["of"][0]
+        lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
+        w = None if of["disturbance"] is None else torch.tensor(of["disturbance"], dtype=torch.float64)
+        if of["degree"] not in (2, DEGREE):
+            raise ValueError("forms of another degree")
+        kept = KeptSide(
+            float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, int(of["degree"]),
+            float(content["proved"]), float(content["seconds"]),
+        )  # fmt: skip
+    loop, problem = copy.deepcopy(controller.closed_loop).double().requires_grad_(False), copied(controller.problem)
+    if name == "below":
+        condition = RiseCondition(loop, kept.alpha, kept.delta, problem)
+    else:
+        condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance)
+    if kept.states.dimension == controller.system.n:  # the claim says so else
+        domain = over_time(kept.states, controller.horizon.duration)
+        of = about(bounded_condition(condition, domain, kept.degree), condition, *domain)
+        KeptProof(path, of, math.inf).claim(domain)
+    return kept
+
+
+def _funnel(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+    kept = kept_funnel(controller, path)
+    claim = sound_claim(
+        controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
+        path, True, kept.degree, kept.disturbance,
+    )  # fmt: skip
+    reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or the funnel misses some of X₀"
+    return Checked(SoundCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, kept.seconds)
+
+
+def _both_sides(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+    above, below = (_kept_side(controller, path, name) for name in ("above", "below"))
+    if (above.alpha, above.delta) != (below.alpha, below.delta) or above.disturbance is not None:
+        raise UsageError(
+            f"Expected both sides by the same α and δ in {str(path)!r}, and without disturbances, got others; name "
+            "another."
+        )
+    loop, problem, numbers = controller.closed_loop, controller.problem, (above.alpha, above.delta)
+    upper = sound_claim(
+        loop, problem, *numbers, above.states, budget, _generator(), report, path, True, above.degree
+    )  # fmt: skip
+    lower = lower_claim(loop, problem, *numbers, below.states, budget, _generator(), report, path, True)
+    certificate = TwoSidedCertificate(controller, upper, lower, {})
+    reason = None if certificate.verdict == "certified" else f"{NOT_PROVED}, or one side misses some of X₀"
+    seconds = upper.proof_seconds + lower.proof_seconds
+    return Checked(certificate.proved(), reason, seconds, above.seconds + below.seconds)
+
+
+def _region(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+    kept = kept_region(path)
+    if not kept.rho >= kept.hole > 0:
+        raise UsageError(
+            f"Expected a proof that has come to a region in {str(path)!r}, got one that has not; go on with lyapnet "
+            f"certify region CKPT --keep {shlex.quote(str(path))} and the same options."
+        )
+    plants = plants_of(controller, kept.parameters) if kept.parameters else None
+    claim = region_claim(
+        controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
+        kept.disturbance, plants,
+    )  # fmt: skip
+    reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is beyond what was tried"
+    seconds = 0.0 if claim.proof is None else claim.proof.seconds
+    return Checked(RegionCertificate(controller, claim, {}).numbers(), reason, seconds, kept.seconds)
+
+
+KINDS: dict[tuple[str, ...], tuple[str, Again]] = {
+    ("above",): ("sound", _funnel),
+    ("above", "below"): ("two-sided", _both_sides),
+    ("region",): ("region", _region),
+}
+"""Names of the proofs in a file ↦ what they prove together."""
+
+
+def _generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)

@@ -1,0 +1,205 @@
+"""Whether the law keeps to a control set of the user's own: u ∈ U on all of [0, T] × D, as `contains` says it."""
+
+import logging
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import GraphModule
+from torch.fx.node import map_arg
+
+from lyapnet.base.contracts import reaches_own_code
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.types import Corner
+from lyapnet.graphs.tracing import name_of, trace
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.boxes import Boxes, roots
+from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, searched
+from lyapnet.prover.taylor import interval_form
+from lyapnet.value.policy import ValuePolicy
+
+POINTS, DESCENTS = 20_000, 20  # at which u ∈ U is held where it is not proved, and steps from the worst of them
+ROUNDING = 1e-6  # of the largest |u|, by which u may leave U
+BOXES, SECONDS = 2000, 20.0  # for the proof
+ASSUMED = "That u stays in U was held at {} points of [0, T] × D, and is not proved: {} is no set that bounds decide."
+
+
+def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
+    """Refuse a law that leaves a control set of the user's own somewhere in a box of (t, x).
+
+    The comparisons of `contains` are bounded on boxes, as the condition is. Where that decides nothing, as for a disk
+    whose rim u reaches, they are held at points, down their slopes from the worst of these.
+
+    Returns:
+        What is assumed of u, as a claim says it; nothing where it is proved, or U is none of the user's own.
+
+    Raises:
+        UsageError: u leaves U; or `contains` and `minimise` cannot be traced.
+    """
+    policy = loop.policy
+    if not isinstance(policy, ValuePolicy) or not policy.controls.limited or not reaches_own_code(policy.controls):
+        return ""
+    name, (lower, upper) = type(policy.controls).__name__, domain
+    share = torch.rand(POINTS, len(lower), generator=torch.Generator().manual_seed(2), dtype=lower.dtype)
+    points = lower + (upper - lower) * share
+    with torch.no_grad():
+        u = policy(points[:, 0], points[:, 1:])
+        room = ROUNDING * float(u.abs().max())
+        # rounding aside: beside a control of U, in one of these directions, there are others of it
+        axes = torch.eye(u.shape[-1]).to(u)
+        near = torch.cat([axes, -axes, axes.new_tensor([[1.0], [-1.0]]).expand(2, len(axes)), 0 * axes[:1]])
+        outside = points[~policy.controls.contains(u[:, None] + room * near).any(-1)]
+    margin, proved = _margin(policy), False
+    if margin is not None and not len(outside):
+        try:
+            question = _Inside(margin, BoundedFunction(lambda t, x: tuple(margin(t, x)), (lower, upper)), room)
+        except LyapnetError:  # an operator of `contains` without a rule
+            question = _Inside(margin, None, room)
+        else:
+            budget = Budget(SECONDS, boxes=BOXES)
+            proved = not len(searched(question, roots(lower[None], upper[None]), budget).frontier.key)
+        question.look(_descended(margin, points, lower, upper))
+        outside, proved = question.outside, proved and not len(question.outside)
+    if len(outside):
+        with torch.no_grad():
+            u = policy(outside[0, 0], outside[0, 1:])
+        raise UsageError(
+            f"Expected {name}.minimise(R, b) in the set that contains(u) has, got u = {u.tolist()} outside at "
+            f"(t, x) = {[round(y, 6) for y in outside[0].tolist()]}; mend one of the two."
+        )
+    if proved:
+        return ""
+    assumed = ASSUMED.format(POINTS, name)
+    logging.getLogger(__name__).warning("note: %s", assumed)
+    return assumed
+
+
+@dataclass
+class _Inside(Question):
+    """Whether a margin is at least −room on boxes, by Taylor forms or by intervals, whichever know more of it.
+
+    Intervals know that what is clamped reaches its limits and no further.
+    """
+
+    margin: Callable[[Tensor, Tensor], Tensor]
+    bounded: BoundedFunction | None
+    room: float
+    outside: Tensor = field(default_factory=lambda: torch.zeros(0, 0))  # a point where it is less, if one was seen
+
+    @property
+    def settled(self) -> bool:
+        return len(self.outside) > 0
+
+    def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
+        assert self.bounded is not None
+        forms = self.bounded.forms(boxes.lower, boxes.upper)
+        plain = self.bounded.image(interval_form(boxes.lower, boxes.upper))
+        low = torch.stack([torch.maximum(f.interval()[0], p.interval()[0]) for f, p in zip(forms, plain, strict=True)])
+        boxes, worst = boxes._replace(key=low.amin(0)), int(low.amin(1).argmin())
+        chosen = ~(boxes.key >= -self.room)
+        self.look(boxes.center[chosen])
+        return boxes[chosen], axis_to_cut(self.bounded, forms[worst], boxes, chosen, worst)
+
+    def look(self, points: Tensor) -> None:
+        """Keep the first of some points outside."""
+        if len(points) and not self.settled:
+            with torch.no_grad():
+                self.outside = points[(self.margin(points[:, 0], points[:, 1:]) < -self.room).any(-1)][:1]
+
+
+def _margin(policy: ValuePolicy) -> Callable[[Tensor, Tensor], Tensor] | None:
+    """(t, x) ↦ by how much each of the comparisons in `contains(u)` holds, all of which have to, (*batch, comparisons);
+    None where `contains` is made of others."""
+    like = torch.zeros(policy.system.m, dtype=torch.float64)
+    try:
+        graph = trace(lambda u: (policy.controls.contains(u),), [like])
+    except Exception as error:  # of any kind: it is the user's
+        raise UsageError(
+            f"Expected {type(policy.controls).__name__}.contains(u) that torch can trace, got {error}; write it in "
+            "torch operations."
+        ) from error
+    try:
+        _interpreted(graph, like)
+    except NotImplementedError:
+        return None
+
+    def margin(t: Tensor, x: Tensor) -> Tensor:
+        u = policy(t, x)
+        return torch.func.vmap(lambda v: _interpreted(graph, v))(u) if u.ndim > 1 else _interpreted(graph, u)
+
+    return margin
+
+
+def _interpreted(graph: GraphModule, u: Tensor) -> Tensor:
+    """A graph of truths with the margin of each comparison in the place of its truth: below 0 where it does not hold.
+
+    Where several have to hold they are kept side by side: no bound is exact of the least of them.
+
+    Raises:
+        NotImplementedError: a truth is used in another way.
+    """
+    values, truths, joined = dict[Any, Any](), set[Any](), set[Any]()
+    for node in graph.graph.nodes:
+        if node.op == "placeholder":
+            values[node] = u
+        elif node.op == "get_attr":
+            values[node] = operator.attrgetter(str(node.target))(graph).detach()
+        elif node.op == "output":
+            return values[node.args[0][0]].reshape(-1)  # pyright: ignore[reportArgumentType, reportIndexIssue]
+        else:
+            arguments, keywords = (map_arg(each, values.__getitem__) for each in (node.args, node.kwargs))
+            name, sources = name_of(node.target), node.all_input_nodes
+            is_truth, of_truths = node.meta["val"].dtype == torch.bool, not truths.isdisjoint(sources)
+            if name in ("all", "bitwise_and", "logical_and", "mul") and is_truth:
+                if not truths.issuperset(sources):
+                    raise NotImplementedError(str(node.target))
+                values[node] = torch.cat([values[source].reshape(-1) for source in sources])
+                joined.add(node)
+            elif name == "eq" and node.args[0] is node.args[1]:  # isfinite asks whether a number is one
+                values[node] = _finite(arguments[0])
+            elif is_truth and name in MARGINS and joined.isdisjoint(sources):
+                values[node] = MARGINS[name](*arguments, **keywords)
+            elif is_truth or of_truths:
+                raise NotImplementedError(str(node.target))
+            else:
+                values[node] = node.target(*arguments, **keywords)
+            truths.update([node] * is_truth)
+    raise AssertionError("a graph ends with its output")
+
+
+def _apart(a: Tensor, b: Any) -> Tensor:
+    if b in (torch.inf, -torch.inf):
+        return _finite(a)
+    raise NotImplementedError("ne")  # no margin says by how much two numbers differ and may
+
+
+def _finite(value: Tensor) -> Tensor:
+    return 1 + 0 * value  # a value with bounds is finite
+
+
+# an operator whose result is a truth ↦ by how much it holds; arrangements of truths are those of their margins
+MARGINS: dict[str, Callable[..., Tensor]] = {
+    "le": lambda a, b: b - a, "lt": lambda a, b: b - a, "ge": lambda a, b: a - b, "gt": lambda a, b: a - b,
+    "eq": lambda a, b: -(a - b).abs(), "ne": _apart, "isfinite": _finite,
+    "bitwise_or": torch.maximum, "logical_or": torch.maximum, "bitwise_not": torch.neg, "logical_not": torch.neg,
+} | {
+    name: getattr(torch.ops.aten, name) for name in ("select", "slice", "view", "unsqueeze", "squeeze", "stack", "cat")
+}  # fmt: skip
+
+
+def _descended(margin: Callable[[Tensor, Tensor], Tensor], points: Tensor, lower: Corner, upper: Corner) -> Tensor:
+    """Where steps down the slope of a margin lead from the points at which it is least."""
+    with torch.no_grad():
+        least = margin(points[:, 0], points[:, 1:]).amin(-1).argsort()[:256]
+    at, width = points[least], upper - lower
+    for k in range(DESCENTS):
+        leaf = at.clone().requires_grad_()
+        with torch.enable_grad():
+            (slope,) = torch.autograd.grad(margin(leaf[:, 0], leaf[:, 1:]).amin(-1).sum(), leaf, materialize_grads=True)
+        step = width * 0.1 / (k + 1) * (slope * width).sign()
+        at = torch.minimum(torch.maximum(at - step, lower), upper)
+    return at

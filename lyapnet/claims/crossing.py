@@ -1,0 +1,113 @@
+"""Where closed loops could violate a constraint: the level of V below which none does, and closed loops that do."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import DivergenceError, UsageError
+from lyapnet.base.types import Corner, Corners, PerState, State, Time
+from lyapnet.loop.rollout import Rollout
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget, minimum
+from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
+from lyapnet.prover.condition import DecreaseCondition, own_constraints
+from lyapnet.task.constraints import Constraints, names_of
+from lyapnet.task.problem import Problem
+from lyapnet.value.calculus import gradients
+
+SHELL = 1e-2  # 0 ≤ h ≤ SHELL, in which h = 0 is looked for
+LOOPS, FINER = 1000, 4  # closed loops, and steps in each Δt
+SURE = 1e-6  # h that is more than an error of theirs
+
+
+class Violation(NamedTuple):
+    """A state of X₀ whose closed loop violates a constraint, as Runge-Kutta steps have it."""
+
+    x0: list[float]
+    t: float
+    constraint: str
+    h: float
+
+
+def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], budget: Budget, enough: float) -> float:
+    """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ where that is empty.
+
+    A closed loop that starts with h ≤ 0 and keeps W below it keeps h ≤ 0: if some h_j became positive along it, then
+    h_j = 0 and ḣ_j ≥ 0 at the last time before at which h_j = 0.
+
+    Args:
+        enough: a level beyond which nothing is asked.
+
+    Raises:
+        UsageError: h has kinks or jumps, where it has no gradient.
+
+    Source: Blanchini, "Set invariance in control", Automatica 1999 (Nagumo's theorem).
+    """
+    if condition.constraints is None:
+        return float("inf")
+    constraints = own_constraints(condition.constraints, domain)
+    if unsmooth := constraints.operators & {*KINKS, *JUMPS, *CHOICES}:
+        raise UsageError(
+            f"Expected smooth constraints, got {' and '.join(sorted(map(str, unsmooth)))}; write a maximum as several "
+            "components."
+        )
+    loop, (lower, upper) = condition.closed_loop, (side[None] for side in domain)
+
+    def crossing(j: int, t: Time, x: State) -> PerState:
+        """At most 0 where 0 ≤ h_j ≤ SHELL and ḣ_j ≥ 0."""
+
+        def h(t: Time, x: State) -> Tensor:
+            return constraints(x)[..., j]
+
+        rate = (gradients(h, t, x)[1] * loop.system.dynamics(x, loop.policy(t, x))).sum(-1)
+        outside = (h(t, x) - SHELL / 2).abs() - (1 + 1e-6) * SHELL / 2
+        return torch.maximum(outside, -rate)
+
+    return _least(condition, (lower, upper), crossing, budget, enough)
+
+
+def beginning_level(
+    condition: DecreaseCondition, states: tuple[Corners, Corners], budget: Budget, enough: float
+) -> float:
+    """A lower bound of W where some h_j ≥ SURE on X₀, at t = 0; ∞ where X₀ is proved to keep the constraints.
+
+    States of X₀ that violate one may lie between all that are sampled.
+    """
+    if condition.constraints is None:
+        return float("inf")
+    h: Constraints = condition.constraints
+    return _least(condition, states, lambda j, t, x: SURE - h(x)[..., j], budget, enough)
+
+
+def _least(
+    condition: DecreaseCondition,
+    boxes: tuple[Corners, Corners],
+    where: Callable[[int, Time, State], PerState],
+    budget: Budget,
+    enough: float,
+) -> float:
+    """A lower bound of W on the parts of boxes where where(j, t, x) ≤ 0 for some constraint j."""
+    components = range(len(names_of(condition.constraints)))
+    return min(minimum(condition.height, *boxes, budget, partial(where, j), 0.0, enough) for j in components)
+
+
+def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.Generator | None) -> Violation | None:
+    """The worst violation of a constraint among closed loops from corners and samples of X₀, if there is one."""
+    constraints, horizon = problem.constraints, problem.horizon
+    if constraints is None:
+        return None
+    x0 = torch.cat([problem.initial_states.corners(), problem.initial_states.sample(LOOPS, generator)])
+    finer = problem.in_steps(steps=FINER * horizon.steps, dt=horizon.dt / FINER)
+    try:
+        with torch.no_grad():
+            trajectory = Rollout(finer, closed_loop.policy, "rk4", "backprop", held=False)(x0)
+    except DivergenceError:
+        return None
+    h = constraints(trajectory.x)
+    node, i, j = (int(k) for k in torch.unravel_index(h.argmax(), h.shape))
+    if float(h[node, i, j]) <= SURE:
+        return None
+    return Violation(x0[i].tolist(), float(trajectory.t[node]), constraints.names[j], float(h[node, i, j]))

@@ -1,0 +1,398 @@
+"""Certificates drawn as matplotlib figures: sampled states, two bounds, and slices of funnels and regions."""
+
+from collections.abc import Sequence
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from torch import Tensor
+
+from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
+from lyapnet.base.types import State, Value
+from lyapnet.claims import Counterexample, RegionClaim, SampledClaim, SoundClaim
+from lyapnet.claims.tables import floored
+from lyapnet.evaluation.figures import widest_axes
+from lyapnet.task.constraints import Constraints
+from lyapnet.task.sets import Box
+
+Slices = SoundClaim | RegionClaim  # what is drawn in slices
+
+NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
+
+
+# Sampled states
+
+
+def sampled_states(claim: SampledClaim, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
+    """Which sampled states of X₀ succeed, and in what the others fail, in the plane of its two widest components.
+
+    The other components of the states are left out: a projection. With one free component, numbers of states in bins.
+
+    Args:
+        labels: names of the states with their units.
+        headline: what is claimed.
+    """
+    axes_shown = widest_axes(initial_states)
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    panel = figure.subplots()
+    parts = _outcomes(claim)
+    if len(axes_shown) == 1:
+        x = [numpy_of(states[:, axes_shown[0]]) for states, _, _, _ in parts]
+        low, high = (float(side[axes_shown[0]]) for side in (initial_states.lower, initial_states.upper))
+        colours = [colour for _, _, colour, _ in parts]
+        panel.hist(x, 40, range=(low, high) if high > low else None, stacked=True, color=colours)
+        panel.set_ylabel("states")
+    else:
+        size = 2 + 60 / len(claim.states) ** 0.5
+        for states, _, colour, marker in parts:
+            x, y = (numpy_of(states[:, i]) for i in axes_shown)
+            panel.plot(
+                x, y, marker, color=colour, markersize=size if marker == "." else 4, markeredgewidth=0.8,
+                alpha=0.5 if marker == "." else 0.9, rasterized=True,
+            )  # fmt: skip
+        panel.add_patch(_rectangle(initial_states, axes_shown, linewidth=0.8))
+        panel.set_ylabel(labels[axes_shown[1]])
+    panel.set_xlabel(labels[axes_shown[0]])
+    shape = "s" if len(axes_shown) == 1 else None
+    handles = [
+        Line2D([], [], color=colour, marker=shape or marker, linestyle="none", label=f"{name}: {len(states)}")
+        for states, name, colour, marker in parts
+    ]
+    legend_below(figure, handles, columns=2)
+    hidden = [_name(labels[i]) for i in range(len(labels)) if initial_states.widths[i] > 0 and i not in axes_shown]
+    projected = f"\nprojected along {', '.join(hidden)}" if hidden else ""
+    panel.set_title(f"{headline}{projected}", fontsize=8)
+    return figure
+
+
+def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
+    """(states, what became of them, colour, marker), successes first so that failures are drawn over them.
+
+    A state that fails in more than one event counts for the first of them.
+    """
+    decrease, terminal, cost, constraints, success = claim.held.unbind(-1)
+    parts, left = [(claim.states[success], "success", SKY, ".")], ~success
+    limits = claim.tolerances
+    failed = (
+        ("violates a constraint", GREY, "D"),
+        (f"‖x(T)‖ > {limits.radius}", PURPLE, "v"),
+        ("V does not fall", ORANGE, "s"),
+        (f"J > {1 + limits.cost:g} V(0, x₀)", VERMILION, "x"),
+    )
+    for style, held in zip(failed, (constraints, terminal, decrease, cost), strict=True):
+        parts.append((claim.states[left & ~held], *style))
+        left = left & held
+    return [part for part in parts if len(part[0])]
+
+
+# Funnels
+
+
+def funnel(
+    claim: SoundClaim,
+    V: Value,
+    initial_states: Box,
+    goal: State,
+    labels: Sequence[str],
+    constraints: Constraints | None = None,
+) -> Figure:
+    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
+
+    One state is drawn over time; two at five times; more at t = 0 and t = T in slices through the goal, along the pairs
+    of the four widest states of X₀, all other states as there. States that the claim leaves out are not shown.
+
+    Args:
+        V, initial_states, goal, labels: of the states that the claim is about.
+        constraints: what they exclude is hatched.
+    """
+    seen = _seen(claim)
+    figure, panels = _slices(claim, initial_states)
+    handles: dict[str, Artist] = {}
+    for panel, pair in panels:
+        if len(seen) == 1:
+            _draw_over_time(panel, claim, V, initial_states, labels[0], handles)
+        else:
+            levels = _levels(claim, fine=len(seen) == 2)
+            _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
+            _draw_violation(panel, claim, pair, handles)
+    legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
+    amount = "all" if claim.volume_share == 1 else floored(claim.volume_share)
+    share = f"{amount} of X₀ in the funnel" if claim.volume_share else "no funnel proved"
+    figure.suptitle(f"{claim.verdict}: {share}, α = {claim.alpha:g}, δ = {claim.delta:.3g}", fontsize=9)
+    return figure
+
+
+# Regions of attraction
+
+
+def region(
+    claim: RegionClaim,
+    V: Value,
+    initial_states: Box,
+    goal: State,
+    labels: Sequence[str],
+    constraints: Constraints | None = None,
+    paths: Tensor | None = None,
+) -> Figure:
+    """The proved region {V(0, ·) ≤ ρ} in D with X₀, the counterexample and what was left undecided.
+
+    More than two states are drawn in slices through the goal, as those of a funnel.
+
+    Args:
+        V, initial_states, goal, labels, constraints: as of a funnel.
+        paths: (times, k, n), closed loops that begin in the region, where it is one of two states.
+    """
+    figure, panels = _slices(claim, initial_states)
+    handles: dict[str, Artist] = {}
+    levels = _levels_of_region(claim)
+    for panel, pair in panels:
+        if len(_seen(claim)) == 1:
+            _draw_over_state(panel, claim, V, initial_states, goal, labels, levels, handles)
+            continue
+        _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
+        if paths is not None:
+            x, y = (numpy_of(paths[..., k]) for k in pair)
+            name = f"closed loops under u(0, x){', not pushed' if claim.disturbance is not None else ''}"
+            name += "" if claim.plants is None else ", each of another plant"
+            line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
+            handles.setdefault("closed loops", line)
+    legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
+    what = "region of attraction" if claim.disturbance is None else "region, however pushed"
+    what += "" if claim.plants is None else " of each plant"
+    share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the {what}"
+    proved = claim.rho > -float("inf")
+    figure.suptitle(f"{claim.verdict}: {share if proved else 'no region proved'}", fontsize=9)
+    return figure
+
+
+def _draw_over_state(
+    panel: Axes, claim: RegionClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    levels: Sequence["Level"], handles: dict[str, Artist],
+) -> None:  # fmt: skip
+    """V(0, ·) over the one state that a claim is about, with levels and X₀."""
+    (i,) = _seen(claim)
+    states = goal.repeat(401, 1)
+    states[:, i] = torch.linspace(float(claim.states.lower[i]), float(claim.states.upper[i]), 401).to(goal)
+    with torch.no_grad():
+        x, value = numpy_of(states[:, i]), numpy_of(V(states.new_zeros(401), states))
+    handles["V"] = panel.plot(x, value, color="black", linewidth=1.2, label="V(0, x)")[0]
+    for _, level, colour, name, proved in levels:
+        handles[name] = panel.axhline(level, color=colour, linestyle="-" if proved else ":", label=name)
+        if proved:
+            panel.fill_between(x, value, level, where=(value <= level).tolist(), color=colour, alpha=0.25)
+    ends = [float(initial_states.lower[i]), float(initial_states.upper[i])]
+    handles["X₀"] = panel.plot(ends, [0, 0], color="black", linewidth=4, label="X₀", clip_on=False)[0]
+    panel.set(xlim=x[[0, -1]], xlabel=labels[i], ylabel="V(0, x)")
+
+
+def _levels_of_region(claim: RegionClaim) -> list["Level"]:
+    """The region, where it ends with a disturbance, and the level that is wanted where it is higher."""
+    name = "V(0, x) ≤ ρ: never left" + (", and attracted" if claim.disturbance is None else "")
+    proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
+    if proved and claim.disturbance is not None:
+        proved += [Level(0.0, claim.hole, ORANGE, "V(0, x) ≤ c: entered, then never left", proved=True)]
+    wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
+    return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+# Two sides
+
+
+def two_sided(
+    value: Tensor, guaranteed: Tensor, least: Tensor, optimum: Tensor | None, headline: str, whose: str = "any control"
+) -> Figure:
+    """Both bounds over V(0, x₀), relative to it, with the optima between them.
+
+    Args:
+        value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,).
+        optimum: of the first few of them.
+        whose: of which controls the bound from below is.
+    """
+    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    panel = figure.subplots()
+    order = value.argsort()
+    order = order[(value > 0)[order] & least.isfinite()[order]]
+    V, upper, lower = (numpy_of(y[order]) for y in (value, guaranteed, least))
+    panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
+    panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
+    panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label=f"least: {whose} costs at least")
+    if optimum is not None:
+        first = order[order < len(optimum)]
+        some, best = numpy_of(value[first]), numpy_of(optimum[first])
+        panel.plot(some, best / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
+    panel.axhline(1, color=GREY, linewidth=0.6)
+    middle = len(V) // 4  # cheaper states, where δT and κ weigh most, may leave the picture
+    if len(V):
+        panel.set_ylim(min(0.9, lower[middle] / V[middle]), max(1.1, upper[middle] / V[middle]))
+        panel.set_xlim(0, V[-1])
+    panel.set(xlabel="V(0, x₀)", ylabel="cost / V(0, x₀)")
+    panel.set_title(headline, fontsize=8)
+    legend_below(figure, panel, columns=2)
+    return figure
+
+
+# Slices
+
+
+class Level(NamedTuple):
+    """A sublevel set of V(t, ·) that is drawn."""
+
+    t: float
+    level: float
+    colour: str
+    name: str
+    proved: bool
+
+
+def _seen(claim: Slices) -> list[int]:
+    """The states that a claim is about."""
+    return [k for k in range(claim.states.dimension) if k not in claim.left_out]
+
+
+def _slices(claim: Slices, initial_states: Box) -> tuple[Figure, list[tuple[Axes, tuple[int, int]]]]:
+    """A figure, and a panel for each pair of states that is shown."""
+    seen = _seen(claim)
+    pairs = [(seen[0], seen[-1])] if len(seen) <= 2 else list(combinations(_telling(initial_states, seen), 2))
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(zip(figure.subplots(rows, columns, squeeze=False).flat, pairs, strict=True))
+
+
+def _draw_slice(
+    panel: Axes, claim: Slices, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    pair: tuple[int, int], levels: Sequence[Level], handles: dict[str, Artist], constraints: Constraints | None,
+) -> None:  # fmt: skip
+    """One slice; what is new in it is added to the handles of the legend."""
+    i, j = pair
+    others = [k for k in range(len(labels)) if k not in (*pair, *claim.left_out)]
+    grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
+    states = goal.repeat(201, 201, 1)
+    states[..., i], states[..., j] = torch.meshgrid(*(axis.to(states) for axis in grid), indexing="ij")
+    axes = [numpy_of(axis) for axis in grid]
+    for t, level, colour, name, proved in levels:
+        with torch.no_grad():
+            excess = numpy_of(V(states.new_tensor(t).expand(201, 201), states) - level).T
+        _draw_sublevel(panel, axes, excess, colour, filled=proved and not t, style="-" if proved else ":")
+        handles.setdefault(name, Line2D([], [], color=colour, linestyle="-" if proved else ":", label=name))
+    if constraints is not None:
+        _draw_excluded(panel, axes, numpy_of(constraints.worst(states)).T, handles)
+    through = bool(((initial_states.lower <= goal) & (initial_states.upper >= goal))[others].all())
+    name = "X₀" if through else "X₀, projected"
+    box = panel.add_patch(_rectangle(initial_states, pair, linestyle="--" if through else ":", label=name))
+    handles.setdefault(name, box)
+    if len(claim.undecided):
+        name = "undecided, some of it" + (" (projected onto the slice)" if others else "")
+        x, y = (numpy_of(claim.undecided[:, 1 + k]) for k in pair)
+        (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
+        handles.setdefault(name, points)
+    if claim.counterexample is not None:
+        _mark(panel, claim.counterexample, claim.states, goal, pair, handles)
+    (star,) = panel.plot(*goal[[i, j]].tolist(), "*", color=GREEN, markersize=6, label="goal", linestyle="none")
+    handles.setdefault("goal", star)
+    panel.set(xlim=axes[0][[0, -1]], ylim=axes[1][[0, -1]], xlabel=labels[i], ylabel=labels[j])
+    if others:
+        panel.set_title(f"slice: {_held([_name(labels[k]) for k in others], goal[others])}", fontsize=8)
+
+
+def _draw_excluded(panel: Axes, grid: Sequence[np.ndarray], worst: np.ndarray, handles: dict[str, Artist]) -> None:
+    """Where some h > 0, hatched."""
+    if worst.max() > 0:
+        levels = [0, max(1.0, 2 * float(worst.max()))]
+        panel.contourf(*grid, worst, levels=levels, colors=["none"], hatches=["////"])
+        panel.contour(*grid, worst, levels=[0], colors=["black"], linewidths=0.8)
+        name = "excluded by a constraint"
+        handles.setdefault(name, Patch(facecolor="none", edgecolor="black", hatch="////", label=name))
+
+
+def _draw_violation(panel: Axes, claim: SoundClaim, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
+    """Where the closed loop begins that violates a constraint."""
+    if claim.violation is not None:
+        name = f"a closed loop from here violates one, t = {claim.violation.t:.3g} s"
+        x, y = (claim.violation.x0[k] for k in pair)
+        (point,) = panel.plot(x, y, "P", color=VERMILION, markersize=6, label=name, linestyle="none")
+        handles.setdefault(name, point)
+
+
+def _levels(claim: SoundClaim, fine: bool) -> list[Level]:
+    """The funnel at some times, and the level that is wanted."""
+    times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
+    at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
+    funnel = [
+        Level(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s", proved=True)
+        for t, colour in at
+    ]
+    wanted = Level(0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved", proved=False)
+    return (funnel if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+def _draw_sublevel(
+    panel: Axes, grid: Sequence[np.ndarray], excess: np.ndarray, colour: str, filled: bool, style: str = "-"
+) -> None:
+    """The set in which the excess is at most 0."""
+    if filled and excess.min() <= 0:
+        panel.contourf(*grid, excess, levels=[excess.min() - 1, 0], colors=[colour], alpha=0.25)
+    if excess.min() < 0 < excess.max():  # else matplotlib warns that there is no line to draw
+        panel.contour(*grid, excess, levels=[0], colors=[colour], linewidths=1.2, linestyles=style)
+
+
+def _draw_over_time(
+    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, label: str, handles: dict[str, Artist]
+) -> None:
+    low, high = float(claim.states.lower[0]), float(claim.states.upper[0])
+    t, x = (torch.linspace(*ends, 201).to(initial_states.lower) for ends in ((0, claim.duration), (low, high)))
+    if claim.volume_share:
+        with torch.no_grad():
+            excess = V(t[None].expand(201, 201), x[:, None, None].expand(201, 201, 1)) - claim.rho - claim.delta * t
+        _draw_sublevel(panel, [numpy_of(t), numpy_of(x)], numpy_of(excess), BLUE, filled=True)
+        handles["funnel"] = Patch(color=BLUE, alpha=0.4, label="V(t, ·) ≤ ρ + δt")
+    ends = [float(initial_states.lower[0]), float(initial_states.upper[0])]
+    handles["X₀"] = panel.plot([0, 0], ends, color="black", linewidth=4, label="X₀", clip_on=False)[0]
+    if (found := claim.counterexample) is not None:
+        name = "condition fails"
+        handles[name] = panel.plot(found.t, found.x[0], "x", color=VERMILION, label=name, linestyle="none")[0]
+    panel.set(xlim=(0, claim.duration), ylim=(low, high), xlabel="time (s)", ylabel=label)
+
+
+def _held(names: Sequence[str], values: State) -> str:
+    """Where a slice holds the states that it does not show: a = b = 0, or a = 1, b = 2."""
+    if not values.any():
+        return f"{' = '.join(names)} = 0"
+    return ", ".join(f"{name} = {value:.3g}" for name, value in zip(names, values.tolist(), strict=True))
+
+
+def _mark(
+    panel: Axes, found: Counterexample, states: Box, goal: State, pair: tuple[int, int], handles: dict[str, Artist]
+) -> None:
+    """The counterexample: filled near the slice, hollow where only its projection lies in it."""
+    widths, away = states.widths.tolist(), (torch.tensor(found.x).to(goal) - goal).abs().tolist()
+    near = all(x <= NEAR * widths[k] for k, x in enumerate(away) if k not in pair)
+    name = f"condition fails, t = {found.t:.3g} s" + ("" if near else " (projected onto the slice)")
+    style = {"markerfacecolor": VERMILION if near else "none", "color": VERMILION, "markersize": 6}
+    (point,) = panel.plot(found.x[pair[0]], found.x[pair[1]], "X", label=name, linestyle="none", **style)
+    handles.setdefault(name, point)
+
+
+def _telling(initial_states: Box, seen: Sequence[int]) -> list[int]:
+    """The four widest states of X₀ among some, in their order."""
+    widest = initial_states.widths.argsort(descending=True, stable=True).tolist()
+    return sorted([i for i in widest if i in seen][:4])
+
+
+def _rectangle(box: Box, axes: Sequence[int], **style) -> Rectangle:
+    (left, bottom), (width, height) = (side[list(axes)].tolist() for side in (box.lower, box.widths))
+    return Rectangle(
+        (left, bottom), width, height, fill=False, edgecolor=GREY if "label" not in style else "black", **style
+    )
+
+
+def _name(label: str) -> str:
+    """A label without its unit."""
+    return label.partition(" (")[0]

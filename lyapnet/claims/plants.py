@@ -1,0 +1,194 @@
+"""One law, made for one plant, on all plants of a box of parameters: as one closed loop, whose parameters stay."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.contracts import copied
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.types import Control, PerState, State, Time
+from lyapnet.controller.controller import Controller
+from lyapnet.experiment.assembly.classes import float64_defaults, section
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.task.constraints import OfFirstStates
+from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import PolicyOutput, ValuePolicy
+
+OPTION = "--parameter"
+TRIED = 8  # states at which plants are held against systems built with their parameters
+
+
+@dataclass(frozen=True)
+class Plants:
+    """ẋ = f(x; p) + g(x; p)u(x) for each constant p of a box P, where u and V were made for one plant, the nominal one.
+
+    With z = (x, p) and ṗ = 0 that is one closed loop of a system with constants, as a family is. Unlike those of a
+    family, u and V are told x alone: what the law knows of f, g and R is the nominal plant's, another object than the
+    one that p is read in.
+    """
+
+    system: FamilySystem  # in z
+    nominal: Mapping[str, float]  # what each parameter is in the plant that u and V were made for
+    box: Box  # P, (k,), in the order of the nominal ones
+
+    @property
+    def ranges(self) -> dict[str, list[float]]:
+        """The ends of P by name."""
+        ends = torch.stack([self.box.lower, self.box.upper], -1).tolist()
+        return dict(zip(self.nominal, ends, strict=True))
+
+    def around(self, states: Box) -> Box:
+        """A box of states beside P.
+
+        Raises:
+            UsageError: it has another number of states.
+        """
+        n = self.system.system.n
+        if states.dimension != n:
+            raise UsageError(f"Expected a set of {n} states, got {states.dimension}; give bounds for each state.")
+        return Box(
+            torch.cat([states.lower.double(), self.box.lower]), torch.cat([states.upper.double(), self.box.upper])
+        )
+
+    def pushed(self, w: Tensor) -> Tensor:
+        """Pushes on ẋ as pushes on ż: none on ṗ."""
+        return torch.cat([w, w.new_zeros(self.box.dimension)])
+
+    def all_of(self, loop: ClosedLoop, problem: Problem) -> tuple[ClosedLoop, Problem]:
+        """The closed loop of the nominal plant and its problem, as those of all plants in z."""
+        assert isinstance(loop.policy, ValuePolicy)
+        inside = self.problem(problem)
+        return ClosedLoop(inside, NominalLaw(inside, loop.policy)), inside
+
+    def problem(self, problem: Problem) -> Problem:
+        """The problem in z: the cost, the controls and the constraints of the nominal plant, and X₀ × P."""
+        n, k = self.system.system.n, self.box.dimension
+        center = self.box.center
+        cost = FamilyCost(problem.cost, center.new_zeros(n, k), center)
+        h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
+        return problem.replaced(
+            system=self.system, cost=cost, initial_states=self.around(problem.initial_states), constraints=h
+        )
+
+
+class NominalValue(ValueFunction):
+    """V(t, x) as a function of (t, z), z = (x, p), that no p changes."""
+
+    def __init__(self, V: ValueFunction, n: int):
+        super().__init__()
+        self.V, self.n = V, n
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.V(t, x[..., : self.n])
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        value, slope = self.V.value_and_state_gradient(t, x[..., : self.n])
+        return value, beside_zeros(slope, x)
+
+
+class NominalLaw(ValuePolicy):
+    """u(t, x) as a function of (t, z) that no p changes.
+
+    Args:
+        problem: in z.
+        policy: the law of the nominal plant.
+    """
+
+    def __init__(self, problem: Problem, policy: ValuePolicy):
+        super().__init__(problem, NominalValue(policy.V, policy.system.n))
+        self.policy, self.n, self.held, self.origin = policy, policy.system.n, policy.held, policy.origin
+
+    def forward(self, t: Time, x: State) -> Control:
+        return self.policy(t, x[..., : self.n])
+
+    def with_value(self, t: Time, x: State) -> PolicyOutput:
+        u, value, slope = self.policy.with_value(t, x[..., : self.n])
+        return PolicyOutput(u, value, beside_zeros(slope, x))
+
+
+def beside_zeros(slope: Tensor, z: Tensor) -> Tensor:
+    """A gradient in x as one in z of what no p changes."""
+    return torch.cat([slope, torch.zeros_like(z[..., slope.shape[-1] :])], -1)
+
+
+def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> Plants:
+    """The plants of a controller's system whose parameters lie between these ends, held against what the constructor
+    builds with them.
+
+    Args:
+        ranges: name of a constructor's argument, which f and g read as self.NAME ↦ [lower, upper].
+
+    Raises:
+        UsageError: it is about a family already; or a parameter is none of the system, is derived from in the
+            constructor or read by neither f nor g; or the constructor refuses one of its values.
+    """
+    if controller.system.constants:
+        raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
+    system = copied(controller.system)  # of its own: nothing that is set in it reaches the law
+    _require_arguments(system, ranges)
+    lower, upper = (torch.tensor([ends[i] for ends in ranges.values()], dtype=torch.float64) for i in (0, 1))
+    plants = Plants(
+        FamilySystem(system, list(ranges), [""] * len(ranges)),
+        {name: getattr(system, name, math.nan) for name in ranges},
+        Box(lower, upper),
+    )
+    X0 = plants.around(controller.initial_states)
+    z = torch.cat([X0.lower[None], X0.upper[None], X0.sample(TRIED, torch.Generator().manual_seed(0)).double()])
+    check_members(plants.system, _builder(controller), z, OPTION)
+    return plants
+
+
+def _builder(controller: Controller) -> Callable[[Mapping[str, float]], ControlAffineSystem]:
+    """How the constructor of a controller's system builds it with other parameters, in the controller's precision."""
+    cls, given, dtype = type(controller.system), controller.parameters, controller.initial_states.lower.dtype
+
+    def build(values: Mapping[str, float]) -> ControlAffineSystem:
+        with section(OPTION), float64_defaults():
+            return cls(**{**given, **values}).to(dtype).double()
+
+    return build
+
+
+def _require_arguments(system: ControlAffineSystem, names: Mapping[str, Any]) -> None:
+    """Refuse what is no argument of a system's constructor."""
+    cls = type(system)
+    known = [name for name in inspect.signature(cls).parameters if not name.startswith(PREFIX)]
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known, "choose one.")
+            raise UsageError(
+                f"Expected {OPTION} among the arguments of {cls.__name__} ({', '.join(known) or 'none'}), got {name}; "
+                f"{hint}"
+            )
+
+
+def parse_parameters(named: Sequence[str]) -> dict[str, list[float]]:
+    """The ends of each parameter's interval, by its name, from "mass=0.9:1.1".
+
+    Raises:
+        UsageError: what is named is no interval of finite numbers, or stands there twice.
+    """
+    found = dict[str, list[float]]()
+    for text in named:
+        name, _, interval = text.partition("=")
+        try:
+            lower, upper = (float(end) for end in interval.split(":"))
+        except ValueError as error:
+            raise UsageError(
+                f"Expected {OPTION} NAME=LOWER:UPPER with two numbers, got {text!r}; for example mass=0.9:1.1."
+            ) from error
+        if not -math.inf < lower <= upper < math.inf:
+            raise UsageError(f"Expected {OPTION} {name}=LOWER:UPPER, LOWER ≤ UPPER and finite, got {text!r}; mend it.")
+        if name in found:
+            raise UsageError(f"Expected {OPTION} once for each parameter, got {name} twice; leave one of them out.")
+        found[name] = [lower, upper]
+    return found

@@ -1,0 +1,233 @@
+"""What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.contracts import Memory, called, check_function, check_memory, reaches_own_code
+from lyapnet.base.contracts.batch_sizes import check_batch_sizes
+from lyapnet.base.errors import UsageError
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import Corner, Corners, State, Time, Value
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.branches import JUMPS
+from lyapnet.prover.condition import DecreaseCondition, OwnOperations, own_constraints
+from lyapnet.task.problem import TRIED, Problem
+from lyapnet.task.sets import Box
+from lyapnet.value.calculus import ValueFunction
+
+NOTHING = 1e-200  # bounds of zero have the least room for rounding
+
+
+def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memory:
+    """Trace V and h once, for every question that is asked of them, after a look at what they are.
+
+    Returns:
+        What the closed loop holds, to be held against it once it was called more.
+    """
+    loop, h = condition.closed_loop, condition.constraints
+    memory = check_loop(loop, h, sample)
+    own = OwnOperations(condition.V, sample)
+    if h is not None:
+        condition.constraints = own_constraints(h, sample)
+    check_states(condition, sample)
+    memory.check()
+    condition.V = own
+    return memory
+
+
+def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Corner, Corner]) -> Memory:
+    """Refuse a closed loop with a memory, or one that is another in batches of another size.
+
+    It is called before it is traced: what it computes lazily is there by then.
+    """
+    lower, upper = domain
+    points = _points(lower, upper)
+    ends = Box(lower, upper).ends(TRIED)
+
+    def everything(t: Tensor, x: Tensor) -> tuple[Tensor, ...]:
+        policy, V = loop.policy, loop.V
+        results = [loop.slope(x, policy(t, x)), loop.cost.terminal(x)]
+        results += [] if V is None else [V(t, x)]
+        results += [] if constraints is None else [constraints(x)]
+        # what their base classes make of V(t, x) and policy(t, x) needs no second look
+        if V is not None and type(V).value_and_state_gradient is not ValueFunction.value_and_state_gradient:
+            results.append(V.value_and_state_gradient(t, x)[1])
+        if reaches_own_code(getattr(type(policy), "with_value", None)):
+            results.append(loop.control(t, x).u)
+        return tuple(results)
+
+    def call(points: Tensor) -> None:
+        called("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+
+    parts = [loop.system, loop.cost, loop.V, constraints, loop.policy]
+    named = {type(part).__name__: part for part in parts if part is not None}
+    memory = check_memory(named, lambda: call(points), lambda: call(ends))
+    if reaches_own_code(named):
+        why = check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
+        if why is not None:
+            logging.getLogger(__name__).warning(
+                "note: batches of 1, 2 and %d states are tried, no others: %s", TRIED, why
+            )
+    return memory
+
+
+def _points(lower: Corner, upper: Corner) -> Tensor:
+    """Points of a box at random."""
+    share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
+    return lower + (upper - lower) * share
+
+
+def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
+    """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
+    lower, upper = domain
+    _require_constant(condition.closed_loop, domain)
+    points = _points(lower, upper)
+
+    def all_three(t: Tensor, x: Tensor) -> Tensor:
+        return torch.stack([condition(t, x), condition.height(t, x), condition.closed_loop.cost.terminal(x)], -1)
+
+    t, x = points[:, 0], points[:, 1:]
+    check_function("the condition, V and φ", all_three, [t, x], (3,), differentiable=False, any_size=False)
+    if condition.constraints is not None:
+        k = len(condition.constraints.names)
+        check_function(
+            "h(x) with a number for each name", condition.constraints, [x], (k,), differentiable=False, any_size=False
+        )
+    with torch.no_grad():
+        own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
+        if not _close(own, condition.V(t, x)):
+            raise UsageError(
+                "Expected V to be one function of (t, x), got another one than at first; read nothing else."
+            )
+        check_parts(condition.closed_loop, t, x)
+
+
+def check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
+    """Refuse a closed loop that runs as another one than its parts say, and a cost below 0, at some states."""
+    system, u = loop.system, loop.policy(t, x)
+    parts = torch.cat([system.f(x) + apply(system.g(x), u), loop.cost.running(x, u)[..., None]], -1)
+    if not _close(loop.slope(x, u), parts) or not _close(loop.control(t, x).u, u):
+        raise UsageError(
+            f"Expected a closed loop that runs by ẋ = f(x) + g(x)u, ℓ and u = policy(t, x), got another one; make "
+            f"{type(system).__name__}.dynamics, {type(loop.policy).__name__}.with_value and "
+            f"{type(loop).__name__}.slope agree with these each time."
+        )
+    cost = parts[..., -1]
+    least = int(cost.argmin())
+    if cost[least] < -1e-9 * cost.abs().max():
+        raise UsageError(
+            f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there: "
+            "correct the cost, or choose a smaller set."
+        )
+
+
+def require_goal(problem: Problem, claim: str) -> None:
+    """Refuse a claim that is about a goal, for a task that has none.
+
+    Args:
+        claim: the name of the certificate, for the message.
+
+    Raises:
+        UsageError: the task has no goal; says why.
+    """
+    if not problem.has_goal:
+        raise UsageError(
+            f"Expected a task with a goal, towards which V falls, for a {claim} certificate, got none: "
+            f"{problem.no_goal}; lyapnet certify tube bounds the cost of such a task."
+        )
+
+
+def _close(one: Tensor, other: Tensor) -> bool:
+    return one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6 * float(other.abs().max()))
+
+
+def require_continuous(V: Value, x_low: State, x_high: State) -> None:
+    """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
+    lower, upper = at_time(0.0, x_low, x_high)
+    jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
+    if jumps:
+        raise UsageError(
+            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write it with "
+            "relu, abs, maximum, minimum or clamp."
+        )
+
+
+def at_time(t: float, lower: State, upper: State) -> tuple[Corners, Corners]:
+    """The box {t} × [lower, upper] as one of (t, x)."""
+    time = torch.tensor([t], dtype=lower.dtype)
+    return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
+
+
+def without(states: Box, left_out: Sequence[int]) -> Box:
+    """The slice of a box at 0 of the states that are left out, in float64."""
+    lower, upper = states.lower.double(), states.upper.double()
+    seen = torch.tensor([i not in left_out for i in range(states.dimension)])
+    return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
+
+
+def at_centre(states: Box, axes: Iterable[int]) -> Box:
+    """The slice of a box in the middle of some axes."""
+    chosen = torch.tensor([i in axes for i in range(states.dimension)])
+    return Box(*(torch.where(chosen, states.center, side) for side in (states.lower, states.upper)))
+
+
+def first_of(states: Box, n: int) -> Box:
+    """A box of the first n states."""
+    return Box(states.lower[:n], states.upper[:n])
+
+
+def beside(box: Box, states: Box) -> Box:
+    """A box of the first states with the ends of another along all others: the constants of a system."""
+    n = box.dimension
+    return Box(torch.cat([box.lower, states.lower[n:]]), torch.cat([box.upper, states.upper[n:]]))
+
+
+def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
+    """Refuse constants that move under the control law."""
+    constants = list(loop.system.constants)
+    if constants:
+        require_still(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
+
+
+def require_still(
+    moving: Callable[[Time, State], tuple[Tensor, ...]], domain: tuple[Corner, Corner], under: str = ""
+) -> None:
+    """Refuse constants of a system that move, by what would move them: D has no faces along them.
+
+    Args:
+        under: which controls may move them, in words.
+    """
+    bounds = BoundedFunction(moving, domain).bounds(*(end[None] for end in domain))
+    if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in bounds):
+        raise UsageError(f"Expected ẋ = 0 for the constants of a system{under}, got others; leave them out.")
+
+
+def domain_around(
+    states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
+) -> tuple[Corner, Corner]:
+    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+    if states.dimension != initial_states.dimension:
+        raise UsageError(
+            f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
+        )
+    outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
+    for i in constants:
+        outside[i] = states.lower[i] > initial_states.lower[i] or states.upper[i] < initial_states.upper[i]
+    outside[left_out] = False
+    if outside.any():
+        i = int(torch.nonzero(outside)[0])
+        raise UsageError(
+            f"Expected a set around X₀, got [{states.lower[i]:g}, {states.upper[i]:g}] around "
+            f"[{initial_states.lower[i]:g}, {initial_states.upper[i]:g}] at index {i}; choose a larger one."
+        )
+    return over_time(states, duration)
+
+
+def over_time(states: Box, duration: float) -> tuple[Corner, Corner]:
+    """[0, T] × a box as (lower, upper)."""
+    time = torch.tensor([0.0, duration], dtype=torch.float64)
+    return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])

@@ -1,0 +1,327 @@
+"""Certificates by proof of the receding law: a region of attraction."""
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torchdiffeq import odeint
+
+from lyapnet.base.contracts import copied
+from lyapnet.base.random_streams import CERTIFICATION, stream
+from lyapnet.base.types import Corner
+from lyapnet.claims import figures
+from lyapnet.claims.certificates import FROZEN, NOT_PROVED, Certificate
+from lyapnet.claims.plants import parse_parameters, plants_of
+from lyapnet.claims.preconditions import over_time
+from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
+from lyapnet.claims.region import RegionClaim, region_claim
+from lyapnet.claims.sound_certificate import (
+    however_pushed,
+    listed,
+    named_pushes,
+    parse_disturbance,
+    parse_set,
+)
+from lyapnet.claims.tables import floored
+from lyapnet.controller.controller import Controller
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.proof import Progress
+from lyapnet.value.policy import ValuePolicy
+
+NEARLY = 0.999  # of the least V on the boundary of D: a region that comes so close is as large as D lets it be
+PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the region they begin
+
+
+class RegionCertificate(Certificate):
+    """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium; with a
+    disturbance, to a smaller set around the goal, which none leaves. With plants, that is so for each of them.
+    """
+
+    kind: ClassVar[str] = "region"
+    picture: ClassVar[str] = "region.png"
+    labels: ClassVar[Mapping[str, str]] = {
+        "reason": "why",
+        "set": "D",
+        "states_left_out": "states that nothing depends on",
+        "region_volume_proved": "volume of the region, at least",
+        "set_volume_share": "share of D in the region, at least",
+        "volume_share": "share of X₀ in the region, at least",
+        "rho_wanted": "ρ for all of X₀",
+        "rho": "largest ρ proved",
+        "rim": "V(0, ·) on the boundary of D and of constraints, at least",
+        "decay": "λ, 1/s",
+        "parameters": "parameters of the plant, constant, anywhere in",
+        "nominal_parameters": "those that V and u were made for",
+        "disturbance": "disturbances, at most",
+        "ultimate_level": "c, V(0, ·) from some time on, at most",
+        "ultimate_volume": "volume of {V(0, ·) ≤ c}, at most",
+        "ultimate_extent": "box around {V(0, ·) ≤ c}",
+        "entered_within": "seconds to {V(0, ·) ≤ c}, at most",
+        "hole": "c, below which the contraction speaks",
+        "contraction_box": "B",
+        "contraction_rate": "κ, 1/s",
+        "equilibrium_offset": "distance of the equilibrium from the goal, at most",
+        "precision": "u is computed in",
+        "distance_left": "distance from the goal that rounding leaves in the end, at most",
+        "constraints": "constraints that no closed loop of the region violates",
+        "counterexample": "counterexample of lowest V",
+        "remaining_volume": "share of D undecided",
+        "boxes": "boxes",
+        "seconds": "seconds",
+        "fingerprint": "fingerprint of what was bounded",
+        "origin": "V and u",
+    }
+    claim: RegionClaim
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing more to prove in D: the region holds all of X₀, or comes up to the boundary."""
+        return self.verdict == "certified" or self.claim.rho >= NEARLY * self.claim.rim
+
+    def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
+        """The condition in plain arithmetic, {0} × D, and the level up to which it was to hold."""
+        claim = self.claim
+        loop, states, w = self._loop, claim.states, claim.disturbance
+        if claim.plants is not None:
+            states, w = claim.plants.around(states), None if w is None else claim.plants.pushed(w)
+        condition = RecedingDecrease(loop, claim.decay, w)
+        if claim.hole > 0:
+            around = None if claim.contraction is None else claim.contraction.box
+            condition.hole, condition.constraints = claim.hole, OutsideTheHole(condition.V, around, claim.hole)
+        return condition, over_time(states, 0.0), claim.rim
+
+    @property
+    def _loop(self) -> ClosedLoop:
+        """The closed loop in float64; of all plants, where the claim is about several."""
+        own, plants = copied(self.controller.closed_loop), self.claim.plants
+        return own if plants is None else plants.all_of(own, copied(self.controller.problem))[0]
+
+    def numbers(self) -> dict[str, Any]:
+        claim, names, found = self.claim, self.controller.system.state_names, self.claim.counterexample
+        proved, B, proof = claim.rho > -float("inf"), claim.contraction, claim.proof
+        around = {} if B is None else {
+            "hole": claim.hole, "contraction_box": [B.box.lower.tolist(), B.box.upper.tolist()],
+            "contraction_rate": B.rate, "equilibrium_offset": B.offset,
+            "contraction_coordinates": B.coordinates.tolist(), "contraction_fingerprint": B.fingerprint,
+        }  # fmt: skip
+        plants = claim.plants
+        pushed = {} if claim.disturbance is None else {"disturbance": self.pushes}
+        if plants is not None:
+            pushed |= {"parameters": plants.ranges, "nominal_parameters": dict(plants.nominal)}
+        if claim.extent is not None:
+            pushed |= {
+                "ultimate_level": claim.hole, "ultimate_volume": claim.ultimate_volume,
+                "entered_within": claim.entered_within,
+                "ultimate_extent": [claim.extent.lower.tolist(), claim.extent.upper.tolist()],
+            }  # fmt: skip
+        if claim.precision is not None:
+            around |= {"precision": claim.precision}
+            around |= {} if math.isnan(claim.distance_left) else {"distance_left": claim.distance_left}
+        searched = {} if proof is None else {
+            "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
+        }  # fmt: skip
+        return {
+            "decay": claim.decay, "rho": claim.rho if proved else None, "rho_wanted": claim.wanted, "rim": claim.rim,
+            "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
+            "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
+            "set_volume_share": claim.region_share, "region_volume_proved": claim.volume, "reason": claim.reason,
+            "constraints": list(claim.constraints) if proved else [],
+            "counterexample": found and {
+                "x": found.x, **claim.failing_plant, "condition": found.condition, "V": found.height
+            },
+            "seconds": claim.seconds, **around, **pushed, **searched,
+            **({"origin": self._origin} if self._origin else {}),
+        }  # fmt: skip
+
+    def in_words(self) -> str:
+        claim = self.claim
+        if claim.rho == -float("inf"):
+            return NOT_PROVED
+        names = self.controller.system.state_names
+        left_out = ", ".join(names[i] for i in claim.left_out)
+        kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
+        origin = f" {self._origin}" * bool(self._origin)
+        return (
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)}{self._of_plants} The "
+            f"volume of the region is at least {claim.volume:.6g}, in the units of the states; it holds at "
+            f"least {floored(claim.volume_share)} of X₀."
+            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
+            f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
+        )
+
+    def _end(self, kept: str) -> str:
+        """What the region is, and where closed loops end."""
+        claim, B, pushed = self.claim, self.claim.contraction, however_pushed(self.pushes)
+        plants, equilibrium = "for this model", "one equilibrium exponentially, for ever,"
+        if claim.plants is not None:
+            ends = ", ".join(f"{name} ∈ [{low!r}, {high!r}]" for name, (low, high) in claim.plants.ranges.items())
+            plants = f"for each plant of this model with constant {ends}"
+            equilibrium = "one equilibrium of their plant exponentially, for ever,"
+        if B is not None:
+            end = f"all go to {equilibrium} which is within {B.offset:.3g} of the goal (in the norm of x)"
+            if claim.precision is not None:
+                end = (
+                    f"all come within {claim.distance_left:.3g} of the goal (in the norm of x) as t → ∞, "
+                    f"exponentially, and stay so close, however each operation of u is rounded in {claim.precision}"
+                )
+            return (
+                f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants}: no "
+                f"closed loop that starts in it leaves it{kept}, and {end}."
+            )
+        assert claim.extent is not None
+        names, (lower, upper) = (
+            self.controller.system.state_names,
+            (side.tolist() for side in (claim.extent.lower, claim.extent.upper)),
+        )
+        seen = [i for i in range(len(names)) if i not in claim.left_out]
+        within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
+        return (
+            f"is never left under the receding law u(0, x), proved in continuous time {plants}, {pushed}: no "
+            f"closed loop that starts in it leaves it{kept}, and each comes to {{x ∈ D: V(0, x) ≤ c}}, c = "
+            f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
+            f"ultimate bound). That set lies in {within}. That closed loops come closer to the goal, or to rest, is "
+            f"not claimed."
+        )
+
+    @property
+    def _of_plants(self) -> str:
+        """What u and V know of the plants."""
+        if self.claim.plants is None:
+            return ""
+        made_for = ", ".join(f"{name} = {value!r}" for name, value in self.claim.plants.nominal.items())
+        return f" u and V are those made for {made_for}: they are not told which plant it is."
+
+    @property
+    def pushes(self) -> dict[str, float]:
+        """The disturbed states and how much their derivatives are pushed at most."""
+        return named_pushes(self.claim.disturbance, self.controller.system.state_names)
+
+    @property
+    def _origin(self) -> str:
+        """Where V and u were made elsewhere, what they are."""
+        policy = self.controller.closed_loop.policy
+        return policy.origin if isinstance(policy, ValuePolicy) else ""
+
+    def in_formulas(self) -> list[str]:
+        claim, B = self.claim, self.claim.contraction
+        rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
+        each = ""
+        if claim.plants is not None:
+            each = f", for each p = ({', '.join(claim.plants.nominal)}) ∈ P = {[*claim.plants.ranges.values()]}"
+        inside = f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''}"
+        rounded = ""
+        if claim.precision is not None:
+            rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
+        if self.pushes:
+            c = repr(claim.hole) if claim.hole > 0 else "c"
+            w = ", ".join(f"w({name}) = {w!r}" for name, w in self.pushes.items())
+            return [
+                f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
+                f"at each x ∈ D with {c} ≤ V ≤ {rho}{each}{rounded}",
+                inside,
+            ]
+        hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
+        box = "B" if B is None else f"B = [{B.box.lower.tolist()}, {B.box.upper.tolist()}]"
+        Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
+        return [
+            f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
+            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{each}{rounded}",
+            f"{inside},  V > {hole} > 0 on the boundary of {box}",
+            f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
+            f"continuous{each}{', without rounding' * bool(rounded)}; {Y}",
+        ]
+
+    def of_the_verdict(self) -> str:
+        found = self.claim.counterexample
+        why = {
+            "certified": "it does",
+            "falsified": "V does not fall so in the set that this would take "
+            f"(closed loops may {'stay in it' if self.pushes else 'go to the goal'} even so)",
+            "unknown": self.claim.reason,
+        }[self.verdict]
+        plant = "".join(f", {name} = {value:.6g}" for name, value in self.claim.failing_plant.items())
+        where = "" if found is None else f" At x = {listed(found.x)}{plant} it fails by {found.condition:.3g}."
+        but = f" but for {{V < {self.claim.hole!r}}}" if self.pushes and self.claim.hole > 0 else ""
+        return (
+            f"The verdict is on the claim that a sublevel set on which V falls so{but} holds all of X₀: {why}.{where}"
+        )
+
+    def figure(self) -> figures.Figure:
+        controller, problem = self.controller, self.controller.problem
+        labels = controller.system.state_labels
+        return figures.region(
+            self.claim, controller.V, problem.initial_states, problem.goal, labels, problem.constraints, self._paths()
+        )
+
+    def _paths(self) -> Tensor | None:
+        """Closed loops of the receding law over T from states just inside a region of two, (times, k, n); each of a
+        plant of its own, where it is about several.
+        """
+        claim, loop, horizon = self.claim, self.controller.closed_loop, self.controller.horizon
+        n, generator = claim.states.dimension, stream(0, CERTIFICATION)
+        if n - len(claim.left_out) != 2:  # elsewhere they would not lie in the slice
+            return None
+        x = claim.states.sample(20_000, generator).to(claim.states.lower)
+        t = x.new_zeros(())
+        with torch.no_grad():
+            share = self.controller.V(t, x) / claim.rho
+            x0 = x[(share <= 1) & (share > 1 - EDGE)][:PATHS]
+            if not len(x0):
+                return None
+            if claim.plants is not None:
+                loop = self._loop
+                x0 = torch.cat([x0, claim.plants.box.sample(len(x0), generator).to(x0)], -1)
+            times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
+            paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
+        return torch.as_tensor(paths)[..., :n]
+
+
+def region_certificate(
+    controller: Controller,
+    decay: float | None = None,
+    set: str | None = None,
+    seconds: float = 60.0,
+    workers: int = 1,
+    device: str = "cpu",
+    disturbance: Sequence[str] | None = None,
+    keep: str | None = None,
+    seed: int = 0,
+    report: Callable[[Progress], None] | None = None,
+    parameter: Sequence[str] | None = None,
+    *,
+    ray: str | None = None,
+    started: float | None = None,
+) -> RegionCertificate:
+    """The region of attraction of a controller's receding law.
+
+    Args:
+        decay: λ in 1/s; 1 % of 1/T if None.
+        set: D, as parse_set reads it; found if None.
+        seconds: when to stop undecided.
+        disturbance: STATE=w for each ẋ_i that is pushed by at most w.
+        keep: a file in which the proof is kept, and from which it goes on.
+        report: is told how far the proof is.
+        parameter: NAME=lower:upper for each parameter of the plant that may lie anywhere between.
+        ray: of Budget.
+        started: time.monotonic() from which the seconds count; now if None.
+    """
+    begun = time.monotonic() if started is None else started
+    budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
+    claim = region_claim(
+        controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
+        stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
+        disturbance=parse_disturbance(disturbance or (), controller),
+        plants=plants_of(controller, parse_parameters(parameter)) if parameter else None,
+    )  # fmt: skip
+    options = {
+        "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device,
+        "ray": ray, "disturbance": list(disturbance or ()) or None, "parameter": list(parameter or ()) or None,
+        "keep": keep, "seed": seed,
+    }  # fmt: skip
+    return RegionCertificate(controller, claim, options)

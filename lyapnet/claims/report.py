@@ -1,0 +1,216 @@
+"""Reports of certificates: the claim in words and formulas, its figures, and what it is about; JSON and Markdown."""
+
+import io
+import json
+import math
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from lyapnet.base.errors import UsageError
+from lyapnet.base.files import digest_of_file, write_atomically
+from lyapnet.base.provenance import versions
+from lyapnet.claims.certificates import Certificate
+from lyapnet.claims.tables import certificate_rows
+from lyapnet.controller.controller import Controller, parameters_of
+from lyapnet.experiment.config import Config
+from lyapnet.task.constraints import names_of
+from lyapnet.task.cost import MadeOfAnother, QuadraticCost
+from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+
+
+def require_writable(figure: Path | None, folder: Path | None, keep: str | None = None) -> None:
+    """Refuse what could not be written after the work; make the report's folder.
+
+    Raises:
+        UsageError: no folder for the figure or the kept proof, a format that cannot be drawn, or no report folder.
+    """
+    if keep is not None and not Path(keep).parent.is_dir():
+        raise UsageError(
+            f"Expected --keep in a folder that exists, got {keep!r}; make {str(Path(keep).parent)!r} first."
+        )
+    if figure is not None:
+        formats = Figure().canvas.get_supported_filetypes()
+        if figure.suffix.removeprefix(".") not in formats:
+            known = ", ".join(sorted(formats))
+            raise UsageError(f"Expected --figure as a file of {known}, got {str(figure)!r}; for example claim.png.")
+        if not figure.parent.is_dir():
+            raise UsageError(
+                f"Expected --figure in a folder that exists, got {str(figure)!r}; make {str(figure.parent)!r} first."
+            )
+    if folder is not None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(
+                f"Expected --report as a folder, got {str(folder)!r} ({error.strerror}); choose another."
+            ) from error
+
+
+def write_outputs(
+    certificate: Certificate, checkpoint: Path, command: str, figure: Path | None, folder: Path | None
+) -> Iterator[Path]:
+    """Write the figure and the report that are asked for, each whole or not at all; their paths, as they are written.
+
+    Args:
+        command: that makes the certificate again.
+    """
+    targets = [path for path in (figure, folder and folder / certificate.picture) if path]
+    picture = certificate.figure() if targets else Figure()
+    for path in targets:
+        write_figure(picture, path)
+        yield path
+    if folder is None:
+        return
+    content = report_of(certificate, checkpoint, command)
+    for name, text in (
+        ("report.json", json.dumps(content, indent=2, allow_nan=False)),
+        ("report.md", markdown(content)),
+    ):
+        write_atomically(folder / name, (text.rstrip() + "\n").encode())
+        yield folder / name
+
+
+def write_figure(picture: Figure, path: Path) -> None:
+    """Write a figure whole or not at all, in the format that the file's name says."""
+    buffer = io.BytesIO()
+    picture.savefig(buffer, dpi=150, format=path.suffix.removeprefix("."))
+    write_atomically(path, buffer.getbuffer())
+
+
+def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[str, Any]:
+    """Everything about a certificate as plain data."""
+    controller, result = certificate.controller, certificate.result
+    config, box, horizon = controller.config, controller.initial_states, controller.horizon
+    return {
+        "kind": certificate.kind,
+        "verdict": result["verdict"],
+        "claim": {
+            "words": certificate.in_words(), "formula": certificate.in_formulas(),
+            "verdict": certificate.of_the_verdict(),
+        },
+        "certificate": result,
+        "numbers": certificate_rows(result, certificate.labels),
+        "options": dict(certificate.options),
+        "checkpoint": {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
+        "experiment": config.experiment,
+        "system": _system(controller, config),
+        "states": controller.system.state_labels,
+        "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
+        "cost": _cost(controller, config),
+        "controls": _controls(controller, config),
+        "constraints": list(names_of(controller.problem.constraints)),
+        "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
+        "horizon": {"steps": horizon.steps, "dt": horizon.dt, "duration": horizon.duration},
+        "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},
+        "network": {"name": config.network.name, "parameters": sum(p.numel() for p in controller.V.parameters())},
+        "command": command,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions("torch"),
+        "figure": certificate.picture,
+    }  # fmt: skip
+
+
+# Markdown
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The report for a reader."""
+    claim, horizon = report["claim"], report["horizon"]
+    parameters = ", ".join(f"{name} = {value}" for name, value in report["system"]["parameters"].items())
+    about = {
+        "checkpoint": f"`{report['checkpoint']['path']}`",
+        "sha256": f"`{report['checkpoint']['sha256']}`",
+        "experiment": report["experiment"],
+        "system": f"{report['system']['name']}{f': {parameters}' if parameters else ''}",
+        "cost": ", ".join(f"{name} = {value}" for name, value in report["cost"].items()),
+        "controls": ", ".join(f"{name} = {value}" for name, value in report["controls"].items()) or "without limits",
+        **({"constraints": "; ".join(report["constraints"])} if report["constraints"] else {}),
+        "horizon": f"{horizon['steps']} steps of {horizon['dt']:g} s, T = {horizon['duration']:g} s",
+        "closed loop": f"policy {report['rollout']['policy']}, integrator {report['rollout']['method']}",
+        "network": f"{report['network']['name']}, {report['network']['parameters']} parameters",
+        **report["versions"],
+        "date": report["date"],
+    }
+    sections = [
+        f"# Certificate of {report['experiment']}: {report['kind']}, {report['verdict']}",
+        claim["words"],
+        "\n".join(["```text", *claim["formula"], "```"]),
+        f"**{report['verdict'].capitalize()}.** {claim['verdict']}",
+        f"![The claim, drawn]({report['figure']})",
+        "## Numbers",
+        "Rounded to nearest, shares downwards; in full in [report.json](report.json).",
+        _table(("", ""), report["numbers"]),
+        "## States",
+        _table(*_boxes(report)),
+        "## What it is about",
+        _table(("", ""), list(about.items())),
+        "## Again",
+        f"```bash\n{report['command']}\n```",
+    ]
+    return "\n\n".join(sections)
+
+
+def _boxes(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """X₀, and D where there is one, state by state."""
+    boxes = {"X₀": list(report["initial_states"].values())}
+    D = report["certificate"].get("set")
+    if D is not None and len(D[0]) == len(report["states"]):
+        boxes["D"] = D
+    rows = [
+        [label, *(f"[{lower[i]!r}, {upper[i]!r}]" for lower, upper in boxes.values())]
+        for i, label in enumerate(report["states"])
+    ]
+    return ["state", *boxes], rows
+
+
+def _table(heading: Any, rows: Any) -> str:
+    """A Markdown table."""
+    lines = [heading, ["---"] * len(heading), *rows]
+    return "\n".join(f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |" for line in lines)
+
+
+def _system(controller: Controller, config: Config) -> dict[str, Any]:
+    """Its name and its parameters, but for those of which there is a family."""
+    system = controller.system
+    if not isinstance(system, FamilySystem):
+        return {"name": _name(system), "parameters": controller.parameters}
+    parameters = parameters_of(system.system, config.system)
+    fixed = {name: value for name, value in parameters.items() if name not in config.family}
+    return {"name": f"family of {_name(system.system)}", "parameters": fixed}
+
+
+def _name(system: ControlAffineSystem) -> str:
+    """The name of a registered system, module:Class of any other."""
+    cls = type(system)
+    return next((name for name, known in SYSTEMS.items() if known is cls), f"{cls.__module__}:{cls.__qualname__}")
+
+
+def _controls(controller: Controller, config: Config) -> dict[str, Any]:
+    """The limits of U, None for none; of a set of the user's own its name; nothing where U is all of ℝᵐ."""
+    controls = controller.controls
+    if controls.limits is None:
+        return {"name": f"{type(controls).__module__}:{type(controls).__qualname__}", **config.controls.parameters}
+    if not controls.limited:
+        return {}
+    sides = (side.expand(controller.system.m).tolist() for side in controls.limits)
+    listed = ([limit if math.isfinite(limit) else None for limit in side] for side in sides)
+    return dict(zip(("lower", "upper"), listed, strict=True))
+
+
+def _cost(controller: Controller, config: Config) -> dict[str, Any]:
+    """The cost's matrices as the config has them, or its name and parameters; and what it is about."""
+    cost, words = controller.cost, list[str]()
+    while isinstance(cost, MadeOfAnother | FamilyCost):
+        moving = ", ".join(name for name in config.family if name.startswith(PREFIX))
+        words.append(cost.words if isinstance(cost, MadeOfAnother) else f"x* moved by {moving}" if moving else "")
+        cost = cost.cost
+    about = {"with": "; ".join(filter(None, words))} if any(words) else {}
+    if isinstance(cost, QuadraticCost):
+        return {"Q": config.cost.Q, "R": config.cost.R, "Q_T": config.cost.Q_T, **about}
+    cls = type(cost)
+    return {"name": f"{cls.__module__}:{cls.__qualname__}", **config.cost.parameters, **about}

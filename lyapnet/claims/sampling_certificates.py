@@ -1,0 +1,195 @@
+"""Certificates from sampled closed loops: a share of the samples, or a bound of the share of X₀."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+from lyapnet.base.random_streams import CERTIFICATION, stream
+from lyapnet.claims import figures
+from lyapnet.claims.certificates import Certificate
+from lyapnet.claims.preconditions import require_goal
+from lyapnet.claims.statistical import SampledClaim, StatisticalClaim, sampled_claim, statistical_claim
+from lyapnet.claims.tables import floored
+from lyapnet.controller.controller import Controller
+from lyapnet.loop.programs import ValueProgram
+from lyapnet.task.constraints import names_of
+
+
+class SampledCertificate(Certificate):
+    """The share of some states whose closed loop succeeds."""
+
+    kind: ClassVar[str] = "sampled"
+    picture: ClassVar[str] = "states.png"
+    labels: ClassVar[Mapping[str, str]] = {
+        "samples": "states",
+        "tolerances": "tolerances",
+        "decrease_share": "condition holds along the closed loop",
+        "terminal_share": "‖x(T)‖ within the radius",
+        "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
+        "constraints_share": "constraints kept",
+        "all_share": "all that is asked for",
+        "confidence": "confidence",
+        "draws": "draws of this checkpoint, other seeds included",
+        "confidence_over_draws": "confidence over all of them",
+        "decrease_lower_bound": "condition holds on at least",
+        "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
+        "cost_lower_bound": "cost ≤ V(0, x₀), up to the tolerance, on at least",
+        "constraints_lower_bound": "constraints kept on at least",
+        "probability_lower_bound": "all that is asked for on at least",
+        "required_share": "share of X₀ that the verdict is about",
+        "failure": "a state that fails",
+        "caveat": "this draw",
+        "advice": "what to do",
+    }
+    claim: SampledClaim
+
+    def numbers(self) -> dict[str, Any]:
+        claim = self.claim
+        asked = (*claim.tolerances.asked, "all")
+        return {
+            "samples": claim.samples,
+            **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
+            "tolerances": {name: value for name, value in asdict(claim.tolerances).items() if name != "constraints"},
+            "failure": claim.failures[0].tolist() if len(claim.failures) else None,
+        }
+
+    def in_words(self) -> str:
+        return (
+            f"Of {self._drawn}, {self.claim.successes['all']} succeed: their closed loops keep the conditions below on "
+            f"the nodes of the horizon. About the other states of X₀ this proves nothing.{self.of_parameters}"
+        )
+
+    @property
+    def _drawn(self) -> str:
+        return f"{self.claim.samples} states drawn uniformly from X₀ (seed {self.options['seed']})"
+
+    def in_formulas(self) -> list[str]:
+        limits = asdict(self.claim.tolerances)
+        lines = {
+            "decrease": "Σₙ max(Vₙ₊₁ − Vₙ + Δt ℓₙ, 0) ≤ {:g} V(0, x₀)",
+            "radius": "‖x(T)‖ ≤ {:g}",
+            "cost": "J(x₀) ≤ {:g} V(0, x₀)",
+        }
+        numbers, constraints = {**limits, "cost": 1 + limits["cost"]}, names_of(self.controller.problem.constraints)
+        asked = [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
+        return [*asked, *([f"h(xₙ) ≤ 0: {'; '.join(constraints)}"] if constraints else [])]
+
+    def of_the_verdict(self) -> str:
+        why = "one that fails was found" if self.verdict == "falsified" else "no sample fails, which proves nothing"
+        return f"The verdict is on the claim that every state of X₀ succeeds: {why}."
+
+    def figure(self) -> figures.Figure:
+        controller = self.controller
+        return figures.sampled_states(
+            self.claim, controller.initial_states, controller.system.state_labels, self.headline
+        )
+
+    @property
+    def headline(self) -> str:
+        """The claim in the title of its figure."""
+        return f"sampled, {self.verdict}: {self.claim.successes['all']} of {self.claim.samples} states succeed"
+
+
+class StatisticalCertificate(SampledCertificate):
+    """A share of X₀ that succeeds, with a confidence."""
+
+    kind: ClassVar[str] = "statistical"
+    claim: StatisticalClaim
+    caveat: str | None = None  # why the draw is not on record
+
+    def numbers(self) -> dict[str, Any]:
+        claim = self.claim
+        bounds = {
+            "confidence": claim.confidence, "draws": claim.draws,
+            "confidence_over_draws": claim.confidence_over_draws, "required_share": claim.share, **claim.named_bounds,
+        }  # fmt: skip
+        said = {"caveat": self.caveat, "advice": self._advice}
+        return {**super().numbers(), **bounds, **{key: text for key, text in said.items() if text}}
+
+    @property
+    def _advice(self) -> str | None:
+        """What to do where V is no bound, as that of the value program need not be."""
+        estimate, share = isinstance(self.controller.program, ValueProgram), self.claim.shares["cost"]
+        if self.verdict == "certified" or not estimate or share >= self.claim.share:
+            return None
+        return (
+            "V of the value program estimates the cost and need not bound it; for a bound train on with --finetune and "
+            "program.name=lyapunov"
+        )
+
+    def in_words(self) -> str:
+        bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]
+        return (
+            f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop keeps the "
+            "conditions below on the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound of "
+            f"{successes} successes in {self._drawn}. The confidence is over the draw{self._others}. Like the rollouts "
+            f"the claim speaks of this model, this Δt and this integrator.{self.of_parameters}"
+        )
+
+    @property
+    def _others(self) -> str:
+        """What there is to say of further draws."""
+        chosen = f", one of {self.claim.draws} of this checkpoint, from which it may have been chosen"
+        return (chosen if self.claim.draws > 1 else "") + (f"; {self.caveat}" if self.caveat else "")
+
+    @property
+    def _confidence(self) -> str:
+        return f"1 − {1 - self.claim.confidence_over_draws:.2g}"
+
+    def in_formulas(self) -> list[str]:
+        bound = floored(self.claim.probability_lower_bound)
+        return [*super().in_formulas(), f"P(x₀ succeeds) ≥ {bound}  for x₀ uniform on X₀"]
+
+    def of_the_verdict(self) -> str:
+        why = {
+            "certified": "the bound is not below it",
+            "falsified": "the share is below it at the same confidence",
+            "unknown": "these samples do not tell",
+        }[self.verdict]
+        return f"The verdict is on the claim that at least {self.claim.share:.6g} of X₀ succeeds: {why}."
+
+    @property
+    def headline(self) -> str:
+        bound = f"at least {floored(self.claim.probability_lower_bound)} of X₀, confidence {self._confidence}"
+        counted = f"{self.claim.successes['all']} of {self.claim.samples} states succeed"
+        return f"statistical, {self.verdict}: {bound}\n{counted}"
+
+
+def sampled_certificate(
+    controller: Controller, samples: int = 100, radius: float | None = None, seed: int = 0
+) -> SampledCertificate:
+    """The sampled claim about a controller.
+
+    Args:
+        radius: of success at T, in the norm of x; not asked for if None.
+    """
+    require_goal(controller.problem, "sampled")
+    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
+    claim = sampled_claim(controller.rollout, controller.problem, tolerances, samples, generator)
+    return SampledCertificate(controller, claim, {"samples": samples, "radius": radius, "seed": seed})
+
+
+def statistical_certificate(
+    controller: Controller,
+    samples: int = 10_000,
+    confidence: float = 1 - 1e-6,
+    share: float = 0.99,
+    radius: float | None = None,
+    seed: int = 0,
+    *,
+    draws: int = 1,
+) -> StatisticalCertificate:
+    """The statistical claim about a controller.
+
+    Args:
+        share: of X₀, about which the verdict is.
+        radius: of success at T, in the norm of x; not asked for if None.
+        draws: of this controller that were made, this one included, with other seeds or numbers of states.
+    """
+    require_goal(controller.problem, "statistical")
+    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
+    claim = statistical_claim(
+        controller.rollout, controller.problem, tolerances, samples, confidence, share, generator, draws=draws
+    )
+    options = {"samples": samples, "confidence": confidence, "share": share, "radius": radius, "seed": seed}
+    return StatisticalCertificate(controller, claim, options)

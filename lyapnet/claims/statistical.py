@@ -1,0 +1,205 @@
+"""Claims about a controller from closed-loop rollouts of sampled initial states: a share, and an exact bound of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool
+from scipy.special import betaincinv
+from torch import Tensor
+
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.sizes import NUMBER, require_memory
+from lyapnet.base.types import State
+from lyapnet.loop.programs import EVENTS, Tolerances
+from lyapnet.loop.programs.terms import hinge, satisfied
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.prover.verdict import Verdict
+from lyapnet.task.problem import Problem
+
+
+@dataclass(frozen=True)
+class SampledClaim:
+    """On `successes["all"]` of `samples` states drawn uniformly from X₀ the closed loop succeeded. It proves no more.
+
+    The claim that every state of X₀ succeeds is falsified by one that fails, and else unknown.
+    """
+
+    states: State  # the samples, (samples, n)
+    held: Bool[Tensor, "samples events"]  # which of EVENTS, from each of them
+    tolerances: Tolerances
+
+    @property
+    def samples(self) -> int:
+        """How many states were drawn."""
+        return len(self.states)
+
+    @property
+    def successes(self) -> dict[str, int]:
+        """The number of samples that succeeded, for each of EVENTS."""
+        return {event: int(count) for event, count in zip(EVENTS, self.held.sum(0), strict=True)}
+
+    @property
+    def failures(self) -> State:
+        """The states that failed in any event, (failures, n), in the order of the draw."""
+        return self.states[~self.held[:, -1]]
+
+    @property
+    def verdict(self) -> Verdict:
+        """On the claim that every state of X₀ succeeds."""
+        return "falsified" if len(self.failures) else "unknown"
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The share of the samples that succeeded, for each of EVENTS."""
+        return {event: count / self.samples for event, count in self.successes.items()}
+
+
+@dataclass(frozen=True)
+class StatisticalClaim(SampledClaim):
+    """With this confidence, at least `probability_lower_bound` of X₀ by volume succeeds.
+
+    The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
+    holds for each event by itself. Like the rollouts it speaks of this model, this Δt and this integrator. Where one of
+    K draws was chosen, the bounds hold with confidence 1 − K(1 − confidence) alone (Bonferroni), and the verdict takes
+    bounds that keep the confidence, each at 1 − (1 − confidence)/K.
+    """
+
+    confidence: float
+    share: float  # of X₀, about which there is a verdict
+    draws: int = 1  # K, this one included
+
+    @property
+    def confidence_over_draws(self) -> float:
+        """With which the bounds hold, whichever of the draws this is."""
+        return max(0.0, 1 - self.draws * (1 - self.confidence))
+
+    @property
+    def lower_bounds(self) -> dict[str, float]:
+        """The bound for each of EVENTS."""
+        return {e: lower_bound(count, self.samples, self.confidence) for e, count in self.successes.items()}
+
+    @property
+    def named_bounds(self) -> dict[str, float]:
+        """The bounds by the names they are printed under: of success, and of each event that is asked for."""
+        bounds = self.lower_bounds
+        single = {f"{event}_lower_bound": bounds[event] for event in self.tolerances.asked}
+        return {"probability_lower_bound": bounds["all"], **single}
+
+    @property
+    def probability_lower_bound(self) -> float:
+        """The bound for all events together."""
+        return self.lower_bounds["all"]
+
+    @property
+    def verdict(self) -> Verdict:
+        """On the claim that at least `share` of X₀ succeeds, at this confidence either way."""
+        each, failures = 1 - (1 - self.confidence) / self.draws, len(self.failures)
+        if lower_bound(self.successes["all"], self.samples, each) >= self.share:
+            return "certified"
+        return "falsified" if 1 - lower_bound(failures, self.samples, each) < self.share else "unknown"
+
+
+def lower_bound(successes: int, samples: int, confidence: float) -> float:
+    """The exact one-sided Clopper-Pearson bound of a probability.
+
+    It is the p at which so many successes or more have probability 1 − confidence,
+    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1), the regularised incomplete beta function, solved for p. (The
+    binomtest of scipy finds the same p by a search for a root.)
+
+    Raises:
+        ValueError: successes do not lie between 0 and samples, or the confidence not strictly between 0 and 1.
+
+    Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
+    Biometrika 1934.
+    """
+    if not (0 <= successes <= samples and samples >= 1):
+        raise ValueError(f"Expected 0 ≤ successes ≤ samples, got {successes} of {samples}; count them again.")
+    if not 0 < confidence < 1:
+        raise ValueError(f"Expected a confidence between 0 and 1, got {confidence}; for example 0.999999.")
+    return float(betaincinv(successes, samples - successes + 1, 1 - confidence)) if successes else 0.0
+
+
+def sampled_claim(
+    rollout: Callable[[State], Trajectory],
+    problem: Problem,
+    tolerances: Tolerances,
+    samples: int = 100,
+    generator: torch.Generator | None = None,
+    batch: int = 1000,
+) -> SampledClaim:
+    """Count successes among fresh states of X₀; K = 100 as in the paper.
+
+    Args:
+        rollout: under a control law that a V defines.
+        problem: whose X₀, goal and constraints are meant.
+        batch: states that are rolled out at once, which bounds the memory.
+
+    Raises:
+        ValueError: less than one sample or state at once.
+    """
+    if samples < 1 or batch < 1:
+        raise ValueError(f"Expected samples and batch ≥ 1, got {samples} and {batch}; choose how many states to draw.")
+    require_memory("samples", samples, NUMBER * samples * problem.system.n, "draw fewer")
+    x0 = problem.initial_states.sample(samples, generator)
+    tolerances = replace(tolerances, constraints=problem.constraints is not None)
+    held = torch.cat([_events(rollout, part, tolerances, problem) for part in x0.split(batch)])
+    return SampledClaim(x0.cpu(), held, tolerances)
+
+
+def statistical_claim(
+    rollout: Callable[[State], Trajectory],
+    problem: Problem,
+    tolerances: Tolerances,
+    samples: int = 10_000,
+    confidence: float = 1 - 1e-6,
+    share: float = 0.99,
+    generator: torch.Generator | None = None,
+    batch: int = 1000,
+    draws: int = 1,
+) -> StatisticalClaim:
+    """Bound the share of X₀ on which the closed loop succeeds, from fresh states.
+
+    The states must be fresh, drawn by a generator on which nothing was trained or chosen, and their number fixed in
+    advance: drawing until the bound pleases voids it, unless all the draws are counted.
+
+    Args:
+        draws: from which this one may be chosen, itself included.
+
+    Raises:
+        ValueError: as sampled_claim and lower_bound.
+    """
+    lower_bound(0, samples, confidence)  # refuse before the work
+    sampled = sampled_claim(rollout, problem, tolerances, samples, generator, batch)
+    return StatisticalClaim(**vars(sampled), confidence=confidence, share=share, draws=draws)
+
+
+FEWEST = 16  # states that are counted as failures together where one of them diverges
+
+
+def _events(
+    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, problem: Problem
+) -> Bool[Tensor, "samples events"]:
+    """Which of EVENTS hold from each state.
+
+    One divergent closed loop ends its whole batch: it is sought by halves. Its last few neighbours count as failures
+    with it, which can only lower a share.
+    """
+    try:
+        with torch.no_grad():
+            trajectory = rollout(x0)
+    except DivergenceError:
+        if len(x0) <= FEWEST:
+            return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
+        return torch.cat([_events(rollout, half, tolerances, problem) for half in x0.tensor_split(2)])
+    values = trajectory.require_value()
+    decrease = terminal = constraints = torch.ones_like(values[0], dtype=torch.bool)
+    if tolerances.decrease is not None:
+        decrease = satisfied(hinge(values, trajectory.step_cost), values[0], tolerances.decrease)
+    if tolerances.radius is not None:
+        terminal = torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1) <= tolerances.radius
+    if problem.constraints is not None:
+        constraints = problem.constraints.worst(trajectory.x).amax(0) <= 0
+    cost = trajectory.cost <= (1 + tolerances.cost) * values[0]
+    single = torch.stack([decrease, terminal, cost, constraints], -1)
+    return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

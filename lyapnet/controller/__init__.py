@@ -1,0 +1,6 @@
+"""V, its control law and the closed loop as one object, and how a checkpoint becomes one."""
+
+from lyapnet.controller.controller import ArrayTrajectory, Controller
+from lyapnet.controller.loading import load
+
+__all__ = ["ArrayTrajectory", "Controller", "load"]

@@ -1,0 +1,372 @@
+"""What training leaves behind: V, the control law, and the closed loop."""
+
+import inspect
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly import Parts, build_problem, build_rollout, member
+from lyapnet.experiment.config import Config, SystemConfig
+from lyapnet.loop.programs import Program, ValueProgram
+from lyapnet.loop.rollout import ClosedLoop, Rollout, Trajectory
+from lyapnet.loop.rollout.runge_kutta import Step
+from lyapnet.task.cost import Cost
+from lyapnet.task.family import FamilySystem
+from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box, ControlSet
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.after_horizon import AfterHorizon, choose_law
+from lyapnet.value.at_parameters import AtParameters
+from lyapnet.value.beyond import ContinuedPolicy, LaterPolicy, slack
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import HJBPolicy, ValuePolicy, gain_over_step, known_law
+
+ALIKE = 0.2  # share by which two control laws of a V may differ without a note: about 1 % of the cost
+
+
+def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
+    """The constructor's arguments, defaults included, of the system of a config; none where they do not fit it."""
+    try:
+        bound = inspect.signature(type(system)).bind(**config.parameters)
+    except TypeError:  # a system of the user's own that was passed in the place of the config's
+        return {}
+    bound.apply_defaults()
+    return dict(bound.arguments)
+
+
+class ArrayTrajectory(NamedTuple):
+    """A batch of closed-loop trajectories as NumPy arrays, with the fields of a Trajectory."""
+
+    t: np.ndarray  # (N + 1,)
+    x: np.ndarray  # (N + 1, *batch, n)
+    u: np.ndarray  # (N, *batch, m)
+    running_cost: np.ndarray  # (N + 1, *batch): ∫ℓ up to t_n
+    terminal_cost: np.ndarray  # (*batch,): φ(x_N)
+    value: np.ndarray  # (N + 1, *batch): V(t_n, x_n)
+
+    def require_value(self) -> np.ndarray:
+        """V along the trajectory."""
+        return self.value
+
+    @property
+    def cost(self) -> Any:  # an array, or of a single state a number of NumPy's
+        """J_N = running cost plus terminal cost, (*batch,)."""
+        return self.running_cost[-1] + self.terminal_cost
+
+    @property
+    def step_cost(self) -> np.ndarray:
+        """∫ℓ over each step, (N, *batch)."""
+        return self.running_cost[1:] - self.running_cost[:-1]
+
+
+class Controller:
+    """V(t, x), u(t, x) and the closed loop they define.
+
+    Tensors in, tensors out (of the controller's dtype); arrays and lists in, NumPy arrays out.
+    """
+
+    problem: Problem
+    program: Program
+    V: ValueFunction
+    _after_horizon: AfterHorizon | None
+
+    def __init__(
+        self,
+        problem: Problem,
+        V: ValueFunction,
+        rollout: Rollout | None = None,
+        program: Program | None = None,
+        config: Config | None = None,
+        beyond: str | None = None,
+        parts: Parts | None = None,
+        policy: type[ValuePolicy] | None = None,
+        after_horizon: AfterHorizon | None = None,
+    ):
+        """A controller of parts.
+
+        Without a rollout it is the closed loop with steps of the horizon's method, as training and evaluation have it;
+        that of an adaptive method has to be given.
+
+        Args:
+            problem: what it was made for.
+            V: its weights are frozen.
+            rollout: the closed loop of V; None: that of its law.
+            program: what V was trained for, and so what a certificate asks of it; None: the value program.
+            config: of the run that trained it, where there was one.
+            beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load; None: the first of riccati,
+                receding and hold that holds closed loops, tried when it is first asked for.
+            parts: the user's own parts that stood in the place of the config's.
+            policy: the control law of V, where no rollout has one; None: the one that V is made for, and the HJB law
+                where nobody knows, with a note if that matters.
+            after_horizon: what an earlier choice of the law after T found.
+
+        Raises:
+            UsageError: V says that it is made for what is no control law.
+            ValueError: the rollout is of another V or problem, or beside a policy.
+        """
+        self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
+        self.program = ValueProgram() if program is None else program
+        self._warned = False  # of parameters of a family that V was not told
+        self.V = V.requires_grad_(False).eval()
+        if rollout is not None and policy is not None:
+            raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
+        self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient="backprop")
+        if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
+            raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
+        law = self.closed_loop.policy
+        assert isinstance(law, ValuePolicy)  # as it has a V
+        self._after_horizon = after_horizon
+        self._continued = ContinuedPolicy(problem, law, beyond, self.after_horizon, noted=after_horizon is not None)
+
+    def __repr__(self) -> str:
+        horizon, V, law = self.horizon, type(self.V).__name__, type(self.closed_loop.policy).__name__
+        about = f"{type(self.system).__name__}, {V}, {law}, {horizon.steps} steps of {horizon.dt:g} s"
+        return f"{type(self).__name__}({about})"
+
+    @property
+    def config(self) -> Config:
+        """The config of the run that trained it.
+
+        Raises:
+            UsageError: it was made from parts.
+        """
+        if self._config is None:
+            raise UsageError("Expected a controller that a run left, got one made from parts; it has no config.")
+        return self._config
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The arguments of the system's constructor, as far as they are known."""
+        return {} if self._config is None else parameters_of(self.system, self._config.system)
+
+    @property
+    def system(self) -> ControlAffineSystem:
+        """ẋ = f(x) + g(x)u."""
+        return self.problem.system
+
+    @property
+    def cost(self) -> Cost:
+        """ℓ and φ."""
+        return self.problem.cost
+
+    @property
+    def controls(self) -> ControlSet:
+        """U."""
+        return self.problem.controls
+
+    @property
+    def horizon(self) -> Horizon:
+        """N (`steps`), Δt (`dt`) and T (`duration`)."""
+        return self.problem.horizon
+
+    @property
+    def initial_states(self) -> Box:
+        """X₀."""
+        return self.problem.initial_states
+
+    @property
+    def method(self) -> str:
+        """The integrator of its rollouts."""
+        return self._rollout.method
+
+    @property
+    def closed_loop(self) -> ClosedLoop:
+        """(t, (x, ∫ℓ)) ↦ its derivative under u(t, x), as a module."""
+        return self._rollout.closed_loop
+
+    @property
+    def step(self) -> Step:
+        """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V), one step of its rollouts; where they choose their own, one of rk4."""
+        return Step(self._rollout.stepped, TABLEAUX.get(self._rollout.solver_arguments["method"], TABLEAUX["rk4"]))
+
+    @property
+    def law(self) -> ContinuedPolicy:
+        """u(t, x) for all t ≥ 0 as a module, with its V."""
+        return self._continued
+
+    def after_horizon(self) -> AfterHorizon:
+        """What training found of the law after T, and of how many closed loops it holds up to 5 T; else it is sought.
+
+        Where `beyond` was given, that law is followed all the same.
+        """
+        if self._after_horizon is None:
+            self._after_horizon = choose_law(
+                self.problem, lambda law, x0, steps: self.continued(law).rollout(x0, steps).x
+            )
+        return self._after_horizon
+
+    @overload
+    def value(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
+    @overload
+    def value(self, t: ArrayLike, x: ArrayLike, **parameters: Any) -> np.ndarray: ...
+    def value(self, t: Any, x: Any, **parameters: Any) -> Any:
+        """V(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch,).
+
+        Args:
+            parameters: of a family, each by its name, scalar or (*batch,); none where x is (x, p).
+
+        Raises:
+            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
+        """
+        return self._answer(self.law.V, t, x, parameters)
+
+    @overload
+    def policy(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
+    @overload
+    def policy(self, t: ArrayLike, x: ArrayLike, **parameters: Any) -> np.ndarray: ...
+    def policy(self, t: Any, x: Any, **parameters: Any) -> Any:
+        """u(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch, m).
+
+        Args:
+            parameters: of a family, each by its name, scalar or (*batch,), as in policy(t, x, pole_mass=0.2); none
+                where x is (x, p).
+
+        Raises:
+            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
+        """
+        return self._answer(self.law, t, x, parameters)
+
+    def with_(self, **parameters: float) -> "Controller":
+        """The controller of one member of a family: of its own problem, with V(t, (x, p)) at these parameters.
+
+        Raises:
+            UsageError: it is of no family; or a parameter is missing, unknown, or outside the range that V was told.
+        """
+        system = self.system
+        if not isinstance(system, FamilySystem) or self._config is None:
+            raise UsageError("Expected a controller of a family, got one of a single problem; add family to the YAML.")
+        config, parts, p = member(self.config, self._parts, system, parameters)
+        problem = build_problem(config, parts).to(self.initial_states.lower.device)
+        V = AtParameters(self.V, self.initial_states.lower.new_tensor(p))
+        rollout = build_rollout(config, problem, V)
+        known = self._after_horizon  # of the family, and so of its members
+        return Controller(problem, V, rollout, self.program, config, self._beyond, parts, after_horizon=known)
+
+    def continued(self, beyond: str) -> "Controller":
+        """The controller with another law after T: hold, receding, riccati or error, as in lyapnet.load.
+
+        Raises:
+            ValueError: another name; or riccati, and the goal is no equilibrium that a linear law can stabilise.
+        """
+        return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, self._parts)
+
+    @overload
+    def rollout(self, x0: Tensor, steps: int | None = None, **parameters: float) -> Trajectory: ...
+    @overload
+    def rollout(self, x0: ArrayLike, steps: int | None = None, **parameters: float) -> ArrayTrajectory: ...
+    def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Any:
+        """The closed loop from x₀ (*batch, n): a Trajectory of tensors, an ArrayTrajectory of arrays and lists.
+
+        Args:
+            steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state; after
+                T it goes on as `beyond` says.
+            parameters: of a family, each by its name; none where x₀ is (x₀, p).
+
+        Raises:
+            ValueError: the shape does not fit.
+            DivergenceError: the closed loop leaves the finite numbers.
+        """
+        if parameters:
+            return self.with_(**parameters).rollout(x0, steps)
+        if steps is not None and (not isinstance(steps, int) or steps < 1):
+            raise ValueError(f"Expected steps as a whole number ≥ 1, got {steps!r}; give how many steps of Δt to take.")
+        with torch.no_grad():
+            trajectory: Trajectory = self._rollout(self._state(x0))
+            if steps is not None and steps < self.horizon.steps:
+                trajectory = self._cut(trajectory, steps)
+            elif steps is not None and steps > self.horizon.steps:
+                trajectory = self._prolonged(trajectory, steps - self.horizon.steps)
+        return trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_like(x0, field) for field in trajectory))
+
+    def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
+        """The first steps of a trajectory."""
+        nodes = slice(steps + 1)
+        end, value = self.cost.terminal(whole.x[steps]), whole.require_value()[nodes]
+        return Trajectory(whole.t[nodes], whole.x[nodes], whole.u[:steps], whole.running_cost[nodes], end, value)
+
+    def take_code_of(self, rollout: Rollout) -> None:
+        """Follow closed loops by the machine code of another rollout of this law, where it has some and agrees."""
+        own, other = self._rollout.discrete, rollout.discrete
+        if own is not None and other is not None and other.compiled_batch:
+            draw = torch.Generator().manual_seed(0)
+            own.share_code(other, self.problem.initial_states.sample(other.compiled_batch, draw))
+
+    def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
+        """A trajectory with further steps, under what follows the horizon."""
+        problem = self.problem.in_steps(steps=steps)
+        law, solver = LaterPolicy(problem, self.law, self.horizon.duration), self._rollout.solver_arguments
+        rest = Rollout(problem, law, self.method, "backprop", solver["rtol"], solver["atol"])(first.x[-1])
+        return Trajectory(
+            self.problem.in_steps(steps=self.horizon.steps + steps).horizon.times(first.x),
+            torch.cat([first.x, rest.x[1:]]),
+            torch.cat([first.u, rest.u]),
+            torch.cat([first.running_cost, first.running_cost[-1] + rest.running_cost[1:]]),
+            rest.terminal_cost,
+            torch.cat([first.require_value(), rest.require_value()[1:]]),
+        )
+
+    def _answer(
+        self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any, parameters: Mapping[str, Any]
+    ) -> Any:
+        time, state = self._inputs(t, self._told(x, parameters) if parameters else x)
+        with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
+            return _like(x, function(time, state))
+
+    def _inputs(self, t: Any, x: Any) -> tuple[Tensor, Tensor]:
+        state = self._state(x)
+        time = torch.as_tensor(t, dtype=state.dtype, device=state.device)
+        batch = tuple(state.shape[:-1])
+        if time.ndim and tuple(time.shape) != batch:
+            raise ValueError(f"Expected t scalar or of shape {batch}, got {tuple(time.shape)}; give a time per state.")
+        if bool((time < -slack(time, self.horizon.duration)).any()):
+            raise ValueError(f"Expected t ≥ 0, got {float(time.min()):g}; the horizon begins at 0.")
+        return time.clamp(min=0), state
+
+    def _told(self, x: Any, parameters: Mapping[str, Any]) -> Tensor:
+        """(x, p) of x and the parameters of a family."""
+        if not isinstance(self.system, FamilySystem):
+            raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
+        box, n = self.initial_states, self.system.system.n
+        state = self.system.joined(torch.as_tensor(x, dtype=box.lower.dtype, device=box.lower.device), parameters)
+        lower, upper = box.lower[n:], box.upper[n:]
+        room = 1e-9 * torch.maximum(lower.abs(), upper.abs())
+        if not self._warned and not bool(Box(lower - room, upper + room).contains(state[..., n:]).all()):
+            self._warned, known = True, ", ".join(f"{name} in {ends}" for name, ends in self.config.family.items())
+            note = "note: V was told %s, and is asked outside of that; what it says there is extrapolated."
+            logging.getLogger(__name__).warning(note, known)
+        return state
+
+    def _state(self, x: Any) -> Tensor:
+        like = self.initial_states.lower
+        state = torch.as_tensor(x, dtype=like.dtype, device=like.device)
+        n = self.system.n
+        if not state.ndim or state.shape[-1] != n:
+            names = ", ".join(self.system.state_names)
+            raise ValueError(
+                f"Expected x of shape (*batch, {n}), got {tuple(state.shape)}; the last axis holds {names}."
+            )
+        return state
+
+
+def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
+    """The control law that V is made for; where nobody knows the HJB law, with a note if that matters."""
+    known = known_law(problem, V)
+    if known is None and (gain := gain_over_step(problem, V)) > ALIKE:
+        logging.getLogger(__name__).warning(
+            "note: nobody says which control law %s is made for; u is its HJB law, which at this Δt differs by %.0f %% "
+            "from the law with u held. Pass policy=lyapnet.SampledPolicy where V is about steps with u held, "
+            "lyapnet.HJBPolicy where it is about continuous time; or set V.made_for.",
+            type(V).__name__, 100 * gain,
+        )  # fmt: skip
+    return HJBPolicy if known is None else known
+
+
+def _like(given: Any, result: Any) -> Any:
+    return result if isinstance(given, Tensor) else result.detach().cpu().numpy()

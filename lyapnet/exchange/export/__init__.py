@@ -1,0 +1,5 @@
+"""A controller's law in other languages: C99, ONNX, or a program of torch's own; each held against the controller."""
+
+from lyapnet.exchange.export.writing import FORMATS, Exported, compiled, export
+
+__all__ = ["FORMATS", "Exported", "compiled", "export"]

@@ -1,0 +1,87 @@
+"""What was written, held against the controller on many states."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lyapnet.base.errors import ExportError
+from lyapnet.base.random_streams import TEST, stream
+from lyapnet.controller.controller import Controller
+from lyapnet.value.policy import LookaheadPolicy
+
+STATES = 10_000
+LOOPS = 100  # closed loops, of whose states half of them are
+AROUND = 0.2  # of the widths of the box of those states, by which the others may leave it
+AFTER = 1.25  # of T: their latest time
+TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-3}  # relative to the largest |u| and |V|
+LOOSER = 1e3  # for a law that compares costs: rounding decides between controls that cost the same
+
+Evaluate = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]  # t (k,), x (k, n) ↦ u (k, m), V (k,)
+
+
+class Agreement(NamedTuple):
+    """The largest differences of an export from its controller."""
+
+    states: int
+    control: float  # of |u − u'|, relative to the largest |u|
+    value: float  # of |V − V'|, relative to the largest |V|
+
+    def __str__(self) -> str:
+        return (
+            f"on {self.states} states u is within {self.control:.1e} of the largest |u|, and V within "
+            f"{self.value:.1e} of the largest |V|"
+        )
+
+
+def verify(controller: Controller, evaluate: Evaluate) -> Agreement:
+    """Hold an export against its controller: on states of closed loops, and around them, up to and after T.
+
+    Raises:
+        ExportError: they differ by more than rounding.
+    """
+    t, x = points(controller)
+    law = controller.law
+    with torch.no_grad():
+        expected = law.at_any_time(t, x), law.V.at_any_time(t, x)
+    found = evaluate(t.double().cpu().numpy(), x.double().cpu().numpy())
+    differences = [_difference(own, other) for own, other in zip(expected, found, strict=True)]
+    agreement = Agreement(len(t), *differences)
+    looser = LOOSER if isinstance(law.policy, LookaheadPolicy) else 1
+    if not max(differences) <= looser * TOLERANCES[x.dtype]:
+        raise ExportError(
+            f"Expected the controller's own u and V, got others: {agreement}; report this with f, g, the cost and the "
+            "network. Nothing was written."
+        )
+    return agreement
+
+
+def points(controller: Controller) -> tuple[Tensor, Tensor]:
+    """(t (k,), x (k, n)) that exports are held against."""
+    generator = stream(0, TEST, 1)
+    x0 = controller.initial_states.sample(LOOPS, generator).to(controller.initial_states.lower)
+    loops = controller.rollout(x0)
+    nodes = len(loops.t)
+    chosen = torch.randint(nodes * LOOPS, (STATES // 2,), generator=generator)
+    visited, when = loops.x.reshape(-1, x0.shape[-1])[chosen], loops.t[chosen // LOOPS]
+    lower, upper = visited.amin(0), visited.amax(0)
+    share = torch.rand(STATES - len(chosen), x0.shape[-1], generator=generator, dtype=torch.float64).to(x0)
+    around = lower + (upper - lower) * ((1 + 2 * AROUND) * share - AROUND)
+    for i in controller.system.constants:  # what V was told of
+        around[:, i] = around[:, i].clamp(controller.initial_states.lower[i], controller.initial_states.upper[i])
+    until = AFTER * controller.horizon.duration
+    then = until * torch.rand(len(around), generator=generator, dtype=torch.float64).to(x0)
+    return torch.cat([when, then]), torch.cat([visited, around])
+
+
+def _difference(own: Tensor, other: NDArray) -> float:
+    """The largest difference, relative to the largest entry; infinite where one has no number and the other has."""
+    expected, found = own.double().cpu().numpy(), np.asarray(other, dtype=np.float64).reshape(own.shape)
+    if not np.array_equal(np.isfinite(expected), np.isfinite(found)):
+        return float("inf")
+    finite = np.isfinite(expected)
+    largest = float(np.abs(expected[finite]).max(initial=0.0)) or 1.0
+    return float(np.abs(expected - found)[finite].max(initial=0.0)) / largest

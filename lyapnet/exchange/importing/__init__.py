@@ -1,0 +1,6 @@
+"""V(x) and u(x) that were made elsewhere, as functions in Python or ONNX files, for the certificates."""
+
+from lyapnet.exchange.importing.files import imported_controller
+from lyapnet.exchange.importing.law import GivenLaw, GivenValue, controller_of
+
+__all__ = ["GivenLaw", "GivenValue", "controller_of", "imported_controller"]

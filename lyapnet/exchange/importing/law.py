@@ -1,0 +1,165 @@
+"""A V(x) and a law u(x) that were made elsewhere, as a controller."""
+
+import copy
+import logging
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.contracts import called, check_memory, copied, reaches_own_code
+from lyapnet.base.contracts.batch_sizes import check_batch_sizes
+from lyapnet.base.errors import UsageError
+from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.types import Control, PerState, State, Time
+from lyapnet.controller.controller import Controller
+from lyapnet.experiment.config import Config
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.problem import TRIED, Problem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import ValuePolicy
+
+STATES = 1000  # at which functions of others are tried
+IN_PYTHON = "functions from Python, read in real numbers"
+LEAVES = 1e-6  # of the largest |u|, by which it may be outside of U: rounding in float32
+
+
+class GivenValue(ValueFunction):
+    """V(t, x) = v(x) − v(x*), the same at every t.
+
+    Args:
+        function: v, (k, n) ↦ (k,) or (k, 1).
+        goal: x*.
+    """
+
+    at_goal: Tensor
+
+    def __init__(self, function: nn.Module, goal: State):
+        super().__init__()
+        self.function = function
+        with torch.no_grad():
+            self.register_buffer("at_goal", self._of(goal))
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self._of(x) - self.at_goal
+
+    def _of(self, x: State) -> PerState:
+        return self.function(x.reshape(-1, x.shape[-1])).reshape(x.shape[:-1])
+
+
+class GivenLaw(ValuePolicy):
+    """u(t, x) = the point of U closest to k(x), at every t; V stands beside it, and does not define it.
+
+    Args:
+        function: k, (k, n) ↦ (k, m).
+        origin: where v and k come from, in words.
+        precision: of the arithmetic in which k is computed, whose rounding its bounds count; None for real numbers.
+    """
+
+    def __init__(
+        self, problem: Problem, V: GivenValue, function: nn.Module, origin: str = IN_PYTHON,
+        precision: str | None = None,
+    ):  # fmt: skip
+        super().__init__(problem, V)
+        self.function, self.precision = function, precision
+        limits = " clamped to U" if self.controls.limited else ""
+        self.origin = (
+            f"V(0, x) is V(x) − V(x*) with V(x*) = {float(V.at_goal)!r}, u(0, x) is u(x){limits}, and V and u are "
+            f"{origin}."
+        )
+
+    def forward(self, t: Time, x: State) -> Control:
+        return self.controls.project(self.unlimited(x))
+
+    def unlimited(self, x: State) -> Control:
+        """k(x), (*batch, m)."""
+        return self.function(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.system.m)
+
+
+def controller_of(
+    problem: Problem,
+    value: nn.Module,
+    law: nn.Module,
+    origin: str = IN_PYTHON,
+    config: Config | None = None,
+    precision: str | None = None,
+) -> Controller:
+    """A controller of V(x) and u(x) that were made elsewhere, for `certify region` and its like.
+
+    Copies in float64 are taken, of the weights as they are: later training does not change them.
+
+    Args:
+        problem: of which system, X₀, goal and controls count; u(x) is clamped to U, and V is counted from V(x*).
+        value: (k, n) ↦ (k,) or (k, 1).
+        law: (k, n) ↦ (k, m).
+        origin: where both come from, as a certificate says it.
+        config: that the problem comes from, for reports.
+        precision: of GivenLaw.
+
+    Raises:
+        UsageError: it is about a family, or V or u has another shape.
+    """
+    require_one_system(problem)
+    problem = copied(problem)
+    v, k = (copy.deepcopy(each).double().cpu().eval().requires_grad_(False) for each in (value, law))
+    for name, function, size in (("V(x)", v, 1), ("u(x)", k, problem.system.m)):
+        _require_size(name, function, problem.goal, size)
+        _require_function(name, function, problem)
+    V = GivenValue(v, problem.goal)
+    policy = GivenLaw(problem, V, k, origin, precision)
+    _note_where_it_leaves(policy, problem)
+    return Controller(problem, V, Rollout(problem, policy, gradient="backprop"), config=config)
+
+
+def require_one_system(problem: Problem) -> None:
+    """Refuse a family."""
+    if problem.system.constants:
+        raise UsageError("Expected one system, got a family; V(x) and u(x) are of a single one.")
+
+
+def states_around(problem: Problem) -> State:
+    """States at which functions of others are tried: half of them of X₀, half of a box three times as wide."""
+    box, generator = problem.initial_states, stream(0, TEST, 2)
+    near, wide = (box.sample(STATES // 2, generator).double() for _ in range(2))
+    return torch.cat([near, box.center + 3 * (wide - box.center)])
+
+
+def _note_where_it_leaves(policy: GivenLaw, problem: Problem) -> None:
+    """Log a note where u(x) is not in U."""
+    x = states_around(problem)
+    with torch.no_grad():
+        u = policy.unlimited(x)
+    apart = (u - policy.controls.project(u)).abs().amax(-1) > LEAVES * u.abs().amax()
+    if bool(apart.any()):
+        first = int(apart.int().argmax())
+        logging.getLogger(__name__).warning(
+            "note: u(x) leaves U, as at x = %s with u = %s: what is certified is u(x) clamped to U.",
+            [round(each, 6) for each in x[first].tolist()], [round(each, 6) for each in u[first].tolist()],
+        )  # fmt: skip
+
+
+def _require_function(name: str, function: nn.Module, problem: Problem) -> None:
+    """Refuse a function that remembers something, or is another one in batches of another size."""
+    x, ends = states_around(problem)[:TRIED], problem.initial_states.ends(TRIED).double()
+
+    def call(x: State) -> None:
+        with torch.no_grad():
+            called(name, function, [x])
+
+    check_memory({name: function}, lambda: call(x), lambda: call(ends))
+    if reaches_own_code(function):
+        check_batch_sizes(name, lambda x: (function(x),), [x])
+
+
+def _require_size(name: str, function: nn.Module, goal: State, size: int) -> None:
+    """Refuse a function that does not give so many finite numbers at x*."""
+    with torch.no_grad():
+        found = called(name, function, [goal[None]])
+    if not isinstance(found, Tensor) or found.numel() != size:
+        got = f"{found.numel()}" if isinstance(found, Tensor) else type(found).__name__
+        raise UsageError(
+            f"Expected {name} with {size} number{'s' * (size != 1)} for a state, got {got}; look whether V and u are "
+            "swapped, and whether they are about this system."
+        )
+    if not bool(cast(Tensor, found).isfinite().all()):
+        raise UsageError(f"Expected finite {name} at the goal, got {found.flatten().tolist()}; correct it.")

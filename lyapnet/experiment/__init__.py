@@ -1,0 +1,1 @@
+"""One experiment as data, and the objects that it names."""

@@ -1,0 +1,29 @@
+"""From a config to the objects it names."""
+
+from lyapnet.experiment.assembly.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
+from lyapnet.experiment.assembly.entries import entry_per_state
+from lyapnet.experiment.assembly.family import knows, member
+from lyapnet.experiment.assembly.learner import build_program, build_rollout, build_value_function
+from lyapnet.experiment.assembly.named_parts import parts_named, parts_of
+from lyapnet.experiment.assembly.problem import build_problem, build_system, operating_point, with_parameters
+
+__all__ = [
+    "DTYPES",
+    "REGISTRIES",
+    "Parts",
+    "build_problem",
+    "build_program",
+    "build_rollout",
+    "build_system",
+    "build_value_function",
+    "default_of",
+    "entry_per_state",
+    "knows",
+    "member",
+    "operating_point",
+    "own_parts",
+    "parts_named",
+    "parts_of",
+    "resolve",
+    "with_parameters",
+]

@@ -1,0 +1,152 @@
+"""The classes that a config names: registered ones, and the user's own."""
+
+import importlib
+import inspect
+import sys
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyapnet.base.contracts import initialised, remedy
+from lyapnet.base.errors import LyapnetError, UsageError, did_you_mean, raised
+from lyapnet.experiment.config import Config
+from lyapnet.loop.programs import PROGRAMS, Program
+from lyapnet.task.constraints import CONSTRAINTS, Constraints
+from lyapnet.task.cost import COSTS, Cost
+from lyapnet.task.sets import CONTROL_SETS, ControlSet
+from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import NETWORKS
+
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The user's own parts, taken in the place of those that a config names; None: the config's."""
+
+    system: ControlAffineSystem | None = None
+    cost: Cost | None = None
+    controls: ControlSet | None = None
+    constraints: Constraints | None = None
+    network: type[ValueFunction] | None = None
+    program: Program | None = None
+
+
+# section of a config ↦ (what is registered, what a class of the user's own derives from)
+REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
+    "system": (SYSTEMS, ControlAffineSystem),
+    "cost": (COSTS, Cost),
+    "controls": (CONTROL_SETS, ControlSet),
+    "constraints": (CONSTRAINTS, Constraints),
+    "network": (NETWORKS, ValueFunction),
+    "program": (PROGRAMS, Program),
+}
+
+
+def own_parts(config: Config) -> dict[str, str]:
+    """The sections whose class is the user's own, with the name of the class."""
+    return {part: name for part, (known, _) in REGISTRIES.items() if (name := getattr(config, part).name) not in known}
+
+
+def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> Any:
+    """A registered class, or the user's own from module:Class, found from the working directory.
+
+    Raises:
+        UsageError: no such module or class, or not a subclass of `base`.
+    """
+    if name in registry:
+        return registry[name]
+    module_name, _, class_name = name.partition(":")
+    choices = f"one of {', '.join(registry)}, or module:Class" if registry else "module:Class"
+    if not class_name:
+        hint = did_you_mean(name, registry, f"name the class too, as in {module_name}:Class.")
+        raise UsageError(f"Expected {key} as {choices}, got {name!r}; {hint}")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+        cls = getattr(module, class_name, None)
+    except (Exception, SystemExit) as error:  # of any kind: the module is the user's
+        raise UsageError(
+            f"Expected {key} as module:Class, got {name!r} ({raised(error)}); correct the name, or the module."
+        ) from error
+    if cls is None:
+        classes = [known for known, value in vars(module).items() if isinstance(value, type)]
+        hint = did_you_mean(class_name, classes, "correct the name, or the module.", f"{module_name}:")
+        raise UsageError(f"Expected {key} as a class of {module_name}, got {name!r}, which it has not; {hint}")
+    if not (isinstance(cls, type) and issubclass(cls, base)):
+        raise UsageError(f"Expected {key} as a subclass of {base.__name__}, got {name!r}; derive your class from it.")
+    return cls
+
+
+def class_of(config: Config, part: str) -> Any:
+    """The class that a section of a config names."""
+    registry, base = REGISTRIES[part]
+    return resolve(getattr(config, part).name, registry, f"{part}.name", base)
+
+
+def instance_of(options: Any, part: str) -> Any:
+    """An object of the class that a section names, from its parameters."""
+    cls = resolve(options.name, REGISTRIES[part][0], f"{part}.name", REGISTRIES[part][1])
+    check_parameters(cls, options.name, options.parameters, part)
+    with float64_defaults(), section(f"{part}.parameters of {options.name}"):
+        return initialised(cls(**options.parameters))
+
+
+def check_parameters(cls: type, name: str, parameters: Mapping[str, Any], part: str) -> None:
+    """Hold the names under a section's parameters against the constructor's arguments."""
+    arguments = inspect.signature(cls).parameters.values()
+    named = [a for a in arguments if a.kind in (a.POSITIONAL_OR_KEYWORD, a.KEYWORD_ONLY)]
+    names = [a.name for a in named]
+    open_ended = any(a.kind is a.VAR_KEYWORD for a in arguments)
+    for key in parameters:
+        if key not in names and not open_ended:
+            hint = did_you_mean(key, names, "remove it.", f"{part}.parameters.")
+            known = ", ".join(names) or "none"
+            raise UsageError(f"Expected parameters of {name} ({known}), got {part}.parameters.{key}; {hint}")
+    missing = [a.name for a in named if a.default is a.empty and a.name not in parameters]
+    if missing:
+        keys = ", ".join(f"{part}.parameters.{key}" for key in missing)
+        raise UsageError(f"Expected values for {keys}, got none; {name} has no default for them.")
+
+
+@contextmanager
+def section(name: str):
+    """Name the config's section in what a constructor refuses, or what goes wrong in one of the user's own."""
+    try:
+        yield
+    except LyapnetError:
+        raise
+    except (Exception, SystemExit) as error:
+        if str(error).startswith("Expected "):  # lyapnet's own words
+            raise UsageError(f"{name}: {error}") from error
+        raise UsageError(f"Expected {name} that can be built, got {raised(error)}; {remedy(error)}.") from error
+
+
+@contextmanager
+def default_dtype(dtype: torch.dtype):
+    """Have tensors of floats be of this type where nothing else is said, as in torch.tensor([[0.0], [1 / L]]).
+
+    One type for all that a command computes: 1/L in float32 is another number, by 5e-8 of it, than the build has used.
+    """
+    previous = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(previous)
+
+
+def float64_defaults():
+    """Build in float64 whatever the precision, so that float32 runs start from the rounded float64 weights."""
+    return default_dtype(torch.float64)
+
+
+def default_of(config: Config):
+    """The type of a config's precision as the default, for training and measuring."""
+    return default_dtype(DTYPES[config.training.precision])

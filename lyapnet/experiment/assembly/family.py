@@ -1,0 +1,154 @@
+"""From a config with a family to the system, the cost and the initial states of all its members."""
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.base.types import ControlMatrix, State
+from lyapnet.experiment.assembly.classes import Parts, section
+from lyapnet.experiment.assembly.target import about_written_target, holding, written_target
+from lyapnet.experiment.config import Config
+from lyapnet.task.cost import Cost, MadeOfAnother, innermost
+from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members, with_attributes
+from lyapnet.task.operating_points import HELD
+from lyapnet.task.sets import Box, ControlSet
+from lyapnet.task.systems import ControlAffineSystem
+
+TAKEN = ("t", "x", "x0", "steps")  # what a controller takes beside them
+TRIED = 8  # states at which members are held against systems built with their parameters
+
+
+def family_of(
+    config: Config, system: ControlAffineSystem, cost: Cost, controls: ControlSet, initial_states: Box
+) -> tuple[FamilySystem, FamilyCost, Box]:
+    """The parts of a family in z = (x, p), X₀ × P among them.
+
+    Raises:
+        UsageError: a name that is neither a parameter of the system nor target_STATE; a range that is none; or a
+            member that breaks the contract of FamilySystem, or a target that asks for another control than the others.
+    """
+    if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
+        raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
+    ranges = _ranges(config.family)
+    targets = _targets(ranges, system)
+    low, high = (torch.tensor([r[side] for r in ranges.values()], dtype=torch.float64) for side in (0, 1))
+    units = [system.state_units[targets[name]] if name in targets else "" for name in ranges]
+    family = FamilySystem(system, list(ranges), units)
+    box = Box(torch.cat([initial_states.lower, low]), torch.cat([initial_states.upper, high]))
+    _check(config, family, box)
+    center = (low + high) / 2
+    shift = torch.zeros(system.n, len(ranges), dtype=torch.float64)
+    for k, name in enumerate(ranges):
+        if name in targets:
+            shift[targets[name], k] = 1
+    if targets or config.target is not None:
+        at_center = _config_of(config, dict(zip(ranges, center.tolist(), strict=True)), system)
+        cost = about_written_target(at_center, cost, family.member(center), controls)
+        if config.target_control is None:
+            _require_one_control(family, cost, shift, center, low, high)
+    return family, FamilyCost(cost, shift, center, _weight_of_members(cost, family)), box
+
+
+def member(
+    config: Config, parts: Parts, family: FamilySystem, parameters: Mapping[str, Any]
+) -> tuple[Config, Parts, list[float]]:
+    """The config of one member of a family, the user's own parts for it, and its p in the order of the family.
+
+    Raises:
+        UsageError: a parameter is missing, unknown, no number, or outside the range that V was told.
+    """
+    if parameters.keys() != config.family.keys():
+        names = ", ".join(parameters) or "none"
+        raise UsageError(f"Expected values for {', '.join(config.family)}, got {names}; give each.")
+    values = dict[str, float]()
+    for name, ends in config.family.items():
+        try:
+            values[name] = float(parameters[name])
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise UsageError(f"Expected {name} as one number, got {parameters[name]!r}; name one member.") from error
+        if not knows(config, name, values[name]):
+            raise UsageError(f"Expected {name} in {ends}, which V knows, got {values[name]:g}.")
+    numbers = {name: values[name] for name in family.parameters_in_f}
+    own = dataclasses.replace(parts, system=with_attributes(family.system, numbers))
+    return _config_of(config, values, family.system), own, [*values.values()]
+
+
+def _config_of(config: Config, parameters: Mapping[str, float], system: ControlAffineSystem) -> Config:
+    """The config of one member of a family."""
+    given = {name: value for name, value in parameters.items() if not name.startswith(PREFIX)}
+    own = dataclasses.replace(config.system, parameters={**config.system.parameters, **given})
+    target = None if config.target is None else written_target(config, system).tolist()
+    for name, i in _targets(parameters, system).items():
+        target = [0.0] * system.n if target is None else target
+        target[i] = parameters[name]
+    return dataclasses.replace(copy.deepcopy(config), system=own, target=target, family={})
+
+
+def knows(config: Config, name: str, value: float) -> bool:
+    """Whether a value lies in the range of a family's parameter, but for rounding."""
+    least, greatest = config.family[name]
+    room = 1e-9 * max(abs(least), abs(greatest))
+    return least - room <= value <= greatest + room
+
+
+def _ranges(family: Mapping[str, list[float]]) -> dict[str, list[float]]:
+    for name, bounds in family.items():
+        if name in TAKEN:
+            raise UsageError(f"Expected parameters of a family other than {', '.join(TAKEN)}, got {name}; rename it.")
+        if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
+            raise UsageError(f"Expected family.{name} as [least, greatest], got {bounds}; give two finite numbers.")
+    return dict(family)
+
+
+def _targets(names: Mapping[str, object], system: ControlAffineSystem) -> dict[str, int]:
+    """The names target_STATE with the index of their state."""
+    known = {PREFIX + name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
+    targets = [name for name in names if name.startswith(PREFIX)]
+    for name in targets:
+        if name not in known:
+            hint = did_you_mean(name, known, "name a state of the system.", "family.")
+            raise UsageError(f"Expected family.{name} among {', '.join(known)}, got no such state; {hint}")
+    return {name: known[name] for name in targets}
+
+
+def _check(config: Config, family: FamilySystem, box: Box) -> None:
+    """Hold the members against systems that are built with their parameters."""
+    if not family.parameters_in_f:
+        return
+    cls, given = type(family.system), config.system.parameters
+
+    def build(values: Mapping[str, float]) -> ControlAffineSystem:
+        with section("family"):
+            return cls(**{**given, **values})
+
+    inside = box.sample(TRIED, torch.Generator().manual_seed(0))
+    check_members(family, build, torch.cat([box.lower[None], box.upper[None], inside]))
+
+
+def _require_one_control(
+    family: FamilySystem, cost: Cost, shift: Tensor, center: Tensor, low: Tensor, high: Tensor
+) -> None:
+    """Refuse targets of which some are held by another control than the one at the centre."""
+    assert cost.goal is not None
+    assert cost.rest is not None
+    for p in (low, high, *Box(low, high).sample(TRIED, torch.Generator().manual_seed(0))):
+        x = cost.goal + shift @ (p - center)
+        u = holding(family.member(p), x)
+        if not float((u - cost.rest).abs().max()) <= HELD * max(1.0, float(cost.rest.abs().max())):
+            raise UsageError(
+                f"Expected a family whose targets one control holds, got u = {cost.rest.tolist()} at its centre "
+                f"and {u.tolist()} at x = {x.tolist()}; say what the cost counts u from, as in target_control: [0]."
+            )
+
+
+def _weight_of_members(cost: Cost, family: FamilySystem) -> Callable[[State], ControlMatrix] | None:
+    """R(x; p), where R is the inverse mass of the system; None where it is the same for every member."""
+    R = getattr(innermost(cost), "R_of_state", None)
+    of_system = getattr(R, "__self__", None) is family.system and getattr(R, "__name__", "") == "inverse_mass"
+    return family.inverse_mass if of_system and family.parameters_in_f else None

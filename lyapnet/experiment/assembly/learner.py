@@ -1,0 +1,176 @@
+"""From a config to what learns: V, its closed loop, and the program."""
+
+import inspect
+from typing import Any
+
+import torch
+
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly.classes import DTYPES, check_parameters, class_of, float64_defaults, section
+from lyapnet.experiment.assembly.entries import entry_per_state
+from lyapnet.experiment.config import Config
+from lyapnet.loop.programs import Program
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.cost import Cost
+from lyapnet.task.problem import Problem
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks import (
+    CentredNetwork,
+    ExpansionNetwork,
+    IgnoringStates,
+    Scaling,
+    StationaryNetwork,
+    TerminalAnchor,
+    Timeless,
+    WithPenalty,
+)
+from lyapnet.value.policy import POLICIES
+
+
+def build_value_function(config: Config, problem: Problem, network: type[ValueFunction] | None = None) -> ValueFunction:
+    """V(t, x) with fresh weights drawn from the config's seed, in its precision; made for the config's control law.
+
+    Args:
+        network: the class taken instead of the one that the config names.
+
+    Raises:
+        UsageError: an option that the network does not have, or a value that it refuses.
+    """
+    options, n = config.network, problem.system.n
+    cls, kept = network or class_of(config, "network"), _kept_states(config, problem.system)
+    name = options.name
+    if problem.horizon.stationary and cls is ExpansionNetwork:  # the standard one
+        cls, name = StationaryNetwork, "stationary"
+    _require_same_end(problem, cls, options.terminal)
+    angles = [kept.index(angle) for angle in problem.system.angles if angle in kept]
+    chosen: dict[str, Any] = {
+        "hidden": options.hidden,
+        "activation": options.activation,
+        "epsilon": options.epsilon,
+        "smooth": options.smooth,
+        "embedded_angles": angles if options.embed_angles else None,
+    }
+    chosen = {key: value for key, value in chosen.items() if value is not None}
+    accepted, domain = inspect.signature(cls).parameters, problem.domain
+    if "constants" in accepted:
+        chosen["constants"] = [kept.index(i) for i in problem.system.constants if i in kept]
+    if "borders" in accepted and domain is not None:
+        places = {problem.system.state_names[i]: place for place, i in enumerate(kept)}
+        chosen["borders"] = [(places[each.state], each) for each in domain.borders if each.state in places]
+    if "scaling" not in accepted:
+        raise UsageError(
+            f"Expected a network built as {options.name}(scaling, …), got none; add that argument to __init__."
+        )
+    for key in (key for key in chosen if key not in accepted):
+        option = {"embedded_angles": "embed_angles"}.get(key, key)
+        raise UsageError(f"Expected a network that takes {option}, got {name}; remove network.{option}.")
+    with float64_defaults(), torch.random.fork_rng(devices=[]), section("network"):
+        torch.manual_seed(config.seed)
+        V = cls(scaling=_scaling(config, problem, kept), **chosen)
+        goal = problem.goal.double().cpu()[kept]
+        if isinstance(V, StationaryNetwork):
+            V.goal.copy_(goal)
+        elif goal.any() and not isinstance(V, ExpansionNetwork):  # which has its own centre
+            V = CentredNetwork(V, goal)
+        if options.terminal == "exact":
+            V = TerminalAnchor(V, _terminal_cost(problem, kept), problem.horizon.duration)
+        if problem.horizon.stationary and not isinstance(V, StationaryNetwork):
+            V = Timeless(V)
+        if len(kept) < n:
+            V = IgnoringStates(V, kept, n)
+        if options.penalty and problem.constraints is not None:
+            V = WithPenalty(V, problem.constraints, problem.constraints.margin, problem.horizon.dt)
+    V.made_for = POLICIES[config.rollout.policy]
+    return V.to(DTYPES[config.training.precision])
+
+
+def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str) -> None:
+    """Refuse a V without time in a task that ends, and one that is φ at T in a task that does not.
+
+    Raises:
+        UsageError: as said.
+    """
+    stationary = problem.horizon.stationary
+    if issubclass(cls, StationaryNetwork) and not stationary:
+        raise UsageError(
+            "Expected horizon.stationary: true with the stationary network, got a horizon that ends; its V has no time."
+        )
+    if stationary and terminal == "exact":
+        raise UsageError(
+            "Expected network.terminal=free with horizon.stationary, got exact; V has no end at which it could be φ."
+        )
+
+
+def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout:
+    """The closed loop of V under the config's control law, integrator and gradient route.
+
+    Raises:
+        UsageError: compile is on for a route that has nothing to compile; or the law does not suit the problem.
+    """
+    options = config.rollout
+    if options.compile == "on" and options.gradient != "discrete":
+        raise UsageError(
+            f"Expected rollout.gradient=discrete for rollout.compile=on, got {options.gradient}; only that route "
+            "compiles: take it, or leave compile at auto."
+        )
+    with section("rollout"):
+        return Rollout(
+            problem, POLICIES[options.policy](problem, V), options.method, options.gradient, options.rtol, options.atol,
+            options.costate_limit,
+        )  # fmt: skip
+
+
+def build_program(config: Config) -> Program:
+    """The program of a config.
+
+    Raises:
+        UsageError: an option that the program does not have, or values that contradict each other.
+    """
+    options, cls = program_options(config), class_of(config, "program")
+    for name in options.keys() - inspect.signature(cls).parameters.keys():
+        raise UsageError(f"Expected no program.{name} with the {config.program.name} program, got one; remove it.")
+    check_parameters(cls, config.program.name, config.program.parameters, "program")
+    with section("program"):
+        program = cls(**options, **config.program.parameters)
+        program.check_terminal(exact=config.network.terminal == "exact")
+        return program
+
+
+def program_options(config: Config) -> dict[str, Any]:
+    """The weights and further keys that a config gives its program, but for `parameters`."""
+    given = vars(config.program)
+    return {key: value for key, value in given.items() if key not in ("name", "parameters") and value is not None}
+
+
+def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
+    """The indices of the states that V depends on."""
+    names, ignored = list(system.state_names), config.network.ignored_states
+    if unknown := [name for name in ignored if name not in names]:
+        raise UsageError(
+            f"Expected network.ignored_states among {', '.join(names)}, got {unknown[0]!r}; name states of the system."
+        )
+    if len(set(ignored)) == len(names):
+        raise UsageError("Expected V to depend on a state, got all in network.ignored_states; leave some out.")
+    return [i for i, name in enumerate(names) if name not in ignored]
+
+
+def _terminal_cost(problem: Problem, kept: list[int]) -> Cost:
+    """φ as a function of the kept states alone, which it has to be."""
+    n = problem.system.n
+    if not all(problem.cost.ignores_at_end(i, n) for i in range(n) if i not in kept):
+        raise UsageError(
+            "Expected cost.Q_T without the states in network.ignored_states for terminal=exact, got weights on them."
+        )
+    return problem.cost if len(kept) == n else problem.cost.restricted_to(kept, n)
+
+
+def _scaling(config: Config, problem: Problem, kept: list[int]) -> Scaling:
+    goal = problem.goal.double()
+    extent = problem.initial_states.reach_from(problem.goal).double()
+    given = entry_per_state("network.state_scale", config.network.state_scale, problem.system)
+    scale = given or [v if v > 0 else 1.0 for v in extent.tolist()]
+    value = config.network.value_scale
+    if value is None:
+        value = float(problem.cost.terminal((goal + torch.tensor(scale).to(goal)).to(problem.goal))) or 1.0
+    return Scaling([scale[i] for i in kept], problem.horizon.duration, value)

@@ -1,0 +1,46 @@
+"""The parts of the user's own that a config names, as objects."""
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from lyapnet.experiment.assembly.classes import Parts, class_of, instance_of, own_parts
+from lyapnet.experiment.assembly.learner import build_program, program_options
+from lyapnet.experiment.assembly.problem import build_cost, build_system, refuse_two_sets
+from lyapnet.experiment.config import Config
+
+
+def parts_of(config: Config) -> Parts:
+    """The user's own parts that a config names as module:Class, imported; nothing for what is registered.
+
+    Raises:
+        UsageError: no such module or class, or arguments that it does not take.
+    """
+    refuse_two_sets(config.controls)
+    return parts_named(config, own_parts(config))
+
+
+def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
+    """Parts by their section and the name of their class, with the other options of a config; as parts_of."""
+    config = copy.deepcopy(config)
+    for part, name in names.items():
+        getattr(config, part).name = name
+    builders: dict[str, Callable[[], Any]] = {
+        "system": lambda: build_system(config.system),
+        "cost": lambda: build_cost(config.cost),
+        "controls": lambda: instance_of(config.controls, "controls"),
+        "constraints": lambda: instance_of(config.constraints, "constraints"),
+        "network": lambda: class_of(config, "network"),
+        "program": lambda: build_program(config),
+    }
+    return Parts(**{part: builders[part]() for part in names})
+
+
+def python_of(config: Config, part: str) -> str:
+    """The Python expression for a part of the user's own that a config names, its module being imported."""
+    options = getattr(config, part)
+    name = options.name.replace(":", ".")
+    if part == "network":  # lyapnet.load takes its class
+        return name
+    given = {**(program_options(config) if part == "program" else {}), **options.parameters}
+    return f"{name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"

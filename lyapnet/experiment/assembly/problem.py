@@ -1,0 +1,245 @@
+"""From a config to its problem."""
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.contracts import initialised
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.experiment.assembly.classes import DTYPES, Parts, float64_defaults, instance_of, section
+from lyapnet.experiment.assembly.constraints import ball_of, build_constraints, choose_margins
+from lyapnet.experiment.assembly.domain import in_domain
+from lyapnet.experiment.assembly.entries import index_of, repeated, require_length, rows
+from lyapnet.experiment.assembly.family import family_of
+from lyapnet.experiment.assembly.free_controls import refuse_free_controls
+from lyapnet.experiment.assembly.stationary import without_end
+from lyapnet.experiment.assembly.target import Trim, about_target, trim
+from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
+from lyapnet.task.cost import (
+    COSTS,
+    Cost,
+    MadeOfAnother,
+    ObstacleCost,
+    PeriodicCost,
+    PseudoHuberCost,
+    QuadraticCost,
+    RegulatorTail,
+)
+from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box, ControlBox, ControlSet
+from lyapnet.task.systems import ControlAffineSystem, Linear
+
+
+def build_problem(config: Config, parts: Parts | None = None) -> Problem:
+    """The problem of a config, in its precision.
+
+    Args:
+        parts: taken instead of those that the config names.
+
+    Raises:
+        UsageError: a parameter, matrix, bound or dimension does not fit; names the section.
+    """
+    parts, dtype = parts or Parts(), DTYPES[config.training.precision]
+    with float64_defaults():
+        # in float64 for the checks below, and copies: the caller's own parts keep their precision
+        given = (parts.system, parts.cost, parts.controls, parts.constraints)
+        system, cost, controls, constraints = (copy.deepcopy(initialised(part)) for part in given)
+        system = build_system(config.system) if system is None else system.double()
+        system.check_coordinates()
+        initial_states = build_initial_states(config.initial_states, system)
+        with section("horizon"):
+            method = config.rollout.method
+            held = method if method in TABLEAUX else "rk4"  # of an adaptive method
+            horizon = Horizon(config.horizon.steps, config.horizon.dt, held, config.horizon.stationary)
+        if cost is None and config.cost.name in COSTS:
+            _refuse_free_controls(config, system, controls, initial_states, horizon)
+        with section("cost"):
+            cost = build_cost(_weights(config), system) if cost is None else cost.double()
+            if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
+                cost = PseudoHuberCost(cost, config.cost.huber)
+        with section("controls"):
+            controls = build_controls(config.controls, system) if controls is None else controls.double()
+        if config.family:
+            system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
+        elif not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
+            cost = about_target(config, cost, system, controls, initial_states)
+        if not isinstance(parts.cost, MadeOfAnother):
+            cost = _with_obstacles(config.cost, cost, system)
+        problem = Problem(system, cost, controls, initial_states, horizon)
+        if not config.family and config.cost.name not in COSTS:
+            _refuse_free_controls_of_own_cost(problem)
+        problem = problem.replaced(constraints=build_constraints(config.constraints, problem, constraints))
+        problem.check()
+        problem = in_domain(config.domain, problem)
+        if problem.constraints is not None and config.constraints.margin is None and config.network.penalty:
+            problem.constraints.margin = choose_margins(problem, problem.constraints)
+        if horizon.stationary and not isinstance(parts.cost, RegulatorTail):
+            problem = without_end(problem)
+        return problem.to(dtype)
+
+
+def operating_point(config: Config, parts: Parts | None = None) -> tuple[ControlAffineSystem, Trim]:
+    """The system of a config, and the operating point of its target, for which its cost and horizon are not asked.
+
+    Raises:
+        UsageError: as build_problem, for these.
+    """
+    parts = parts or Parts()
+    with float64_defaults():
+        system, controls = (copy.deepcopy(initialised(part)) for part in (parts.system, parts.controls))
+        system = build_system(config.system) if system is None else system.double()
+        system.check_coordinates()
+        initial_states = build_initial_states(config.initial_states, system)
+        with section("controls"):
+            controls = build_controls(config.controls, system) if controls is None else controls.double()
+        return system, trim(config, system, controls, initial_states)
+
+
+def _weights(config: Config) -> CostConfig:
+    """The cost section; with stationary V, of which no Q_T is asked, Q in its place until φ is known."""
+    if not config.horizon.stationary:
+        return config.cost
+    if config.family:
+        raise UsageError("Expected one system with horizon.stationary, got a family; train one V for each member.")
+    if config.cost.Q_T is not None:
+        raise UsageError("Expected no cost.Q_T with horizon.stationary, got one; φ is the regulator's: remove it.")
+    return replace(config.cost, Q_T=config.cost.Q)
+
+
+def _refuse_free_controls(
+    config: Config, system: ControlAffineSystem, controls: ControlSet | None, initial_states: Box, horizon: Horizon
+) -> None:
+    """Refuse a quadratic cost whose R has no weight for a control that has limits; other faults are found later."""
+    try:
+        R = torch.as_tensor(_control_weight(config.cost.R, system), dtype=torch.float64)
+        if torch.linalg.eigvalsh(R)[0] > 0:
+            return
+        weighted = build_cost(replace(_weights(config), R=1.0), system)
+        controls = build_controls(config.controls, system) if controls is None else controls.double()
+        cost = about_target(config, weighted, system, controls, initial_states)
+        problem = Problem(system, cost, controls, initial_states, horizon)
+    except (LyapnetError, ValueError, TypeError, RuntimeError):
+        return
+    refuse_free_controls(problem, R)
+
+
+def _refuse_free_controls_of_own_cost(problem: Problem) -> None:
+    """The same for a cost of the user's own; an R that is no matrix, or raises, is found by its contract."""
+    try:
+        R: Any = problem.cost.R(problem.initial_states.lower[None])
+    except Exception:  # of any kind: it is the user's
+        return
+    if isinstance(R, Tensor) and R.shape == (1, problem.system.m, problem.system.m):
+        refuse_free_controls(problem, R)
+
+
+def build_system(config: SystemConfig) -> ControlAffineSystem:
+    """The system of a config, registered or the user's own."""
+    return instance_of(config, "system")
+
+
+def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:
+    """A system of the same class from other arguments, in the precision and on the device of a tensor."""
+    with float64_defaults():
+        return type(system)(**parameters).to(like)
+
+
+def build_initial_states(config: InitialStatesConfig, system: ControlAffineSystem) -> Box:
+    """X₀ of a config; a single number is the bound of every state."""
+    with section("initial_states"):
+        bounds = {side: repeated(getattr(config, side), system.n) for side in ("lower", "upper")}
+        for side, bound in bounds.items():
+            require_length(f"initial_states.{side}", len(bound), system.state_names)
+        return Box(**bounds)
+
+
+def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
+    """The cost of a config; a quadratic one with its shapes held against the system's."""
+    if config.name not in COSTS:
+        if config.periodic:
+            raise UsageError("Expected cost.periodic with the quadratic cost, got another; write it into your own.")
+        return instance_of(config, "cost")
+    assert system is not None
+    for key in ("Q", "R", "Q_T"):
+        if getattr(config, key) is None:
+            raise UsageError(
+                f"Expected a value for cost.{key}, got none; add it to the config, or cost.{key}=… to the command."
+            )
+    if config.parameters:
+        raise UsageError("Expected no cost.parameters with the quadratic cost, got some; it has Q, R and Q_T.")
+    R = _control_weight(config.R, system)
+    weights = {key: rows(key, repeated(getattr(config, key), system.n)) for key in ("Q", "Q_T")}
+    for key, weight in weights.items():
+        require_length(f"cost.{key}", len(weight), system.state_names)
+    cost = QuadraticCost(R=R, **weights)
+    return _going_round(config.periodic, cost, system) if config.periodic else cost
+
+
+def _going_round(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
+    """The cost with some angles that go round; it must not know on which side of the goal they are."""
+    angles = [index_of(name, "cost.periodic", system) for name in names]
+    for weight in (cost.Q, cost.Q_T):
+        beside = weight[angles] * (1 - torch.eye(system.n)[angles])
+        if beside.any():
+            raise UsageError("Expected no products of a cost.periodic angle in Q and Q_T, got some; remove them.")
+    return PeriodicCost(cost, angles, system.n)
+
+
+def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem) -> Cost:
+    """The cost with the obstacles of a config."""
+    for k, given in enumerate(config.obstacles):
+        center, radius = ball_of(given, "cost.obstacles", {"center", "radius", "weight"}, system)
+        states = [index_of(name, f"cost.obstacles[{k}].center", system) for name in center]
+        with section("cost.obstacles"):
+            cost = ObstacleCost(cost, states, list(center.values()), radius, given["weight"])
+    return cost
+
+
+def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
+    """R as a matrix, or as the function of the state that inverse_mass names."""
+    if not isinstance(R, str):
+        R = rows("R", repeated(R, system.m))
+        require_length("cost.R", len(R), system.control_names)
+        return R
+    if R != "inverse_mass":
+        raise ValueError(f"Expected R as a number, the diagonal's numbers, a list of rows or inverse_mass, got {R!r}.")
+    inverse_mass: Callable[[Tensor], Tensor] | None = getattr(system, "inverse_mass", None)
+    if inverse_mass is None:
+        raise ValueError(
+            f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} has not; write R as rows."
+        )
+    # constant for a linear system: a matrix then, as the Riccati equation needs it
+    return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
+
+
+def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> ControlSet:
+    """The control set of a config: a box where it has limits, else a registered one or the user's own."""
+    if config.lower is None and config.upper is None:
+        return instance_of(config, "controls")
+    refuse_two_sets(config)
+    with float64_defaults(), section("controls"):
+        lower = _limits("controls.lower", config.lower, -math.inf, system)
+        return ControlBox(lower, _limits("controls.upper", config.upper, math.inf, system))
+
+
+def refuse_two_sets(config: ControlsConfig) -> None:
+    """Refuse limits beside a set that is named."""
+    limited = config.lower is not None or config.upper is not None
+    if limited and (config.name != "unbounded" or config.parameters):
+        raise UsageError(f"Expected limits or a controls.name, got both ({config.name}); leave one of them out.")
+
+
+def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> list[float]:
+    """A limit for each control, from a number, one for all, or a list in which null is none."""
+    entries = [none if entry is None else entry for entry in (given if isinstance(given, list) else [given])]
+    if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):
+        raise UsageError(f"Expected {key} as a number or a list of them, got {given!r}; write null where is no limit.")
+    entries = repeated(entries, system.m)
+    require_length(key, len(entries), system.control_names)
+    return entries

@@ -1,0 +1,61 @@
+"""Tasks without end: what a regulator goes on to pay after T, as the terminal cost."""
+
+import torch
+
+from lyapnet.base.errors import UsageError
+from lyapnet.task.cost import RegulatorTail
+from lyapnet.task.problem import Problem
+from lyapnet.value.regulator import Regulator
+
+PURPOSE, INSTEAD = "horizon.stationary", "choose another goal, or stationary: false"
+FREE, STATES = 1e-3, 256  # of the mean q at states of X₀: what staying at the goal may cost per second
+
+
+def without_end(problem: Problem) -> Problem:
+    """The problem with φ = (x − x*)ᵀP(x − x*), the infinite-horizon cost of the regulator linearised at the goal.
+
+    V of the linearised problem is then φ at every t, whatever T is. No limit may be met at the goal.
+
+    Raises:
+        UsageError: no control holds the goal, a limit is met there, it lies outside the constraints, staying there
+            costs something, or no regulator brings the state there.
+    """
+    limits, rest = problem.controls.limits, problem.rest
+    if limits is None:
+        raise UsageError(
+            f"Expected controls without limits, or a set that tells its `limits`, for {PURPOSE}, got "
+            f"{type(problem.controls).__name__}; choose another, or stationary: false."
+        )
+    lower, upper = (side.to(rest) for side in limits)
+    if not bool((lower < rest).all() and (rest < upper).all()):
+        raise UsageError(
+            f"Expected limits around the control at the goal, {rest.tolist()}, for {PURPOSE}, got {lower.tolist()} to "
+            f"{upper.tolist()}; widen controls, or choose another target."
+        )
+    _require_lasting_goal(problem)
+    n = problem.system.n
+    try:
+        regulator = Regulator(problem.replaced(cost=RegulatorTail(problem.cost, torch.zeros(n, n))), PURPOSE, INSTEAD)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+    return problem.replaced(cost=RegulatorTail(problem.cost, regulator.P))
+
+
+def _require_lasting_goal(problem: Problem) -> None:
+    """Refuse a goal outside the constraints, and one at which q is paid: for ever, that is more than any number.
+
+    Raises:
+        UsageError: as said.
+    """
+    place = f"x* = {problem.goal.tolist()}"
+    if problem.constraints is not None and bool((problem.constraints(problem.goal) > 0).any()):
+        raise UsageError(f"Expected a goal within the constraints for {PURPOSE}, got {place} outside; {INSTEAD}.")
+    at_goal, mean = (
+        float(problem.cost.state(x).mean())
+        for x in (problem.goal, problem.initial_states.sample(STATES, torch.Generator().manual_seed(0)))
+    )
+    if abs(at_goal) > FREE * abs(mean):
+        raise UsageError(
+            f"Expected q(x*) = 0 for {PURPOSE}, got {at_goal:.3g} per second at {place}; write a cost that vanishes "
+            "there, move cost.obstacles away from it, or take stationary: false."
+        )

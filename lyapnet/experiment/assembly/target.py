@@ -1,0 +1,234 @@
+"""The cost about a target, and the control that holds it."""
+
+import functools
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import UsageError, did_you_mean
+from lyapnet.experiment.assembly.entries import repeated, require_length
+from lyapnet.experiment.config import Config, ConstraintsConfig
+from lyapnet.task.cost import Cost, TargetCost
+from lyapnet.task.operating_points import HELD, OperatingPoint, OperatingPoints
+from lyapnet.task.sets import Box, ControlSet
+from lyapnet.task.systems import ControlAffineSystem
+
+OTHERS = 4  # further operating points that a note lists
+ELSEWHERE = "say what the cost counts u from, as in target_control: [0]"
+
+
+class Trim(NamedTuple):
+    """The operating point of a target, and what there was to choose from."""
+
+    point: OperatingPoint
+    others: list[OperatingPoint]
+    note: str  # how it was found; empty where the target was held as it was written
+
+
+def about_target(
+    config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet, initial_states: Box
+) -> Cost:
+    """The cost about the target of a config, if there is one; what was solved for is told in a note."""
+    if config.target is None or config.target_control is not None:
+        return about_written_target(config, cost, system, controls)
+    (x, u, *_), _, note = trim(config, system, controls, initial_states)
+    _tell(note)
+    return TargetCost(cost, x, u)
+
+
+def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
+    """The same where x* is taken as it is written, and u* too where it is: nothing is moved, nor solved for but u*."""
+    if config.target is None and config.target_control is not None:
+        raise UsageError("Expected target with target_control, got none; name the state that it holds.")
+    if config.target is None:
+        return cost
+    x = written_target(config, system)
+    u = holding(system, x) if config.target_control is None else _written_control(config, system)
+    if not bool(controls.contains(u)):
+        raise _not_admitted(u)
+    return TargetCost(cost, x, u)
+
+
+def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, initial_states: Box) -> Trim:
+    """The operating point of a config's target, f(x*) + g(x*)u* = 0: what is not given is solved for.
+
+    Raises:
+        UsageError: the target is none, or no control that is admitted holds it.
+    """
+    given = named_entries(config.target, system)
+    search = OperatingPoints(system, controls, initial_states, _state_limits(config.constraints, system))
+    if len(given) == system.n:
+        point = search.held_by(torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64))
+        if not point.held:
+            point, note = _moved(search, given, point)
+            return Trim(_admitted(point), [], note)
+        return Trim(_admitted(point), [], "")
+    points = search.find(given)
+    if not points:
+        raise UsageError(
+            f"Expected a target near which f and g are finite, got {_in_words(given, system)} and none in X₀; choose "
+            "another."
+        )
+    point, *others = points
+    if not point.held:
+        point, note = _moved(search, given, point)
+        return Trim(_admitted(point), [], note)
+    note = f"{_in_words(given, system)}; solved for {_place(point, system, given)}"
+    if others:
+        further = "; ".join(
+            _place(other, system, given) + ("" if other.admitted else ", beyond limits") for other in others[:OTHERS]
+        )
+        more = f" and {len(others) - OTHERS} more" if len(others) > OTHERS else ""
+        note += f", the nearest to X₀'s centre of {len(points)}; also {further}{more}"
+    return Trim(_admitted(point), others, f"target: {note}.")
+
+
+def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
+    """Index ↦ value of what a target gives: a list for every state, a number for all, or a mapping by their names.
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    if not isinstance(target, Mapping):
+        entries = repeated(target, system.n)
+        if not isinstance(entries, list | tuple):
+            raise UsageError(
+                f"Expected target as a number or a list of them, or as {{{system.state_names[0]}: …}}, got {target!r}; "
+                "write one of these."
+            )
+        require_length("target", len(entries), system.state_names)
+        named = dict(zip(system.state_names, entries, strict=True))
+    else:
+        named = dict(target)
+    known = {name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
+    found = dict[int, float]()
+    for name, number in named.items():
+        key = str(name).replace(" ", "_")
+        if key not in known:
+            names = ", ".join(system.state_names)
+            hint = did_you_mean(str(name), system.state_names, "name states of the system.")
+            raise UsageError(f"Expected target of the states {names}, got {name!r}; {hint}")
+        if known[key] in found:
+            raise UsageError(f"Expected target with one number for {name}, got two; leave one of them out.")
+        if type(number) not in (int, float) or not math.isfinite(number):
+            raise UsageError(
+                f"Expected target of finite numbers, got {number!r} for {name}; correct it, or leave it out of a "
+                f"mapping as in {{{system.state_names[0]}: 1}}, and it is solved for."
+            )
+        found[known[key]] = float(number)
+    if not found:
+        raise UsageError(f"Expected target with a state, got none; name one of {', '.join(system.state_names)}.")
+    return found
+
+
+def written_target(config: Config, system: ControlAffineSystem) -> Tensor:
+    """The target of a config that gives every state.
+
+    Raises:
+        UsageError: it does not.
+    """
+    given = named_entries(config.target, system)
+    missing = [name for i, name in enumerate(system.state_names) if i not in given]
+    if missing:
+        what = "with target_control" if config.target_control is not None else "with a family"
+        raise UsageError(
+            f"Expected target with every state {what}, got none for {', '.join(missing)}; give them, as lyapnet trim "
+            "finds them where they are to be solved for."
+        )
+    return torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64)
+
+
+def holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
+    """u* with f(x*) + g(x*)u* = 0.
+
+    Raises:
+        UsageError: there is none.
+    """
+    u, left = system.holding_control(x)
+    worst = int(left.abs().argmax())
+    if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
+        raise _not_held(system, x, f"choose another, or {ELSEWHERE}")
+    return u + 0.0  # 0 in the place of −0
+
+
+def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:
+    given = repeated(config.target_control, system.m)
+    require_length("target_control", len(given), system.control_names)
+    if not all(math.isfinite(number) for number in given):
+        raise UsageError(f"Expected target_control of finite numbers, got {given}; correct it.")
+    return torch.tensor(given, dtype=torch.float64)
+
+
+def _moved(search: OperatingPoints, given: Mapping[int, float], point: OperatingPoint) -> tuple[OperatingPoint, str]:
+    """A target that is not held, moved onto the nearest point that is, where it misses that by rounding alone."""
+    system, to_move = search.system, search.to_move(point.x, given)
+    near = search.nearest(point.x, to_move) if to_move else None
+    if near is not None and search.is_rounding(given, near.x):
+        moves = [
+            f"{system.state_names[i]} by {float(near.x[i]) - number:.3g} to {float(near.x[i]):.9g}"
+            for i, number in given.items()
+            if float(near.x[i]) != number
+        ]
+        solved = _place(near, system, given)
+        return near, f"target: moved onto the nearest operating point, {', '.join(moves)}; {solved}."
+    advice = f"choose another, or {ELSEWHERE}"
+    if near is not None and near.admitted:
+        advice = f"choose another, such as {_rounded(near.x)}, or {ELSEWHERE}"
+    raise _not_held(system, point.x, advice)
+
+
+def _not_held(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
+    left = system.holding_control(x)[1]
+    worst = int(left.abs().nan_to_num(torch.inf).argmax())
+    return UsageError(
+        f"Expected a target that some control holds, f(x*) + g(x*)u* = 0, got {float(left[worst]):.3g} for the rate of "
+        f"{system.state_names[worst]} at {_rounded(x)}; {advice}."
+    )
+
+
+def _admitted(point: OperatingPoint) -> OperatingPoint:
+    if not point.admitted:
+        raise _not_admitted(point.u)
+    return point
+
+
+def _not_admitted(u: Tensor) -> UsageError:
+    return UsageError(
+        f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
+        "choose another target."
+    )
+
+
+def _state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
+    """The limits of states that a config lists, for which points are sought within them; names are held elsewhere."""
+    low, high = (
+        torch.tensor([float(side.get(name, none)) for name in system.state_names], dtype=torch.float64)
+        for side, none in ((config.lower, -math.inf), (config.upper, math.inf))
+    )
+    return low, high
+
+
+def _in_words(given: Mapping[int, float], system: ControlAffineSystem) -> str:
+    return ", ".join(f"{system.state_names[i]} = {number:.9g}" for i, number in given.items())
+
+
+def _place(point: OperatingPoint, system: ControlAffineSystem, given: Mapping[int, float] | None = None) -> str:
+    """What a point was solved for, in nine digits: "current = 0.454124583, held by duty = 0.339388328"."""
+    states = {i: float(point.x[i]) for i in range(system.n) if given is None or i not in given}
+    controls = [f"{name} = {u:.9g}" for name, u in zip(system.control_names, point.u.tolist(), strict=True)]
+    return ", ".join([*([_in_words(states, system)] if states else []), f"held by {controls[0]}", *controls[1:]])
+
+
+def _rounded(x: Tensor) -> list[float]:
+    return [float(f"{number:.6g}") for number in x.tolist()]
+
+
+@functools.cache
+def _tell(note: str) -> None:
+    """Say it once in a process, however often its problem is built."""
+    if note:
+        logging.getLogger(__name__).warning("note: %s", note)

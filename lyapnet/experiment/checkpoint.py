@@ -1,0 +1,201 @@
+"""Checkpoint files: read without executing anything, written so that a crash leaves the previous one.
+
+Each carries a digest of all that it holds, so that a changed bit is noticed.
+"""
+
+import functools
+import hashlib
+import io
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.errors import CheckpointError, UsageError, one_line
+from lyapnet.base.files import require_file, write_atomically
+from lyapnet.base.plain_data import UNREADABLE, plain_data_of
+
+KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
+AFTER_HORIZON = "after_horizon"  # under KEY: the law after T that training found
+ZOO = Path(__file__).parents[1] / "zoo"  # the controllers that come with lyapnet, NAME.ckpt with NAME.json
+DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.3
+
+
+def located(path: str | Path) -> Path:
+    """Where a checkpoint lies: the path itself, or that of zoo:NAME among the controllers that come with lyapnet.
+
+    Raises:
+        UsageError: no such controller; names those that there are.
+    """
+    scheme, separator, name = str(path).partition(":")
+    if scheme != "zoo" or not separator or Path(path).exists():
+        return Path(path)
+    if name not in (known := zoo_names()):
+        raise UsageError(f"Expected zoo:NAME with one of {', '.join(known)}, got {str(path)!r}; see lyapnet zoo.")
+    return ZOO / f"{name}.ckpt"
+
+
+def zoo_names() -> list[str]:
+    """The controllers that come with lyapnet."""
+    return sorted(path.stem for path in ZOO.glob("*.ckpt"))
+
+
+def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dict[str, Any]:
+    """The content of a lyapnet checkpoint, as it was written: its digest is verified, and left out.
+
+    A note is logged for a file without a digest, as version 0.1 wrote them; the checksums of its archive are verified.
+
+    Raises:
+        UsageError: no such file.
+        CheckpointError: truncated, changed since it was written, not a checkpoint of lyapnet's, or holding anything but
+            plain data.
+    """
+    path = located(path)
+    content = read_plain_data(path, device)
+    if not isinstance(content, dict) or not all(isinstance(content.get(k), dict) for k in (KEY, "state_dict")):
+        raise CheckpointError(
+            f"Expected a lyapnet checkpoint, got {str(path)!r}, which another program wrote; use one from logs/."
+        )
+    if not _is_as_written(Path(path), content, content.pop(DIGEST, None)):
+        raise CheckpointError(
+            f"Expected the checkpoint that was written, got {str(path)!r}, which was changed or damaged since; use "
+            "another checkpoint of the run, or a copy of this one."
+        )
+    _add_missing_buffers(content["state_dict"])
+    return content
+
+
+def _add_missing_buffers(weights: dict[str, Any]) -> None:
+    """Add what files of up to 0.3 lack: whether an expansion network ends in φ, which theirs did not."""
+    for name, tensor in list(weights.items()):
+        prefix, _, last = name.rpartition(".")
+        if last == "at_goal" and isinstance(tensor, Tensor):
+            weights.setdefault(f"{prefix}.ends", torch.zeros_like(tensor))
+
+
+def digest_of(content: Any) -> str:
+    """The SHA-256 of plain data in a canonical form: every key and value with its type, in the order of the keys, and
+    of every tensor its dtype, shape and entries, bit for bit. The device does not count.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, content)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, value: Any) -> None:
+    if isinstance(value, Tensor):
+        value = value if value.layout == torch.strided else value.to_dense()
+        storage, strides = value.detach(), ()
+        if value.nbytes > value.untyped_storage().nbytes():  # expanded: what it is made of, not what it would fill
+            strides = (value.stride(), value.storage_offset())
+            storage = torch.empty(0, dtype=torch.uint8, device=value.device).set_(value.untyped_storage())
+        digest.update(f"tensor {value.dtype} {tuple(value.shape)} {strides};".encode())
+        digest.update(storage.cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    elif isinstance(value, Mapping):
+        digest.update(f"mapping {len(value)};".encode())
+        for key in sorted(value, key=lambda key: (type(key).__name__, repr(key))):
+            _feed(digest, key)
+            _feed(digest, value[key])
+    elif isinstance(value, list | tuple | set | frozenset):
+        digest.update(f"{type(value).__name__} {len(value)};".encode())
+        for entry in value if isinstance(value, list | tuple) else sorted(value, key=repr):
+            _feed(digest, entry)
+    else:
+        text = repr(value).encode()
+        digest.update(f"{type(value).__name__} {len(text)};".encode() + text)
+
+
+def _is_as_written(path: Path, content: dict[str, Any], digest: Any) -> bool:
+    """Whether a file's content has its digest; one without it, whether its archive has its checksums."""
+    try:
+        if digest is not None:
+            return digest == digest_of(content)
+        with zipfile.ZipFile(path) as archive:
+            # torch takes an entry with the attribute of a folder for empty, and what was in memory for its tensor
+            intact = archive.testzip() is None and not any(entry.external_attr for entry in archive.infolist())
+    except Exception:  # of any kind: what is checked may be hostile
+        return False
+    _note_missing_digest(path)
+    return intact
+
+
+@functools.cache  # once for each file: training reads it for its config, and Lightning for its weights
+def _note_missing_digest(path: Path) -> None:
+    logging.getLogger(__name__).warning("note: %s has no digest, as lyapnet 0.1 left it; it is taken as it is.", path)
+
+
+def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any:
+    """The content of a torch file that holds tensors, numbers, strings, lists and dictionaries only.
+
+    Raises:
+        UsageError: no such file.
+        CheckpointError: truncated, foreign, or holding anything else; nothing in it was executed.
+    """
+    path = Path(path)
+    try:
+        require_file(path)
+    except IsADirectoryError as error:
+        raise UsageError(
+            f"Expected a checkpoint file, got the folder {str(path)!r}; in a run's it is checkpoints/best.ckpt."
+        ) from error
+    except FileNotFoundError as error:
+        raise UsageError(
+            f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
+        ) from error
+    except (OSError, ValueError) as error:  # a name with a null character is a ValueError
+        raise UsageError(f"Expected a checkpoint file, got {str(path)!r} ({_words(error)}); use another.") from error
+    if not path.stat().st_size:
+        raise CheckpointError(
+            f"Expected a lyapnet checkpoint, got {str(path)!r}, which is empty; use another of the run."
+        )
+    try:
+        with path.open("rb") as file:
+            return plain_data_of(file, device)
+    except OSError as error:
+        raise CheckpointError(
+            f"Expected a readable checkpoint, got {str(path)!r} ({error.strerror}); use another."
+        ) from error
+    except UNREADABLE as error:
+        raise CheckpointError(
+            f"Expected a lyapnet checkpoint, got {str(path)!r}, which is truncated or foreign "
+            f"({_first_sentence(error)}); use another checkpoint of the run."
+        ) from error
+
+
+def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
+    """Write a checkpoint with its digest, all or nothing.
+
+    Raises:
+        CheckpointError: the disk is full, the folder cannot be written; the previous file is untouched.
+    """
+    buffer = io.BytesIO()
+    torch.save({**content, DIGEST: digest_of(content)}, buffer)
+    try:
+        write_atomically(Path(path), buffer.getbuffer())
+    except OSError as error:
+        raise CheckpointError(
+            f"Expected to write checkpoint {str(path)!r}, got {error.strerror}; make room and continue with --resume "
+            f"last: {'the previous checkpoint is untouched' if Path(path).exists() else 'there is no earlier one yet'}."
+        ) from error
+
+
+def note_in_checkpoint(path: str | Path, **notes: Any) -> None:
+    """Add plain data to what a checkpoint file says of itself, beside its config.
+
+    Raises:
+        CheckpointError: it cannot be read, or not be written; then it is untouched.
+    """
+    content = read_checkpoint(path)
+    write_checkpoint({**content, KEY: {**content[KEY], **notes}}, path)
+
+
+def _words(error: Exception) -> str:
+    """What the system says of a file, or what else was raised."""
+    return getattr(error, "strerror", None) or one_line(error)
+
+
+def _first_sentence(error: Exception) -> str:
+    return str(error).split("\n")[0].split(". ")[0][:120] or type(error).__name__

@@ -1,0 +1,359 @@
+"""The schema of an experiment: one dataclass a section, one sentence a field; and its loading, with clear refusals.
+
+A YAML file lists only what differs from these defaults; `key.sub=value` on the command line comes last.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from omegaconf import MISSING, OmegaConf
+
+from lyapnet.base.sizes import THREADS, check_sizes
+from lyapnet.experiment.recipe import STANDARD, completed
+from lyapnet.experiment.schema import Names, check_values, checked, differences, option, read_yaml
+
+# what is registered, without what registers it: a misspelt key is refused before torch is loaded
+CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
+COSTS = Names("task.cost", "COSTS")
+ACTIVATIONS = Names("value.networks", "ACTIVATIONS")
+NETWORKS = Names("value.networks", "NETWORKS")
+POLICIES = Names("value.policy", "POLICIES")
+PROGRAMS = Names("loop.programs", "PROGRAMS")
+GRADIENTS = Names("loop.rollout", "GRADIENTS")
+METHODS = Names("loop.rollout", "METHODS")
+CONTROL_SETS = Names("task.sets", "CONTROL_SETS")
+SYSTEMS = Names("task.systems", "SYSTEMS")
+SWITCH = ("auto", "on", "off")
+LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which every run has
+
+
+@dataclass
+class ProgramConfig:
+    """What is minimised; see Program for the loss and its units."""
+
+    name: str = option(
+        MISSING,
+        "A registered program, or module:Class of your own.",
+        choices=PROGRAMS,
+        user_class=True,
+    )
+    constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
+    terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
+    trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
+    normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
+    cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
+    relative: bool | None = option(
+        None, "Measure that distance against the cost of each trajectory, not against their mean (value only)."
+    )
+    margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
+    bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
+    share: float | None = option(None, "Share of ℓ by which V falls at least (region only).", above=0)
+    growth: float | None = option(None, "Weight of the share of D outside the region (region only).", at_least=0)
+    parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
+
+
+@dataclass
+class PointwiseConfig:
+    """The program's condition off the closed loops, as a certificate asks for it; see PointwiseCondition."""
+
+    weight: float | None = option(
+        None, "Weight of the condition at points of [0, T] × D; null: 0, with the region program 5.", at_least=0
+    )
+    points: int = option(512, "Points in each step.", at_least=2)
+    region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
+    floor: float | None = option(
+        None,
+        "ℓ₀ and φ₀ of it as shares of J̄/T and J̄; null: 0.01, of a stationary V 1e-4.",
+        above=0,
+    )
+    counterexamples: str | None = option(
+        None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
+    )
+
+
+@dataclass
+class SystemConfig:
+    """The dynamics ẋ = f(x) + g(x)u."""
+
+    name: str = option(
+        MISSING,
+        "A registered system, or module:Class of your own.",
+        choices=SYSTEMS,
+        user_class=True,
+    )
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor, in SI units.")
+
+
+@dataclass
+class CostConfig:
+    """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (one number: repeated), rows are a matrix."""
+
+    name: str = option("quadratic", "quadratic, or module:Class of your own.", choices=COSTS, user_class=True)
+    Q: Any = option(None, "State weight, symmetric positive semidefinite.")
+    R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
+    Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
+    periodic: list[str] = option([], "Angles δ whose δ² counts as 2(1 − cos δ), names of states.")
+    huber: float | None = option(None, "δ: q and φ count as 2δ²(√(1 + q/δ²) − 1), less far away.", above=0)
+    obstacles: list[dict[str, Any]] = option([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
+    parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
+
+
+@dataclass
+class ControlsConfig:
+    """U, the controls that are admitted: all, those between limits, or a set of the user's own."""
+
+    lower: Any = option(None, "Least controls: a number, or one for each; null: no limit.")
+    upper: Any = option(None, "Greatest controls, likewise.")
+    name: str = option(
+        "unbounded", "A registered control set, or module:Class of your own.", choices=CONTROL_SETS,
+        user_class=True,
+    )  # fmt: skip
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
+
+
+@dataclass
+class ConstraintsConfig:
+    """h(x) ≤ 0, the states that closed loops may enter: limits of states, balls, or a class of the user's own."""
+
+    lower: dict[str, float] = option({}, "Least values of states, by name.")
+    upper: dict[str, float] = option({}, "Greatest values, likewise.")
+    outside: list[dict[str, Any]] = option([], "Balls to stay out of, each as {center: {state: …}, radius: …}.")
+    inside: list[dict[str, Any]] = option([], "Balls to stay in, likewise.")
+    name: str = option(
+        "listed", "listed: those above; or module:Class of your own, besides.", choices=CONSTRAINTS,
+        user_class=True,
+    )  # fmt: skip
+    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
+    margin: float | None = option(
+        None,
+        "Of h, within which training pays for coming close; null: 0.02, or where u acts on h at once and "
+        "network.penalty is true, 0.002.",
+        above=0,
+    )
+
+
+@dataclass
+class DomainConfig:
+    """Where f, g, q and φ are defined, besides the borders that are found; see constraints for what is to be kept."""
+
+    lower: dict[str, float] = option({}, "Borders below, of states by name.")
+    upper: dict[str, float] = option({}, "Borders above, likewise.")
+
+
+@dataclass
+class InitialStatesConfig:
+    """X₀, the box of initial states; a single number is the bound of every state."""
+
+    lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
+    upper: list[float] = option(MISSING, "Upper bounds, one for each state.")
+
+
+@dataclass
+class HorizonConfig:
+    """N steps of Δt."""
+
+    steps: int = option(MISSING, "N, the number of time steps.", at_least=1)
+    dt: float = option(0.01, "Δt in seconds.", above=0)
+    stationary: bool = option(False, "A task without end: V(x), and the regulator's cost as φ.")
+
+
+@dataclass
+class NetworkConfig:
+    """V(t, x). Fields left at null take the network's own default."""
+
+    name: str = option(
+        "expansion",
+        "A registered network, or module:Class of your own.",
+        choices=NETWORKS,
+        user_class=True,
+    )
+    hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
+    activation: str | None = option(None, "A smooth activation.", choices=ACTIVATIONS)
+    ignored_states: list[str] = option([], "Names of states on which V does not depend.")
+    embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
+    epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
+    smooth: bool | None = option(None, "Smooth in time, for sound certificates (expansion).")
+    penalty: bool = option(False, "Add to N what a state pays in one step for coming close to constraints.")
+    terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
+    state_scale: list[float] | None = option(
+        None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0
+    )
+    value_scale: float | None = option(None, "Expected V; null: φ at the state scale.", above=0)
+
+
+@dataclass
+class RolloutConfig:
+    """How the closed loop is integrated and differentiated; see Rollout."""
+
+    policy: str = option("hjb", "The control law that V defines.", choices=POLICIES)
+    choose_policy: bool = option(
+        False, "Take lookahead in its place where the search for a start finds that this costs much less."
+    )
+    method: str = option("euler", "The integrator.", choices=METHODS)
+    gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
+    compile: str = option("auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH)
+    costate_limit: float | None = option(
+        None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", at_least=1
+    )
+    rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
+    atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
+
+
+@dataclass
+class TrainingConfig:
+    """The optimisation."""
+
+    iterations: int = option(200, "Gradient steps.", at_least=1, below=10**12)
+    batch_size: int = option(64, "Initial states in each step, per process.", at_least=1)
+    optimizer: str = option(
+        "adam",
+        "adam, adamw with decoupled weight decay, or muon for the matrices of V and adamw for the rest.",
+        choices=("adam", "adamw", "muon"),
+    )
+    learning_rate: float = option(1e-2, "Greatest step size: at the start, or after the warmup.", above=0)
+    final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
+    warmup: int = option(0, "Steps in which the learning rate rises to its greatest, linearly.", at_least=0)
+    beta1: float = option(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
+    beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
+    weight_decay: float = option(0.0, "AdamW weight decay.", at_least=0)
+    precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
+    threads: int = option(
+        1,
+        "CPU threads; in networks this small, more of them mostly wait for each other.",
+        at_least=1,
+        below=THREADS + 1,
+    )
+    lost_share: float = option(
+        0.0,
+        "Greatest share of a batch that is drawn from states whose closed loop costs more than V says.",
+        at_least=0,
+        below=1,
+    )
+    least_gain: float = option(
+        0.0,
+        "By how much the validation loss has to fall in 40 steps for training to take all iterations; 0: always.",
+        at_least=0,
+    )
+    validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
+
+
+@dataclass
+class EvaluationConfig:
+    """What is measured on states that training never sees."""
+
+    validation_states: int = option(64, "Initial states in each validation.", at_least=1)
+    test_states: int = option(256, "Initial states of the evaluation at the end of training.", at_least=1)
+    optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
+    figures_every: int = option(5, "Validations between figures; the last one always draws.", at_least=1)
+    animate: bool = option(True, "Show closed loops in motion in TensorBoard, after the last step.")
+    certify_every: int = option(0, "Validations between statistical bounds; 0 for none.", at_least=0)
+    certified_states: int = option(1000, "Fresh states for each such bound.", at_least=1)
+    confidence: float = option(1 - 1e-6, "Confidence of each such bound by itself.", above=0, below=1)
+
+
+@dataclass
+class Config:
+    """One experiment."""
+
+    experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
+    logs: str = option("logs", "The folder of all runs.")
+    seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0, below=2**63)
+    seeds: int = option(1, "Runs trained side by side, with the seeds seed, seed + 1, …", at_least=1)
+    program: ProgramConfig = field(default_factory=ProgramConfig)
+    pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
+    system: SystemConfig = field(default_factory=SystemConfig)
+    cost: CostConfig = field(default_factory=CostConfig)
+    controls: ControlsConfig = field(default_factory=ControlsConfig)
+    constraints: ConstraintsConfig = field(default_factory=ConstraintsConfig)
+    domain: DomainConfig = field(default_factory=DomainConfig)
+    initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
+    horizon: HorizonConfig = field(default_factory=HorizonConfig)
+    target: Any = option(
+        None, "x*, what the cost is about: a list, or {state: value}, the others solved for; null: its own goal.",
+        mapping=True,
+    )  # fmt: skip
+    target_control: list[float] | None = option(None, "u*, likewise; null: what holds x*, f(x*) + g(x*)u* = 0.")
+    family: dict[str, list[float]] = option(
+        {}, "Ranges of what V is told: parameters of the system, and target_STATE; each as [least, greatest]."
+    )
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    rollout: RolloutConfig = field(default_factory=RolloutConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
+    loggers: list[str] = option(["tensorboard"], "Where curves go besides metrics.csv.", choices=LOGGERS)
+    callbacks: list[str] = option([], "Lightning callbacks of your own, each as module:Class.")
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+def configs_of_seeds(config: Config) -> list[Config]:
+    """The config of each seed's run alone."""
+    return [dataclasses.replace(config, seed=config.seed + k, seeds=1) for k in range(config.seeds)]
+
+
+def label_of(config: Config) -> str:
+    """The name of a seed's run within an ensemble."""
+    return f"seed_{config.seed}"
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The config of a YAML file with `key.sub=value` overrides.
+
+    Raises:
+        UsageError: no such file, not YAML, an unknown key, a wrong type, a value out of range.
+    """
+    content = read_yaml(path, Config)
+    return config_from_plain({"experiment": Path(path).stem, **content}, overrides)
+
+
+def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """The config of a YAML file with its keys and types checked, and the values of its horizon: known without torch.
+
+    Raises:
+        UsageError: as load_config, for these.
+    """
+    content = {"experiment": Path(path).stem, **read_yaml(path, Config)}
+    given = {key: content.get(key, {}) for key in STANDARD}
+    standard = {key: {**STANDARD[key], **section} for key, section in given.items() if isinstance(section, Mapping)}
+    config = checked(Config, {**content, **standard}, overrides)
+    check_values(config.horizon, "horizon.")
+    return config
+
+
+def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Config:
+    """The config of plain nested dictionaries, checked like a file.
+
+    Raises:
+        UsageError: as load_config.
+    """
+    config = checked(Config, completed(content, overrides, _weights), overrides)
+    # YAML reads on and off as booleans
+    config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
+    check_values(config)
+    check_sizes(config)
+    return config
+
+
+def _weights(program: str) -> Mapping[str, Any]:
+    """What a registered program recommends; nothing for one of the user's own."""
+    from lyapnet.loop import programs  # loads torch
+
+    known = programs.PROGRAMS.get(program)
+    return {} if known is None else known.recommended
+
+
+def to_plain(config: Config) -> dict[str, Any]:
+    """The config as nested dictionaries, lists, numbers and strings, as a checkpoint holds it."""
+    return dataclasses.asdict(config)
+
+
+def to_yaml(config: Config) -> str:
+    """The resolved config as YAML."""
+    return OmegaConf.to_yaml(OmegaConf.create(to_plain(config)))
+
+
+def differing_keys(one: Config, other: Config) -> list[str]:
+    """Full names of the fields in which two configs differ."""
+    return list(differences(to_plain(one), to_plain(other)))

@@ -1,6 +1,0 @@
-"""V(x) and u(x) that were made elsewhere, as functions in Python or ONNX files, for the certificates."""
-
-from lyapnet.importing.files import imported_controller
-from lyapnet.importing.law import GivenLaw, GivenValue, controller_of
-
-__all__ = ["GivenLaw", "GivenValue", "controller_of", "imported_controller"]

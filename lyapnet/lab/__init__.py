@@ -1,0 +1,1 @@
+"""Measurements of lyapnet itself and against others; nothing but the command line imports it."""

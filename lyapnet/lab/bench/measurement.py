@@ -1,0 +1,94 @@
+"""Seconds, memory and error of the routes on one task and batch, in one run."""
+
+import gc
+import os
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.profiler import ProfilerActivity, profile
+
+from lyapnet.base.types import State
+from lyapnet.lab.bench.accuracy import reference_gradient, relative_error
+from lyapnet.lab.bench.cases import Case
+from lyapnet.lab.bench.routes import JAX_ROUTES, entries, timed
+
+
+@dataclass(frozen=True)
+class BenchRow:
+    """One route on one task and batch, as `lyapnet bench --json` prints it."""
+
+    task: str
+    states: int  # n
+    batch: int
+    route: str
+    compiled: bool
+    dtype: str
+    seconds: float  # median, for one loss and its gradient; for the closed loop alone, of the rollout routes
+    steps_per_second: float  # environment steps: batch · N / seconds
+    peak_bytes: int | None  # beyond the model; None: not torch's memory
+    relative_error: float | None  # ‖gradient − reference‖ / ‖reference‖; None: no gradient
+    compile_seconds: float | None  # to trace, and to compile or load from disk; None: nothing is compiled
+
+
+def time_routes(
+    case: Case, batch: int, routes: Sequence[str], repeats: int, say: Callable[[str], Any]
+) -> list[BenchRow]:
+    """A row for each route, and for each compiled one: all warmed up, then timed in turns, `repeats` times each.
+
+    Args:
+        case, batch, routes, repeats: what is measured.
+        say: called with the reason where compiled rows are left out.
+
+    Raises:
+        DivergenceError: the closed loop of the fresh V leaves the finite numbers.
+    """
+    x0 = case.sample(batch)
+    ready = list(entries(case, x0, routes, say))
+    gradients = [entry.flat and entry.flat(entry.run()) for entry in ready]  # and caches are warm
+    errors = _errors(gradients, case, x0)
+    peaks = [None if entry.route in JAX_ROUTES else peak_bytes(entry.run) for entry in ready]
+    turns = [[timed(entry.run)[1] for entry in ready] for _ in range(repeats)]
+    rows = []
+    for entry, error, peak, times in zip(ready, errors, peaks, zip(*turns, strict=True), strict=True):
+        seconds = statistics.median(times)
+        rows.append(
+            BenchRow(
+                case.name, case.problem.system.n, batch, entry.route, entry.compiled, case.config.training.precision,
+                seconds, batch * case.problem.horizon.steps / seconds, peak, error, entry.compile_seconds,
+            )
+        )  # fmt: skip
+    return rows
+
+
+def _errors(gradients: Sequence[Tensor | None], case: Case, x0: State) -> list[float | None]:
+    if all(gradient is None for gradient in gradients):
+        return [None] * len(gradients)
+    reference = reference_gradient(case, x0)
+    return [None if gradient is None else relative_error(gradient, reference) for gradient in gradients]
+
+
+def use_threads(threads: int) -> None:
+    """Compute on that many CPU threads; so does JAX, unless it has computed before."""
+    torch.set_num_threads(threads)
+    os.environ["NPROC"] = str(threads)
+
+
+def peak_bytes(run: Callable[[], Any]) -> int:
+    """The most that a call holds of torch's CPU memory, beyond what was held before, in bytes.
+
+    The allocator itself reports to torch's profiler, whether eager code, autograd or compiled code asks for memory.
+    Scratch that kernels take from elsewhere, as MKL does, is not seen.
+    """
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # or the profiler writes to the terminal
+    gc.collect()
+    with profile(activities=[ProfilerActivity.CPU], profile_memory=True) as recording:
+        run()
+    results: Any = getattr(recording.profiler, "kineto_results", None)
+    events = [event for event in results.events() if event.name() == "[memory]"]
+    changes = [event.nbytes() for event in sorted(events, key=lambda event: event.start_ns())]
+    return max(accumulate(changes), default=0)

@@ -1,0 +1,226 @@
+"""One job from start to end, in this process: trained from where it was stopped, and measured like all others."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock
+from rich.console import Console
+
+from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.files import read_file, write_json
+from lyapnet.base.random_streams import TEST, stream
+from lyapnet.base.types import State
+from lyapnet.controller.controller import Controller
+from lyapnet.controller.loading import load
+from lyapnet.evaluation.states import measure
+from lyapnet.experiment.assembly import parts_of
+from lyapnet.experiment.config import ControlsConfig, CostConfig, config_from_plain, to_plain
+from lyapnet.experiment.schema import differences
+from lyapnet.lab.comparison.baselines.training import BaselineTraining, best_policy
+from lyapnet.lab.comparison.controller_policy import ControllerPolicy
+from lyapnet.lab.comparison.plan import RESULT, Job
+from lyapnet.lab.comparison.planners import PlannerPolicy, planner_of
+from lyapnet.lab.comparison.results import OURS, PLANNED, ControlTimes, Measurement, Result
+from lyapnet.lab.comparison.scoring import Costs, costs_of, optima_of
+from lyapnet.lab.comparison.timing import times_of_controller, times_of_policy
+from lyapnet.lab.sweep.points import Point
+from lyapnet.training.runs import Run
+
+RECORD, LOCK = "job.json", "lock"
+
+
+def run_job(job: Job, console: Console) -> Result:
+    """Train what is not trained yet, measure it, and leave the result.
+
+    Raises:
+        UsageError: the folder holds another job of that name.
+        LyapnetError: the training fails.
+    """
+    job.folder.mkdir(parents=True, exist_ok=True)
+    # another process may be at it: one that outlived its parent
+    with FileLock(job.folder / LOCK, fallback_to_soft=False):  # a soft one would outlive a process that is killed
+        require_same(job)
+        if (done := job.result) is not None:
+            return done
+        write_json(job.folder / RECORD, _description(job))
+        torch.set_num_threads(1)  # jobs run side by side
+        make = _lyapnet if job.method == OURS else _planner if job.method in PLANNED else _baseline
+        result = make(job, console)
+        result.write(job.folder / RESULT)
+        return result
+
+
+def require_same(job: Job) -> None:
+    """Hold a job that was begun before against what its folder was made for.
+
+    Raises:
+        UsageError: it was another one.
+    """
+    record = job.folder / RECORD
+    if not record.is_file():
+        return
+    wanted = json.loads(json.dumps(_description(job)))
+    kept = _with_defaults(json.loads(read_file(record)))
+    changes = [
+        text if len(text := f"{name} = {now} instead of {then}") < 80 else f"another {name}"
+        for name, (then, now) in differences(kept, wanted).items()
+    ]
+    if changes:
+        raise UsageError(
+            f"Expected {job.name} as it was begun, got {', '.join(changes)}; undo the change, remove "
+            f"{str(job.folder)!r}, or give the comparison another name."
+        )
+
+
+def _description(job: Job) -> dict[str, Any]:
+    """What a result depends on."""
+    evaluation = [job.comparison.evaluation_states, job.comparison.evaluation_seed]
+    config, scale = to_plain(job.config), job.bounded.control_scale
+    if job.method == OURS:
+        return {"evaluation": evaluation, "control_scale": scale, "config": {**config, "logs": ""}}
+    task = [config[key] for key in ("system", "cost", "controls", "initial_states", "horizon")]
+    method = {} if job.method in PLANNED else job.baseline.description
+    return {"evaluation": evaluation, "control_scale": scale, "task": task, **method}
+
+
+def _with_defaults(kept: dict[str, Any]) -> dict[str, Any]:
+    """A record with the defaults of the keys that came since version 0.1."""
+    if "config" in kept:
+        return {**kept, "config": {**to_plain(config_from_plain(kept["config"])), "logs": ""}}
+    if len(kept["task"]) == 4:
+        system, cost, initial_states, horizon = kept["task"]
+        task = [system, {**asdict(CostConfig()), **cost}, asdict(ControlsConfig()), initial_states, horizon]
+        return {**kept, "task": task}
+    return kept
+
+
+def _lyapnet(job: Job, console: Console) -> Result:
+    from lyapnet.training.experiment import train  # Lightning takes seconds to import: baselines do without
+
+    config, bounded, states = job.config, job.bounded, _states(job)
+    point = Point(Path(job.compared.config), job.settings)
+    run = point.run()
+    if run is None or not run.finished:
+        last = None if run is None or not run.last.is_file() else str(run.last)
+        run = train(point.path, point.settings, resume=last, console=console)
+    controller = _controller(job, run.best)
+    costs = costs_of(ControllerPolicy(controller, bounded.control_scale), bounded, True, states)
+    with torch.no_grad():
+        constraint_loss = measure(controller.problem, controller.program, controller.rollout(states)).constraint_loss
+    record = run.record()
+    compilation, start = record.get("compilation_seconds", 0.0), record.get("start", {}).get("seconds", {})
+    before = compilation + max(start.values(), default=0.0)
+    validations = _validations(run, config.training.batch_size * config.horizon.steps, before)
+    return _result(
+        job, states, costs, str(run.best), validations, compilation,
+        constraint_loss=float(constraint_loss.mean()), times=times_of_controller(controller, states),
+    )  # fmt: skip
+
+
+def _controller(job: Job, checkpoint: Path) -> Controller:
+    return load(checkpoint, **vars(parts_of(job.config)))
+
+
+def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
+    """task ↦ the controller of its first finished job of lyapnet."""
+    found: dict[str, Controller] = {}
+    for job in jobs:
+        if job.method == OURS and job.task not in found and (result := job.result) is not None:
+            checkpoint = Path(result.checkpoint)
+            if checkpoint.is_file():  # the results alone may have been kept
+                found[job.task] = _controller(job, checkpoint)
+    return found
+
+
+def _validations(run: Run, steps: int, before: float) -> list[Measurement]:
+    """The validations of a run, `steps` environment steps to an iteration and `before` seconds before it,
+    from its metrics.csv.
+
+    Raises:
+        LyapnetError: the run has none there.
+    """
+    from lyapnet.training.metrics_file import METRICS, STEP, read_curves  # with Lightning, as above
+
+    names = ("trajectory_cost/val", STEP, "training_seconds", "optimality_gap/val", "constraint_loss/val")
+    validations = [
+        Measurement(int(iteration) * steps, before + seconds, cost, None if gap is None else 1 + gap, loss)
+        for cost, iteration, seconds, gap, loss in read_curves(run.folder, *names)
+    ]
+    if not validations:
+        raise LyapnetError(
+            f"Expected the validations of {str(run.folder)!r} in its {METRICS}, got none; lyapnet 0.1 did not write "
+            "that file: remove the run, and the same command trains it again."
+        )
+    return validations
+
+
+def _baseline(job: Job, console: Console) -> Result:
+    baseline, states = job.baseline, _states(job)
+    training = BaselineTraining(baseline, job.folder)
+
+    def report(point: Measurement) -> None:
+        ratio = "" if point.cost_ratio is None else f"  cost/optimum {point.cost_ratio:.4g}"
+        console.print(f"{point.environment_steps}/{baseline.steps}  cost {point.cost:.4g}{ratio}", soft_wrap=True)
+
+    training.run(report)
+    path, policy = best_policy(baseline, job.folder)
+    costs = costs_of(policy, job.bounded, baseline.setting.observe_time, states)
+    times = times_of_policy(policy, job.bounded, baseline.setting.observe_time, states)
+    return _result(job, states, costs, str(path), training.curve, times=times)
+
+
+def _planner(job: Job, console: Console) -> Result:
+    bounded, states = job.bounded, _states(job)
+    began = time.process_time()
+    policy = PlannerPolicy(planner_of(job.method, bounded.problem), bounded)
+    prepared = time.process_time() - began
+    costs = costs_of(policy, bounded, True, states)
+    console.print(f"{job.name}: mean cost {float(costs.cost.mean()):.4g}", soft_wrap=True)
+    return _result(
+        job, states, costs, "", [], seconds=prepared, times=policy.times, unsolved_fraction=policy.unsolved_fraction
+    )
+
+
+def _states(job: Job) -> State:
+    """The evaluation states: the same for every method and seed."""
+    comparison = job.comparison
+    draw = stream(comparison.evaluation_seed, TEST)
+    return job.bounded.problem.initial_states.sample(comparison.evaluation_states, draw)
+
+
+def _result(
+    job: Job,
+    states: State,
+    costs: Costs,
+    checkpoint: str,
+    validations: Sequence[Measurement],
+    compilation: float = 0.0,
+    seconds: float | None = None,
+    constraint_loss: float | None = None,
+    times: ControlTimes | None = None,
+    unsolved_fraction: float | None = None,
+) -> Result:
+    optima = optima_of(job.bounded, states)
+    return Result(
+        task=job.task,
+        method=job.method,
+        seed=job.seed,
+        environment_steps=validations[-1].environment_steps if validations else 0,
+        seconds=validations[-1].seconds if seconds is None else seconds,
+        compilation_seconds=compilation,
+        costs=costs.cost.tolist(),
+        sums=costs.sum.tolist(),
+        optima=None if optima is None else optima.tolist(),
+        constraint_loss=constraint_loss,
+        clipped_fraction=costs.clipped_fraction,
+        horizon_steps=job.bounded.problem.horizon.steps,
+        checkpoint=checkpoint,
+        curve=validations,
+        times=times,
+        unsolved_fraction=unsolved_fraction,
+    )

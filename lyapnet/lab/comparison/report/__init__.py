@@ -1,0 +1,7 @@
+"""The report of a comparison, from whatever results there are: tables, figures, every number, and TensorBoard."""
+
+from lyapnet.lab.comparison.report.alternatives import brief_alternatives
+from lyapnet.lab.comparison.report.details import summary
+from lyapnet.lab.comparison.report.writing import write_report
+
+__all__ = ["brief_alternatives", "summary", "write_report"]

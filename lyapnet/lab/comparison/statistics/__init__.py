@@ -1,0 +1,26 @@
+"""What the seeds of a method reach, how sure that is, and how methods compare: pure functions of results."""
+
+from lyapnet.lab.comparison.statistics.comparison import TASKS, Comparison, Speedup, compared, in_order
+from lyapnet.lab.comparison.statistics.groups import CONVERGED, NEAR, AtStep, Group, Reach
+from lyapnet.lab.comparison.statistics.one_result import cost_ratio, first_within, optimum, relative_costs
+from lyapnet.lab.comparison.statistics.spread import Spread, interquartile_mean, spread
+
+__all__ = [
+    "CONVERGED",
+    "NEAR",
+    "TASKS",
+    "AtStep",
+    "Comparison",
+    "Group",
+    "Reach",
+    "Speedup",
+    "Spread",
+    "compared",
+    "cost_ratio",
+    "first_within",
+    "in_order",
+    "interquartile_mean",
+    "optimum",
+    "relative_costs",
+    "spread",
+]

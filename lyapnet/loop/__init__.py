@@ -1,0 +1,1 @@
+"""Closed loops of a control law, and what is minimised along them."""

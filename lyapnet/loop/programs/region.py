@@ -1,0 +1,109 @@
+"""The region program: V(x) falls along the closed loop on as large a sublevel set in a box as can be had."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.base.types import PerState, State, ValuePath
+from lyapnet.loop.programs.base import Program
+from lyapnet.loop.programs.pointwise import PointwiseCondition
+from lyapnet.loop.programs.terms import hinge, terminal_hinge
+from lyapnet.loop.rollout import Trajectory
+from lyapnet.value.networks import kept_states
+
+CEILING = 1.15  # times the least V on the boundary of D: points above do not count as failing
+SHARPNESS, SOFTNESS = 8.0, 30.0  # of what is smoothed: a step at V = ρ, and the least V on the boundary, both in log V
+BOUNDARY, SAMPLES = 1024, 20_000  # points on the boundary, and of D where the region is measured
+
+
+@dataclass(frozen=True)
+class RegionProgram(Program):
+    """V̇ + share · ℓ ≤ 0 on {x ∈ D: V(x) ≤ ρ}, ρ = the least V on the boundary of D, and that set as large as can be.
+
+    It is a program of points, RegionCondition, and not of closed loops: C = Σ_n max(V_{n+1} − V_n + share Δt ℓ_n, 0)
+    along these and J_N, the cost of the closed loop, are further terms. V is no longer the cost-to-go, but a Lyapunov
+    function of its law; with share < 1 it may grow steeper than the cost-to-go where that makes the region larger.
+
+    Args:
+        share: of the running cost, by which V falls at the least, so that a proof has room.
+        growth: weight of the share of D outside the region, against the condition.
+    """
+
+    degree: ClassVar[int] = 1
+    needs_goal: ClassVar[bool] = True
+    pointwise: ClassVar[float] = 5.0
+    recommended: ClassVar[Mapping[str, float | bool]] = MappingProxyType(
+        {"constraint": 0, "trajectory_cost": 1, "share": 0.4, "growth": 0.06}
+    )
+
+    share: float = 0.4
+    growth: float = 0.06
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 < self.share <= 1:
+            raise ValueError(f"Expected share in (0, 1], got {self.share}; V cannot pay for more than the cost.")
+        if not self.growth >= 0:
+            raise ValueError(f"Expected growth ≥ 0, got {self.growth}; the region is to grow.")
+
+    def excess(self, rate: Tensor, running: Tensor) -> Tensor:
+        return rate + self.share * running
+
+    def penalty(self, excess: Tensor) -> Tensor:
+        return torch.relu(excess)
+
+    def constraint_loss(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        return hinge(values, self.share * trajectory.step_cost)
+
+    def terminal_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
+        return terminal_hinge(values, trajectory.terminal_cost)
+
+
+class RegionCondition(PointwiseCondition):
+    """The mean of max(V̇ + share ℓ, 0) / (ℓ + ℓ₀) at points of {x ∈ D: V ≤ 1.15 ρ} + growth × the share of D outside:
+
+        mean over x ∈ D of σ(8 log(V(x)/ρ)),     ρ = (Σ V⁻³⁰)^(−1/30) over points of the boundary of D,
+
+    a smooth measure of the volume that {V ≤ ρ} does not have yet. Points are drawn and sought as of PointwiseCondition.
+    """
+
+    program: RegionProgram
+
+    def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
+        """The condition at the points of one step; of the closed loops it needs the mean cost alone."""
+        level = -torch.logsumexp(-SOFTNESS * self._log_value(self._boundary(generator)), 0) / SOFTNESS
+        failing = self.condition(generator, self.floor * mean_cost.detach(), CEILING * level.detach().exp())
+        inside = self.region.sample(2 * self.points, generator).to(mean_cost)
+        return failing + self.program.growth * torch.sigmoid(SHARPNESS * (self._log_value(inside) - level)).mean()
+
+    @torch.no_grad()
+    def sampled_share(self, generator: torch.Generator) -> Float[Tensor, ""]:
+        """The share of D in the largest {V ≤ ρ} on which V falls, as far as samples tell."""
+        V, loop = self.V, self.closed_loop
+        x, now = self.region.sample(SAMPLES, generator).to(self.goal), self.goal.new_zeros(())
+        value, slope = V.value_and_state_gradient(now, x)
+        rising = (slope * loop.system.dynamics(x, loop.policy(now, x))).sum(-1) >= 0
+        boundary = self._log_value(self._boundary(generator)).exp()
+        level = torch.minimum(value.where(rising, torch.inf).min(), boundary.min())
+        return (value < level).to(x).mean()
+
+    def _log_value(self, x: State) -> PerState:
+        return self.V(x.new_zeros(()), x).clamp_min(torch.finfo(x.dtype).tiny).log()
+
+    def _boundary(self, generator: torch.Generator) -> State:
+        """Points of the boundary of D, as many on each side along which V changes."""
+        x = self.region.sample(BOUNDARY, generator).to(self.goal)
+        sides = [(i, side) for i in self.axes for side in (self.region.lower[i], self.region.upper[i])]
+        for k, (i, side) in enumerate(sides):
+            x[k :: len(sides), i] = side
+        return x
+
+    @property
+    def axes(self) -> list[int]:
+        """The states that V depends on: along the others V does not change, and D has no boundary."""
+        return kept_states(self.V, self.region.dimension)

@@ -1,0 +1,54 @@
+"""The closed loop as one vector field of the state and its running cost."""
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.types import Control, State, Time
+from lyapnet.task.cost import Cost
+from lyapnet.task.problem import Problem
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.policy import PolicyOutput, ValuePolicy
+
+
+class ClosedLoop(nn.Module):
+    """The right-hand side of (x, ∫ℓ): d/dt (x, c) = (f + g u, ℓ(x, u)) with u = policy(t, x)."""
+
+    system: ControlAffineSystem
+    cost: Cost
+    policy: nn.Module
+
+    def __init__(self, problem: Problem, policy: nn.Module):
+        super().__init__()
+        self.system, self.cost, self.policy = problem.system, problem.cost, policy
+
+    @property
+    def V(self) -> ValueFunction | None:
+        """The V that defines the control law; None where no V does."""
+        return self.policy.V if isinstance(self.policy, ValuePolicy) else None
+
+    def forward(self, t: Time, y: Tensor) -> Tensor:
+        x = y[..., :-1]
+        return self.slope(x, self.policy(t, x))
+
+    def slope(self, x: State, u: Control) -> Tensor:
+        """(f + g u, ℓ), (*batch, n + 1)."""
+        return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
+
+    def control(self, t: Time, x: State) -> PolicyOutput:
+        """u, V and V_x; with a law that no V defines, V = 0."""
+        if isinstance(self.policy, ValuePolicy):
+            return self.policy.with_value(t, x)
+        return PolicyOutput(self.policy(t, x), torch.zeros_like(x[..., 0]), torch.zeros_like(x))
+
+
+class SteppedLoop(ClosedLoop):
+    """The means of (f + gu, ℓ) over a step with u held: Euler steps of it are steps of the horizon's method."""
+
+    def __init__(self, problem: Problem, policy: nn.Module):
+        super().__init__(problem, policy)
+        self.problem = problem
+
+    def slope(self, x: State, u: Control) -> Tensor:
+        rate, cost = self.problem.rates(x, u)
+        return torch.cat([rate, cost[..., None]], -1)

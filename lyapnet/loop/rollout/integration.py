@@ -1,0 +1,216 @@
+"""Closed-loop integration of the state and its running cost, differentiable in the parameters of V."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.errors import DivergenceError
+from lyapnet.base.types import ControlPath, PerState, State, StatePath, Times, ValuePath
+from lyapnet.loop.rollout.closed_loop import ClosedLoop, SteppedLoop
+from lyapnet.loop.rollout.discrete_adjoint import DiscreteAdjoint
+from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.problem import Problem
+
+
+class Trajectory(NamedTuple):
+    """A batch of closed-loop trajectories on the nodes of the horizon."""
+
+    t: Times  # (N + 1,)
+    x: StatePath  # (N + 1, *batch, n)
+    u: ControlPath  # (N, *batch, m) applied from t_n on; a record, never part of the graph
+    running_cost: ValuePath  # (N + 1, *batch): ∫ℓ up to t_n
+    terminal_cost: PerState  # (*batch,): φ(x_N)
+    value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), where a V defines the control law
+
+    def require_value(self) -> ValuePath:
+        """V along the trajectory.
+
+        Raises:
+            ValueError: no V defines the control law.
+        """
+        if self.value is None:
+            raise ValueError("Expected a trajectory under the control law of a V, got another law; use a ValuePolicy.")
+        return self.value
+
+    @property
+    def cost(self) -> Any:  # a tensor, or an array where the fields are arrays
+        """J_N = running cost plus terminal cost, (*batch,)."""
+        return self.running_cost[-1] + self.terminal_cost
+
+    @property
+    def step_cost(self) -> Any:
+        """∫ℓ over each step in the integrator's own quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
+        return self.running_cost[1:] - self.running_cost[:-1]
+
+
+FIXED_STEP_METHODS = tuple(TABLEAUX)
+ADAPTIVE_METHODS = ("dopri5",)
+METHODS = FIXED_STEP_METHODS + ADAPTIVE_METHODS
+GRADIENTS = ("adjoint", "backprop", "discrete")
+
+
+class Rollout(nn.Module):
+    """x₀ ↦ Trajectory under u = policy(t, x), by torchdiffeq on the state augmented with the running cost.
+
+    Fixed-step methods take one step from node to node: with Euler, x_{n+1} = x_n + Δt(f + g u) and the cost is J_N.
+
+    Args:
+        problem, policy: what is integrated.
+        method: a member of METHODS, None: the horizon's; rk4 is the 3/8 rule, dopri5 chooses its own steps between the
+            nodes. A law that is made to be held is held over each step of a fixed-step method, else it is u(t, x) at
+            every stage.
+        gradient: a member of GRADIENTS.
+
+            * adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
+              to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
+              adjoint). Memory does not grow with the graph of a step; the gradient is that of the continuous problem,
+              so on a fixed grid it differs from the discrete one by O(Δt).
+            * backprop: automatic differentiation through the steps; the exact gradient of the discretisation.
+            * discrete: the same gradient, exact, by the discrete costate equation (see DiscreteAdjoint); several times
+              faster than either, in memory that grows with neither the network nor the graph of the steps. For
+              fixed-step methods.
+        rtol, atol: tolerances of adaptive methods.
+        costate_limit: with gradient discrete, times the median of its batch that a costate may be long; None: any, the
+            exact gradient (see DiscreteAdjoint).
+        held: whether u is held over each step; None: as the law is made to be.
+
+    Raises:
+        ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
+            an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler; or a
+            limit of the costates below 1, or of another gradient.
+    """
+
+    problem: Problem
+    closed_loop: ClosedLoop
+    stepped: ClosedLoop
+    horizon: Horizon
+    method: str
+    gradient: str
+    discrete: DiscreteAdjoint | None
+
+    def __init__(
+        self,
+        problem: Problem,
+        policy: nn.Module,
+        method: str | None = None,
+        gradient: str = "adjoint",
+        rtol: float = 1e-6,
+        atol: float = 1e-8,
+        costate_limit: float | None = None,
+        held: bool | None = None,
+    ):
+        super().__init__()
+        method = problem.horizon.method if method is None else method
+        for name, value, known in (("method", method, METHODS), ("gradient", gradient, GRADIENTS)):
+            if value not in known:
+                raise ValueError(f"Expected {name} as one of {', '.join(known)}, got {value!r}; choose one of them.")
+        if gradient == "discrete" and method not in FIXED_STEP_METHODS:
+            raise ValueError(
+                f"Expected method as one of {', '.join(FIXED_STEP_METHODS)} for gradient discrete, got {method!r}; "
+                "choose one of them, or gradient adjoint."
+            )
+        if costate_limit is not None and not (gradient == "discrete" and costate_limit >= 1):
+            raise ValueError(
+                f"Expected a costate_limit ≥ 1 of gradient discrete, got {costate_limit} of {gradient}; leave it out."
+            )
+        wanted = getattr(policy, "held", False) if held is None else held
+        held = bool(wanted) and method in FIXED_STEP_METHODS[1:]  # with Euler steps every law is held
+        if held and gradient == "adjoint":
+            raise ValueError(
+                f"Expected gradient discrete or backprop for a law that is held over steps of {method}, got adjoint; "
+                "choose one of them: the costate equation of continuous time knows nothing of a held control."
+            )
+        self.closed_loop, self.horizon = ClosedLoop(problem, policy), problem.horizon
+        self.stepped = SteppedLoop(problem.in_steps(method=method), policy) if held else self.closed_loop
+        self.problem, self.method, self.gradient = problem, method, gradient
+        step = "euler" if held else method  # of the mean over a step that `method` takes
+        self.solver_arguments: dict[str, Any] = {"method": step, "rtol": rtol, "atol": atol}
+        if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
+            self.solver_arguments["options"] = {"max_num_steps": 10_000}
+        self.discrete = None
+        if gradient == "discrete":
+            steps, dt = self.horizon.steps, self.horizon.dt
+            self.discrete = DiscreteAdjoint(self.stepped, steps, dt, step, costate_limit)
+
+    def forward(self, x0: State) -> Trajectory:
+        """The closed loop from x₀ (*batch, n).
+
+        Raises:
+            DivergenceError: a state or cost is not finite; names the step and the initial state. Or an adaptive method,
+                which takes its steps for the whole batch, gave up.
+        """
+        t = self.horizon.times(x0)
+        x, running_cost, value, u = (self._integrate if self.discrete is None else self._discretely)(x0, t)
+        _require_finite(x, running_cost, t)
+        return Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
+
+    @property
+    def takes_steps_of_problem(self) -> bool:
+        """Whether it goes from node to node as Problem.step does, with u held."""
+        held = self.stepped is not self.closed_loop
+        return self.method == self.problem.horizon.method and (held or self.method == "euler")
+
+    def _discretely(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
+        """(x, ∫ℓ, V, u) at the nodes, by the route with the discrete costate."""
+        assert self.discrete is not None
+        path = self.discrete(x0.reshape(-1, x0.shape[-1]))
+        x, running_cost, value, u = (y.reshape(len(y), *x0.shape[:-1], *y.shape[2:]) for y in path)
+        return x, running_cost, None if self.closed_loop.V is None else value, u
+
+    def _integrate(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
+        """(x, ∫ℓ, V, u) at the nodes, by torchdiffeq."""
+        y = self._solve(torch.cat([x0, torch.zeros_like(x0[..., :1])], -1), t)
+        x, V = y[..., :-1], self.closed_loop.V
+        nodes = t.reshape(-1, *[1] * (x0.ndim - 1))
+        with torch.no_grad():
+            u = self.closed_loop.policy(nodes[:-1], x[:-1])
+        return x, y[..., -1], None if V is None else V(nodes, x), u
+
+    def _solve(self, y0: Tensor, t: Times) -> Tensor:
+        """The augmented state at the nodes, by the route of `gradient`."""
+        from torchdiffeq import odeint, odeint_adjoint  # loads scipy.integrate: a third of a second
+
+        solve: Callable[..., Any] = odeint
+        arguments = dict(self.solver_arguments)
+        if self.gradient == "adjoint" and torch.is_grad_enabled():
+            solve = odeint_adjoint
+            arguments |= self._adjoint_arguments()
+        try:
+            return solve(self.stepped, y0, t, **arguments)
+        except (
+            AssertionError
+        ) as error:  # how torchdiffeq says that an adaptive step shrank to nothing, or too many came
+            if self.method not in ADAPTIVE_METHODS:
+                raise
+            message = f"Expected {self.method} to reach t = {t[-1]:.4g} s, got {error}; {_REMEDY}."
+            raise DivergenceError(message) from error
+
+    def _adjoint_arguments(self) -> dict[str, Any]:
+        arguments: dict[str, Any] = {"adjoint_params": tuple(p for p in self.parameters() if p.requires_grad)}
+        if self.method in ADAPTIVE_METHODS:
+            # The parameters' gradient is an integral that feeds back into nothing: leaving it out of the error
+            # estimate saves steps (Kidger, Chen, Lyons, "Hey, that's not an ODE", ICML 2021).
+            arguments["adjoint_options"] = {"norm": "seminorm", **self.solver_arguments["options"]}
+        return arguments
+
+
+_REMEDY = (
+    "lower the learning rate or Δt, shorten the horizon, or start closer to the goal; lyapnet check says how stiff the "
+    "control law is, and from where on X₀ the start is finite"
+)
+
+
+def _require_finite(x: StatePath, running_cost: ValuePath, t: Times) -> None:
+    finite = (torch.isfinite(x).all(-1) & torch.isfinite(running_cost)).reshape(len(t), -1)
+    if finite.all():
+        return
+    broken = torch.nonzero(~finite.all(0)).flatten()
+    first_steps = (~finite[:, broken]).int().argmax(0)
+    earliest = int(first_steps.argmin())
+    step, x0 = int(first_steps[earliest]), x[0].reshape(finite.shape[1], -1)[broken[earliest]]
+    raise DivergenceError(
+        f"Expected a finite closed loop, got a non-finite state or running cost at step {step} (t = {t[step]:.4g} s) "
+        f"from x0 = {[round(v, 6) for v in x0.tolist()]} ({len(broken)} of {finite.shape[1]} trajectories); {_REMEDY}."
+    )

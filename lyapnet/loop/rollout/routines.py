@@ -1,0 +1,176 @@
+"""The pieces of work of a discretised closed loop: integrate it, and run backwards along it to the gradient."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.fx import GraphModule
+
+from lyapnet.base.errors import CompilationError, LyapnetError, UntraceableError, one_line
+from lyapnet.base.types import ControlPath, StagePath, State, Times, ValuePath
+from lyapnet.graphs.compilation import compilation_errors
+from lyapnet.graphs.cuda_graphs import RecordedFunction, Replay, record
+from lyapnet.graphs.number_kernel.kernel import ScanKernel
+from lyapnet.graphs.scan import Scan
+from lyapnet.graphs.stateless import stateless, trained_of
+from lyapnet.graphs.tracing import cut, trace
+from lyapnet.loop.rollout.backwards import BlockwiseGradient, PathWithDerivatives, StepwiseGradient
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.loop.rollout.runge_kutta import Linearise, PullBack, Step
+from lyapnet.task.horizon import ButcherTableau
+
+
+class Nodes(NamedTuple):
+    """What a rollout leaves at its nodes 0 … N; at the last one, of a step of length zero."""
+
+    stages: StagePath  # where each step evaluates the closed loop, the node itself first
+    step_cost: ValuePath  # ∫ℓ over the step
+    u: ControlPath  # at the node
+    value: ValuePath  # V at the node
+
+
+BATCH_AXES = (-2, -1, -2, -1)  # of the columns of Nodes
+
+
+class Routines(NamedTuple):
+    """The two pieces of work, for one shape of batch; `state` is the tensors that a closed loop is made of."""
+
+    integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀) ↦ the columns of Nodes at the nodes t
+    gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
+
+
+class TracedRoutines:
+    """The pieces of work for one shape of batch as graphs, each traced when it is first asked for.
+
+    Args:
+        loop, tableau: the closed loop, and its steps.
+        state: the tensors that it is made of, the trained ones first.
+        grid: t and Δt at all nodes.
+        x0: a batch (b, n).
+        block: K, nodes in a block.
+        limit: of the costates.
+        visited: gives (t, Δt, x) at which the trace of a step is held against the loop itself.
+    """
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        tableau: ButcherTableau,
+        state: list[Tensor],
+        grid: tuple[Times, Times],
+        x0: State,
+        block: int,
+        limit: float | None,
+        visited: Callable[[], list[list[Tensor]]],
+    ):
+        self.state, self.grid, self.x0, self.block, self.limit = state, grid, x0, block, limit
+        self._step, self._linearise = Step(loop, tableau), Linearise(loop, tableau)
+        self._visited, self._trained, self._stages = visited, len(trained_of(loop)), len(tableau.b)
+
+    def traced(self) -> Routines:
+        """The graphs, replayed operation by operation.
+
+        Raises:
+            UntraceableError: control flow that depends on tensor values, or code that leaves torch.
+        """
+        return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
+
+    def compiled(self) -> Routines:
+        """The graphs on a CPU by lyapnet's own kernel, on a GPU with all kernels of a piece launched at once.
+
+        Raises:
+            UntraceableError: as traced.
+            CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
+        """
+        with compilation_errors():
+            return self._by_kernel() if self.x0.device.type == "cpu" else self.recorded()
+
+    def recorded(self, record: Callable[..., Replay] = record) -> Routines:
+        """The graphs, with the kernels of the whole path and of the whole gradient recorded."""
+        by_blocks, tensors = BlockwiseGradient(*self._block_pieces, self.block, self.limit), len(self.state)
+        integrate = RecordedFunction(self._scan().loop, [*self.state, *self.grid, self.x0], record)
+        (t, dt), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
+        stages = nodes[:, None].expand(-1, self._stages, -1, -1)
+        path = PathWithDerivatives(
+            t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0])
+        )
+
+        def backwards(*arguments: Tensor) -> list[Tensor]:
+            costate, share = by_blocks(arguments[:tensors], PathWithDerivatives(*arguments[tensors:]))
+            return [costate, *share]
+
+        gradient = RecordedFunction(backwards, [*self.state, *path], record)
+
+        def unpacked(state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
+            costate, *share = gradient(*state, *path)
+            return costate, share
+
+        return Routines(integrate, unpacked)
+
+    def _by_kernel(self) -> Routines:
+        (t, dt), x0 = self.grid, self.x0
+        nodes, per_node = x0.expand(len(t), *x0.shape), torch.ones_like(x0[:, 0]).expand(len(t), -1)
+        columns = [t, dt, nodes, nodes, per_node, per_node]
+        try:
+            integrate = ScanKernel(*self._forwards, [*self.state, *self.grid, x0])
+            back = ScanKernel(*self._backwards, [*self.state, *columns, x0], len(columns), sums=self._trained)
+        except NotImplementedError as error:
+            raise CompilationError(f"Expected operations that the kernel has, got {error}") from error
+        return Routines(integrate, StepwiseGradient(back, self.limit))
+
+    def _scan(self) -> Scan:
+        return Scan(*self._forwards, len(self.state))
+
+    @cached_property
+    def _forwards(self) -> tuple[GraphModule, GraphModule]:
+        """(what all steps share, a step)."""
+        t, dt = self.grid
+        arguments = [*self.state, t[0], dt[0], self.x0]
+        with _tracing():
+            elsewhere = self._visited()
+        return cut(self._trace(self._step, arguments, elsewhere), late=3, early_outputs=0, repeat=False)
+
+    @cached_property
+    def _backwards(self) -> tuple[GraphModule, GraphModule]:
+        """(what all steps share, a step pulled back)."""
+        (t, dt), x0 = self.grid, self.x0
+        late = [t[0], dt[0], x0, x0.clone(), torch.ones_like(x0[:, 0]), torch.ones_like(x0[:, 0]), x0.clone()]
+        return cut(
+            self._trace(PullBack(self._step), [*self.state, *late]), late=len(late), early_outputs=0, repeat=False
+        )
+
+    @cached_property
+    def _block_pieces(self) -> tuple[GraphModule, GraphModule]:
+        """(linearise, product) of a block."""
+        return cut(self._trace(self._linearise, self._block_arguments()), late=1, early_outputs=2)
+
+    def _block_arguments(self) -> list[Tensor]:
+        """What the pieces of a block are traced on."""
+        (t, dt), x0 = self.grid, self.x0
+        nodes = x0.expand(self.block, *x0.shape)
+        stages = nodes[:, None].repeat(1, self._stages, 1, 1)
+        bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
+        return [*self.state, t[: self.block], dt[: self.block], stages, *bars, nodes.clone()]
+
+    def _trace(
+        self, module: nn.Module, arguments: list[Tensor], elsewhere: Sequence[Sequence[Tensor]] = ()
+    ) -> GraphModule:
+        with _tracing():
+            return trace(stateless(module), arguments, elsewhere, whole=self.x0.device.type == "cpu")
+
+
+@contextmanager
+def _tracing() -> Iterator[None]:
+    """Turn whatever a loop's own functions raise in a trace into an UntraceableError."""
+    try:
+        yield
+    except LyapnetError:
+        raise
+    except Exception as error:  # of any kind, from inside the user's own functions
+        reason = one_line(error).split(". ")[0].rstrip(".")
+        raise UntraceableError(
+            f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."
+        ) from error

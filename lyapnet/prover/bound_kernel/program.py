@@ -1,0 +1,322 @@
+"""A function's operations on Taylor forms as a flat program for program.cpp, which runs it on many boxes."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lyapnet.prover.taylor import monomials
+
+OPERATIONS = {
+    name: code
+    for code, name in enumerate((
+        "combine", "matrix_product", "multiply", "functions", "where", "no_wider", "sign", "positive", "negation",
+        "conjunction", "rounded",
+    ))
+}  # fmt: skip
+FUNCTIONS = {
+    name: code
+    for code, name in enumerate((
+        "exp", "log", "log1p", "sqrt", "reciprocal", "sigmoid", "softplus", "sin", "cos", "tan", "square", "absolute",
+        "leaky", "clamp",
+    ))
+}  # fmt: skip
+LINEAR = {"tan", "square", "absolute", "leaky", "clamp"}  # functions that are bounded by a line in forms of any degree
+
+Support = tuple[int, ...]  # the numbers of the monomials that a form can have, rising; the constant is one of them
+CONSTANT: Support = (0,)
+
+
+def of_boxes(axes: int, wide: Sequence[int]) -> list[Support]:
+    """The supports of the numbers of a box, of which those along wide axes have an ε each."""
+    return [(0, 1 + wide.index(k)) if k in wide else CONSTANT for k in range(axes)]
+
+
+class Entry(int):
+    """The form of one number: its place in the list of a program's forms."""
+
+
+ZERO = Entry(0)  # so that what an arrangement pads with 0 is zero
+
+
+@dataclass(frozen=True, eq=False)
+class Forms:
+    """A value that depends on the point, as forms of its numbers.
+
+    Args:
+        entries: (*shape), whole numbers; what operators arrange is done to them.
+    """
+
+    entries: Tensor
+
+    @property
+    def shape(self) -> torch.Size:
+        """That of the value."""
+        return self.entries.shape
+
+
+class Assembled(NamedTuple):
+    """A program as program.cpp reads it."""
+
+    tables: np.ndarray
+    code: np.ndarray
+    numbers: np.ndarray
+    arena: int  # numbers of a box that its forms take
+    spare: int  # those that one operation takes besides
+
+
+class Program:
+    """Operations on the forms of single numbers, no two of them alike.
+
+    Args:
+        inputs: the support of each number that the function is of.
+        dimension, degree: of the forms.
+    """
+
+    def __init__(self, inputs: Sequence[Support], dimension: int, degree: int):
+        self.degree, self.dimension = degree, dimension
+        self.monomials = monomials(self.dimension, degree)
+        number = {powers: k for k, powers in enumerate(self.monomials)}
+        self._place = [[number.get(tuple(sorted(a + b)), -1) for b in self.monomials] for a in self.monomials]
+        self._powers: dict[tuple[Support, Support], Support] = {}
+        self._products: dict[tuple[Support, Support, Support], int] = {}
+        self._placings: dict[tuple[Support, Support], int] = {}
+        self._known: dict[tuple[object, ...], Entry] = {}
+        self._numbers: list[float] = []
+        self._number: dict[float | bytes, int] = {}
+        self._instructions: list[list[int]] = []
+        self._functions: dict[Entry, list[int]] = {}
+        self._spare = 3 * (len(self.monomials) + 4)
+        self.supports: list[Support] = []
+        self.constants: dict[Entry, float] = {}
+        self.constant(0.0)
+        self.inputs = [self._new(support) for support in inputs]
+
+    def constant(self, value: float) -> Entry:
+        """The form of a number that is the same everywhere."""
+        key = ("constant", value)
+        if key not in self._known:
+            self._known[key] = self._new(CONSTANT)
+            self.constants[self._known[key]] = value
+        return self._known[key]
+
+    def combine(self, summands: Iterable[tuple[float, Entry]], offset: float = 0.0, operations: int = 1) -> Entry:
+        """Σ w x + offset.
+
+        Args:
+            operations: by which each number of the result is rounded; 1 where it is the result of a single one.
+        """
+        summands = [(weight, x) for weight, x in summands if x != ZERO]
+        if not summands:
+            return self.constant(offset)
+        if summands[0][0] == 1 and len(summands) == 1 and not offset:
+            return summands[0][1]
+        support = self._union(x for _, x in summands)
+        words = [word for weight, x in summands for word in (x, self._placing(x, support), self._at(weight))]
+        return self._emit("combine", support, operations, len(summands), self._at(offset), *words, result_first=True)
+
+    def scale(self, x: Entry, factor: float) -> Entry:
+        """factor · x."""
+        return self.combine([(factor, x)])
+
+    def multiply(self, x: Entry, y: Entry) -> Entry:
+        """x · y."""
+        if x in self.constants or y in self.constants:
+            x, y = (y, x) if x in self.constants else (x, y)
+            return self.scale(x, self.constants[y])
+        x, y = min(x, y), max(x, y)
+        a, b = self.supports[x], self.supports[y]
+        support = self._product(a, b)
+        return self._emit("multiply", support, x, y, behind=(self._table(a, b, support),))
+
+    def square(self, x: Entry) -> Entry:
+        """x²."""
+        return self.function("square", x) if self.degree == 1 else self.multiply(x, x)
+
+    def function(self, name: str, x: Entry, p: float = 0.0, q: float = 0.0) -> Entry:
+        """f(x), with its parameters."""
+        support = power = self.supports[x]
+        if name not in LINEAR:
+            for _ in range(self.degree - 1):
+                power = self._product(power, self.supports[x])
+                support = tuple(sorted({*support, *power}))
+        a = self.supports[x]
+        powers = self._table(a, a, support), self._table(support, a, support), self._placing(x, support)
+        parameters = self._at(p), self._at(q)
+        key = (name, x, *parameters)
+        if key not in self._known:
+            self._known[key] = self._new(support)
+            if x not in self._functions:  # those of one form share its range, and some its powers
+                self._functions[x] = [OPERATIONS["functions"], x, 0]
+                self._instructions.append(self._functions[x])
+            self._functions[x][2] += 1
+            self._functions[x] += [FUNCTIONS[name], self._known[key], *parameters, *powers]
+        return self._known[key]
+
+    def matrix_product(self, row: Sequence[Entry], weight: Tensor) -> list[Entry]:
+        """A row times a constant matrix."""
+        if not any(row):
+            return [ZERO] * weight.shape[1]
+        at, support = self._matrix(weight), self._union(row)
+        key = ("matrix_product", at, *row)
+        if key not in self._known:
+            results = [self._new(support) for _ in range(weight.shape[1])]
+            self._known[key] = results[0]
+            head = [OPERATIONS["matrix_product"], *weight.shape, at, len(support)]
+            padded = [word for x in row for word in (x, self._placing(x, support))]
+            self._instructions.append([*head, *padded, *results])
+            self._spare = max(self._spare, len(row) * (len(support) + 1))
+        return [Entry(self._known[key] + j) for j in range(weight.shape[1])]
+
+    def where(self, truth: Entry, x: Entry, y: Entry) -> Entry:
+        """x where a number is not 0, else y; their hull where that is undecided."""
+        support = self._union((x, y))
+        return self._emit("where", support, x, y, truth, behind=(self._placing(x, support), self._placing(y, support)))
+
+    def truth(self, name: str, *operands: Entry) -> Entry:
+        """A truth, or a sign."""
+        return self._emit(name, CONSTANT, *operands)
+
+    def no_wider(self, x: Entry, low: float, high: float) -> Entry:
+        """x, but [low, high] where it is wider."""
+        return self._emit("no_wider", self.supports[x], x, behind=(self._at(low), self._at(high)))
+
+    def rounded(self, x: Entry, *limits: float) -> Entry:
+        """x rounded in another arithmetic: by how much, relative to it and absolutely, and up to which number."""
+        return self._emit("rounded", self.supports[x], x, behind=tuple(self._at(limit) for limit in limits))
+
+    def assembled(self, results: Sequence[Entry]) -> Assembled:
+        """The program with its results, its forms laid out so that their places are used again."""
+        offset, arena = self._layout(results)
+        of_support = {support: k for k, support in enumerate(dict.fromkeys(self.supports))}
+
+        def words(items: Iterable[int]) -> Iterable[int]:
+            for word in items:
+                if isinstance(word, Entry):
+                    yield offset[word]
+                    yield of_support[self.supports[word]]
+                else:
+                    yield word
+
+        code = [len(self.constants), *(word for x, value in self.constants.items() for word in (x, self._at(value)))]
+        code += [len(self.inputs), *self.inputs, len(self._instructions)]
+        code += [word for instruction in self._instructions for word in instruction]
+        code += [len(results), *results]
+        numbers = np.array(self._numbers, dtype=np.float64)
+        tables = np.array(list(self._tables(of_support)), dtype=np.int32)
+        return Assembled(tables, np.array(list(words(code)), dtype=np.int32), numbers, arena, self._spare)
+
+    def _layout(self, results: Sequence[Entry]) -> tuple[dict[int, int], int]:
+        """(where each form starts, the numbers that they take together), after each other where they fit."""
+        kept = {*self.constants, *results}
+        last = {word: k for k, line in enumerate(self._instructions) for word in line if isinstance(word, Entry)}
+        offset: dict[int, int] = {}
+        free: dict[int, list[int]] = {}
+        arena = 0
+
+        def place(x: Entry) -> None:
+            nonlocal arena
+            size = self._size(x)
+            if free.get(size):
+                offset[x] = free[size].pop()
+            else:
+                offset[x], arena = arena, arena + size
+
+        for x in (*self.constants, *self.inputs):
+            place(x)
+        for k, line in enumerate(self._instructions):
+            entries = {word for word in line if isinstance(word, Entry)}
+            for x in sorted(entries - offset.keys()):
+                place(x)
+            for x in sorted(entries - kept):
+                if last[x] == k:
+                    free.setdefault(self._size(x), []).append(offset[x])
+        return offset, arena
+
+    def _size(self, x: Entry) -> int:
+        """The numbers that a form takes: its terms, its remainder, and the sizes of its terms of each degree."""
+        return len(self.supports[x]) + 1 + self.degree
+
+    def _tables(self, of_support: dict[Support, int]) -> Iterable[int]:
+        yield from (self.dimension, self.degree, len(self.monomials))
+        for powers in self.monomials:
+            yield from (*powers, *(-1,) * (3 - len(powers)))
+        yield len(of_support)
+        for support in of_support:
+            yield from self._counts(support)
+            yield from support
+        yield len(self._products)
+        for a, b, support in self._products:
+            factors = self._factors(a, b, support)
+            yield sum(1 + 2 * len(pairs) for pairs in factors)
+            for pairs in factors:
+                yield len(pairs)
+                for pair in pairs:
+                    yield from pair
+        yield len(self._placings)
+        for a, support in self._placings:
+            yield len(a)
+            yield from map(support.index, a)
+
+    def _counts(self, support: Support) -> list[int]:
+        """How many monomials of a support are of degree ≤ 0, 1, 2, 3."""
+        of_degree = [len(self.monomials[k]) for k in support]
+        return list(accumulate(of_degree.count(k) for k in range(4)))
+
+    def _emit(
+        self, name: str, support: Support, *words: int, behind: tuple[int, ...] = (), result_first: bool = False
+    ) -> Entry:
+        """The result of an operation, which is computed once."""
+        key = (name, *words, *behind)
+        if key not in self._known:
+            self._known[key] = result = self._new(support)
+            line = [result, *words] if result_first else [*words, result, *behind]
+            self._instructions.append([OPERATIONS[name], *line])
+        return self._known[key]
+
+    def _new(self, support: Support) -> Entry:
+        self.supports.append(support)
+        return Entry(len(self.supports) - 1)
+
+    def _union(self, entries: Iterable[Entry]) -> Support:
+        return tuple(sorted({*CONSTANT, *(k for x in entries for k in self.supports[x])}))
+
+    def _product(self, a: Support, b: Support) -> Support:
+        """The monomials in the products of those of two forms."""
+        if (a, b) not in self._powers:
+            self._powers[a, b] = tuple(sorted({self._place[i][j] for i in a for j in b} - {-1}))
+        return self._powers[a, b]
+
+    def _table(self, a: Support, b: Support, support: Support) -> int:
+        """Which product of forms with two supports it is, in a third."""
+        return self._products.setdefault((a, b, support), len(self._products))
+
+    def _placing(self, x: Entry, support: Support) -> int:
+        """Which placing of the terms of a form among those of a larger support it is."""
+        return self._placings.setdefault((self.supports[x], support), len(self._placings))
+
+    def _factors(self, a: Support, b: Support, support: Support) -> list[list[tuple[int, int]]]:
+        """For each monomial of a support: (i, j) where it is the i-th monomial of a times the j-th of b."""
+        factors: dict[int, list[tuple[int, int]]] = {monomial: [] for monomial in support}
+        for i, m in enumerate(a):
+            for j, n in enumerate(b):
+                factors.get(self._place[m][n], []).append((i, j))
+        return list(factors.values())
+
+    def _at(self, number: float) -> int:
+        """Where a number stands."""
+        if number not in self._number:
+            self._number[number] = len(self._numbers)
+            self._numbers.append(number)
+        return self._number[number]
+
+    def _matrix(self, weight: Tensor) -> int:
+        content = repr(tuple(weight.shape)).encode() + weight.contiguous().numpy().tobytes()
+        if content not in self._number:
+            self._number[content] = len(self._numbers)
+            self._numbers += weight.flatten().tolist()
+        return self._number[content]

@@ -1,0 +1,371 @@
+"""Rules for bounds: what each operator of a graph does with Taylor forms."""
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import vmap
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+from lyapnet.base.errors import UsageError
+from lyapnet.prover import elementary_functions as functions
+from lyapnet.prover import taylor
+from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
+from lyapnet.prover.linear_systems import LINEAR_SYSTEMS
+from lyapnet.prover.rounding import ROUNDED
+from lyapnet.prover.taylor import TaylorForm
+
+aten = torch.ops.aten
+
+Rule = Callable[..., Any]
+RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS}
+"""Operator ↦ its rule: the operator's arguments, some of them Taylor forms, ↦ a Taylor form, or a tensor."""
+
+
+def rule(*operators: Any) -> Callable[[Rule], Rule]:
+    """Register a rule for operators."""
+
+    def register(function: Rule) -> Rule:
+        RULES.update(dict.fromkeys(operators, function))
+        return function
+
+    return register
+
+
+# Sums and products
+
+
+@rule(aten.add.Tensor, aten.add.Scalar)
+def _add(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
+    """x + αy."""
+    if alpha != 1:
+        y = _multiply(y, alpha) if isinstance(y, TaylorForm) else _tensor(y) * alpha
+    if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
+        return taylor.add(x, y)
+    return taylor.shift(x, _tensor(y)) if isinstance(x, TaylorForm) else taylor.shift(y, _tensor(x))
+
+
+@rule(aten.sub.Tensor, aten.sub.Scalar)
+def _subtract(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
+    """x − αy."""
+    return _add(x, taylor.negate(y) if isinstance(y, TaylorForm) else -_tensor(y), alpha)
+
+
+@rule(aten.rsub.Scalar, aten.rsub.Tensor)
+def _subtract_from(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
+    """y − αx."""
+    return _subtract(y, x, alpha)
+
+
+@rule(aten.mul.Tensor, aten.mul.Scalar)
+def _multiply(x: Any, y: Any) -> TaylorForm:
+    """x · y; a square where both are one value."""
+    if x is y:
+        return functions.square(x)
+    if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
+        return taylor.multiply(x, y)
+    return taylor.scale(x, _tensor(y)) if isinstance(x, TaylorForm) else taylor.scale(y, _tensor(x))
+
+
+@rule(aten.div.Tensor, aten.div.Scalar)
+def _divide(x: Any, y: Any) -> TaylorForm:
+    """x · (1/y)."""
+    if isinstance(y, TaylorForm):
+        return _multiply(x, functions.reciprocal(y))
+    return taylor.scale(x, 1 / _tensor(y)).rounded()
+
+
+@rule(aten.pow.Tensor_Scalar)
+def _power(x: TaylorForm, exponent: float) -> Any:
+    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal; x⁰ = 1."""
+    if exponent == 0:
+        return torch.ones_like(x.radius[0])
+    if exponent < 0:
+        return functions.reciprocal(_power(x, -exponent))
+    if exponent == 0.5:
+        return functions.sqrt(x)
+    if not float(exponent).is_integer():
+        raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
+    if exponent == 1:
+        return x
+    half = _power(x, exponent // 2)
+    return functions.square(half) if exponent % 2 == 0 else taylor.multiply(functions.square(half), x)
+
+
+@rule(aten.mm.default, aten.bmm.default)
+def _matrix_product(x: Any, y: Any) -> TaylorForm:
+    """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
+    if not isinstance(x, TaylorForm):
+        return _transposed(_matrix_product(_transposed(y), x.mT))
+    if not isinstance(y, TaylorForm) and y.ndim == 2:
+        return taylor.matrix_product(x, y)
+    left, right = ARRANGEMENTS[aten.unsqueeze.default](x, -1), _unsqueezed(y, -3)
+    return _sum(_multiply(left, right), [-2])
+
+
+@rule(aten.mv.default)
+def _matrix_vector_product(x: Any, y: Any) -> TaylorForm:
+    """xy of a matrix and a vector."""
+    return ARRANGEMENTS[aten.squeeze.dim](_matrix_product(x, _unsqueezed(y, -1)), -1)
+
+
+@rule(aten.dot.default)
+def _dot(x: Any, y: Any) -> TaylorForm:
+    """Σ_i x_i y_i."""
+    return _sum(_multiply(x, y))
+
+
+@rule(aten._to_copy.default)
+def _to_copy(x: TaylorForm, **keywords: Any) -> TaylorForm:
+    """x: truths as numbers; the gate refuses any dtype but float64."""
+    return x
+
+
+@rule(aten.addmm.default)
+def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> TaylorForm:
+    """β · offset + α · xy."""
+    product = _matrix_product(x, y)
+    product = product if alpha == 1 else _multiply(product, alpha)
+    return _add(product, offset, beta)
+
+
+@rule(aten.neg.default)
+def _negate(x: TaylorForm) -> TaylorForm:
+    """−x."""
+    return taylor.negate(x)
+
+
+@rule(aten.sum.default, aten.sum.dim_IntList)
+def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
+    """Σ x over some axes; remainders add."""
+    x, rank = x.rounded(x.shape.numel()), len(x.shape)
+    if not rank:
+        return x
+    axes = [axis % rank for axis in dim or range(rank)]
+    radius = x.radius.sum([axis + 1 for axis in axes], keepdim)
+    return x.with_parts(x.terms.sum([axis + 2 for axis in axes], keepdim), radius)
+
+
+@rule(aten.mean.default, aten.mean.dim)
+def _mean(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
+    """Σ x over some axes, divided by their length."""
+    total = _sum(x, dim, keepdim)
+    return _multiply(total, total.shape.numel() / x.shape.numel())
+
+
+# Rounding in another arithmetic
+
+
+@rule(ROUNDED)
+def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) -> TaylorForm:
+    """y (1 + θ) + η; nothing is known where y may exceed the largest number."""
+    y = y if isinstance(y, TaylorForm) else taylor.constant_form(_tensor(y), at)
+    size = y.magnitude * (1 + 1e-9)  # for the rounding of these lines
+    radius = y.radius + (relative * size + absolute) * (1 + 1e-9)
+    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).rounded()
+
+
+# Functions of one number
+
+rule(aten.exp.default)(functions.exp)
+rule(aten.log.default)(functions.log)
+rule(aten.log1p.default)(functions.log1p)
+rule(aten.sqrt.default)(functions.sqrt)
+rule(aten.reciprocal.default)(functions.reciprocal)
+rule(aten.sigmoid.default)(functions.sigmoid)
+rule(aten.sin.default)(functions.sin)
+rule(aten.cos.default)(functions.cos)
+rule(aten.tan.default)(functions.tan)
+
+
+@rule(aten.rsqrt.default)
+def _rsqrt(x: TaylorForm) -> TaylorForm:
+    """1/√x."""
+    return functions.reciprocal(functions.sqrt(x))
+
+
+@rule(aten.tanh.default)
+def _tanh(x: TaylorForm) -> TaylorForm:
+    """tanh x = 2σ(2x) − 1; with powers of two no rounding is added."""
+    double = x.with_parts(2 * x.terms, 2 * x.radius)
+    return _subtract(_multiply(functions.sigmoid(double), 2.0), 1.0)
+
+
+@rule(aten.softplus.default)
+def _softplus(x: TaylorForm, beta: float = 1, threshold: float = 20) -> TaylorForm:
+    """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is off by at most e^{−threshold}/|β|."""
+    y = _multiply(x, beta) if beta != 1 else x
+    return _loosened_above(_divide(functions.softplus(y), beta), y, threshold, 1 / abs(beta))
+
+
+@rule(aten.softplus_backward.default)
+def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: float) -> TaylorForm:
+    """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
+    y = _multiply(x, beta) if beta != 1 else x
+    return _multiply(gradient, _loosened_above(functions.sigmoid(y), y, threshold, 1.0))
+
+
+@rule(aten.silu.default)
+def _silu(x: TaylorForm) -> TaylorForm:
+    """x σ(x)."""
+    return taylor.multiply(x, functions.sigmoid(x))
+
+
+@rule(aten.silu_backward.default)
+def _silu_backward(gradient: Any, x: TaylorForm) -> TaylorForm:
+    """gradient · σ(1 + x(1 − σ))."""
+    s = functions.sigmoid(x)
+    return _multiply(gradient, _multiply(s, _add(_multiply(x, _subtract(1.0, s)), 1.0)))
+
+
+@rule(aten.sigmoid_backward.default)
+def _sigmoid_backward(gradient: Any, s: TaylorForm) -> TaylorForm:
+    """gradient · s(1 − s)."""
+    return _multiply(gradient, _subtract(s, functions.square(s)))
+
+
+@rule(aten.tanh_backward.default)
+def _tanh_backward(gradient: Any, y: TaylorForm) -> TaylorForm:
+    """gradient · (1 − y²)."""
+    return _multiply(gradient, _subtract(1.0, functions.square(y)))
+
+
+def _loosened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
+    """The form with room for factor · e^{−threshold}, and its rounding, where y may exceed the threshold."""
+    room = factor * (1.001 * torch.exp(-_tensor(threshold)) + taylor.TINY)
+    return smooth.with_parts(smooth.terms, smooth.radius + torch.where(y.interval()[1] > threshold, room, 0.0))
+
+
+# Arrangements: entries copied, moved or left out, without arithmetic
+
+
+def _arranging(function: Callable[..., Any]) -> Rule:
+    """The rule of an operator that only arranges entries: c, A_k and r are arranged alike."""
+    return lambda *arguments, **keywords: _rearranged(function, *arguments, **keywords)
+
+
+def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
+    """The operator on c and on each A_k of its arguments, in one call, and on their r."""
+    leaves, structure = tree_flatten((arguments, keywords), is_leaf=lambda leaf: isinstance(leaf, TaylorForm))
+    forms = [leaf for leaf in leaves if isinstance(leaf, TaylorForm)]
+
+    def call(*tensors: Tensor) -> Any:
+        filled = iter(tensors)
+        arguments, keywords = tree_unflatten(
+            [next(filled) if isinstance(leaf, TaylorForm) else leaf for leaf in leaves], structure
+        )
+        return function(*arguments, **keywords)
+
+    counts = forms[0].terms.shape[:2]
+    terms = vmap(call)(*(form.terms.flatten(0, 1) for form in forms))
+    radius = vmap(call)(*(form.radius for form in forms))
+    if isinstance(terms, Tensor):
+        return forms[0].with_parts(terms.unflatten(0, counts), radius)
+    return [forms[0].with_parts(y.unflatten(0, counts), r) for y, r in zip(terms, radius, strict=True)]
+
+
+def _along(function: Callable[..., Any], new: int = 0) -> Rule:
+    """As _arranging, of an operator that takes an axis and may add one: without the detour through vmap."""
+
+    def arrange(x: TaylorForm, dim: int = 0, *rest: Any) -> TaylorForm:
+        axis = dim % (len(x.shape) + new)
+        return x.with_parts(function(x.terms, axis + 2, *rest), function(x.radius, axis + 1, *rest))
+
+    return arrange
+
+
+def _expand(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
+    x = x.as_rank(len(size))
+    return x.with_parts(x.terms.expand(-1, -1, *size), x.radius.expand(-1, *size))
+
+
+def _view(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
+    if -1 in size:  # which torch does not know of no boxes
+        others = -math.prod(size)
+        size = [x.shape.numel() // others if length == -1 else length for length in size]
+    counts = x.terms.shape[:2]
+    return x.with_parts(x.terms.reshape(*counts, *size), x.radius.reshape(*counts[1:], *size))
+
+
+def _joining(function: Callable[..., Any]) -> Rule:
+    """As _arranging, of a list in which constants stand beside forms."""
+
+    def join(items: Sequence[Any], dim: int = 0) -> TaylorForm:
+        like = next(item for item in items if isinstance(item, TaylorForm))
+        forms = [item if isinstance(item, TaylorForm) else taylor.constant_form(item, like) for item in items]
+        return _rearranged(function, forms, dim)
+
+    return join
+
+
+ARRANGEMENTS: dict[Any, Rule] = {
+    **{
+        operation: _arranging(operation)
+        for operation in (
+            aten.permute.default, aten.t.default, aten.transpose.int, aten.squeeze.default, aten.squeeze.dim,
+            aten.squeeze.dims, aten.index.Tensor, aten.select_backward.default, aten.unbind.int,
+            aten.slice_backward.default, aten.split.Tensor, aten.flip.default,
+            aten.diagonal.default, aten.diag_embed.default,
+        )
+    },
+    **{operation: _along(operation) for operation in (aten.select.int, aten.slice.Tensor)},
+    aten.unsqueeze.default: _along(aten.unsqueeze.default, new=1),
+    **dict.fromkeys((aten.view.default, aten._unsafe_view.default), _view),
+    aten.expand.default: _expand,
+    aten.cat.default: _joining(aten.cat.default),
+    aten.stack.default: _joining(aten.stack.default),
+    operator.getitem: operator.getitem,
+}  # fmt: skip
+
+
+@rule(aten.index_add.default)
+def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
+    """x with source_i added to its entry index_i: a sum of two arrangements."""
+    like = x if isinstance(x, TaylorForm) else source
+    x, source = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, source))
+    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.rounded(len(index)))
+    return taylor.add(x, moved)
+
+
+@rule(aten.index_put.default)
+def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False) -> TaylorForm:
+    """x with the values added to its entries at some indices, as the derivative of an indexing is written."""
+    if not accumulate:
+        raise UsageError("Expected values that are added to entries, got entries that are replaced; use torch.where.")
+    like = x if isinstance(x, TaylorForm) else values
+    x, values = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, values))
+    values = values.rounded(values.shape.numel())
+    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_put(indices, y, accumulate=True), x, values)
+    return taylor.add(x, moved)
+
+
+OF_TRUTHS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
+"""The operators whose rules hold for truths as results too: 1 · 0 is a conjunction, 1 + 1 is not a truth."""
+
+
+def _of_shape(operation: Any) -> Rule:
+    """The rule of an operator that reads the shape of its argument alone: the result is constant."""
+    return lambda x, *arguments, **keywords: operation(torch.zeros_like(x.radius[0]), *arguments, **keywords)
+
+
+OF_SHAPE = {
+    aten.zeros_like.default, aten.ones_like.default, aten.full_like.default, aten.empty_like.default,
+    aten.new_zeros.default, aten.new_ones.default, aten.new_full.default, aten.fill.Scalar,
+}  # fmt: skip
+for _operation in OF_SHAPE:
+    rule(_operation)(_of_shape(_operation))
+
+
+def _transposed(x: TaylorForm) -> TaylorForm:
+    return x.with_parts(x.terms.mT, x.radius.mT)
+
+
+def _unsqueezed(x: Any, axis: int) -> Any:
+    return ARRANGEMENTS[aten.unsqueeze.default](x, axis) if isinstance(x, TaylorForm) else x.unsqueeze(axis)
+
+
+def _tensor(number: Any) -> Tensor:
+    return torch.as_tensor(number, dtype=torch.float64)

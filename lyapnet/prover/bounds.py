@@ -1,0 +1,235 @@
+"""Bounds of a function on boxes: its operator graph, interpreted with Taylor forms.
+
+The function is the one that training and control use, traced at one point (t, x). What is done with each operator is in
+lyapnet.prover.bound_rules; an operator without a rule is refused by name. The arithmetic of forms, and what is covered
+of rounding, is in lyapnet.prover.taylor. Numbers that do not depend on the point (weights, W → softplus(W), a constant
+mass matrix) are computed once, by torch: bounds are those of the function with these numbers.
+
+Every operator passes one gate, _apply. What depends on the point stays in float64, or is a truth: torch would round it
+in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the shape that the trace recorded.
+"""
+
+import copy
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import Node
+from torch.fx.node import map_arg
+from torch.utils._pytree import tree_map_only
+
+from lyapnet.base.errors import LyapnetError, UsageError, one_line
+from lyapnet.base.types import Corner, Corners, OnBoxes
+from lyapnet.graphs.tracing import trace
+from lyapnet.prover import taylor
+from lyapnet.prover.bound_kernel.kernel import BoundKernel, kernel_of
+from lyapnet.prover.bound_kernel.program import Support, of_boxes
+from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
+from lyapnet.prover.rounding import rounding
+from lyapnet.prover.simplification import with_known_truths, without_copies
+from lyapnet.prover.taylor import TaylorForm, box_form, wide_axes
+
+MANY = 4000  # boxes, whose bounds take torch as long as a kernel takes to compile
+HELD = 32  # points of the box at which a trace is held against its function
+
+
+class BoundedFunction:
+    """(t, x) ↦ some numbers, with bounds of each on boxes of (t, x).
+
+    Args:
+        function: of t () and x (n,), with tensors of any shape as results; in float64, from torch operations; its
+            control flow does not depend on their values.
+        sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
+        degree: of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
+        exact: bounds the function in real numbers, also where it stands for one that a program rounds.
+
+    Attributes:
+        graph: the function as its torch operations, at one (t, x).
+
+    Raises:
+        UsageError: the function cannot be traced; or it has an operator without a rule, which is named.
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Tensor, Tensor], tuple[Tensor, ...]],
+        sample: tuple[Corner, Corner],
+        degree: int = 2,
+        exact: bool = False,
+    ):
+        lower, upper = sample
+        self.degree = degree
+        generator = torch.Generator().manual_seed(0)
+        share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
+        first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
+        try:
+            with rounding(counted=not exact):
+                graph = trace(function, first, others)
+            self.graph = copy.deepcopy(graph)  # with constants that no one else writes to
+        except LyapnetError as error:
+            raise UsageError(str(error)) from error
+        except (Exception, SystemExit) as error:
+            line = one_line(error)
+            raise UsageError(
+                f"Expected f, g, the cost and V in torch operations, each state's result its own, got {line}"
+            ) from error
+        self._nodes = list(with_known_truths(without_copies(self.graph.graph)).nodes)
+        self._fold_constants()
+        self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
+        self._seen: Counter[Hashable] = Counter()  # boxes, by the axes along which they have a width; and forms
+        self._kernels: dict[Hashable, BoundKernel | None] = {}
+        self.forms(lower[None], upper[None])  # an operator without a rule is found here
+
+    def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
+        """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.
+
+        Once there are many boxes on the CPU, machine code takes over, if there is any.
+        """
+        if lower.device.type == "cpu":
+            wide = tuple(wide_axes(lower, upper).tolist())
+            self._seen[wide] += len(lower)
+            kernel = self.kernel(lower, upper) if self._seen[wide] > MANY else None
+            if kernel is not None:
+                return kernel.forms(lower, upper)
+        return self.image(box_form(lower, upper, self.degree))
+
+    def kernel(self, lower: Corners, upper: Corners) -> BoundKernel | None:
+        """Machine code for boxes with a width along the same axes as these; None where there is none."""
+        wide = tuple(wide_axes(lower, upper).tolist())
+        if wide not in self._kernels:
+            self._kernels[wide] = self._kernel_of(of_boxes(lower.shape[-1], wide), len(wide))
+        return self._kernels[wide]
+
+    def _kernel_of(self, inputs: Sequence[Support], dimension: int) -> BoundKernel | None:
+        return kernel_of(self._nodes, self._constants, inputs, dimension, self.degree)
+
+    def image(self, box: TaylorForm, supports: Sequence[Support] | None = None) -> list[TaylorForm]:
+        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none.
+
+        Args:
+            supports: the numbers of the terms that each entry of the form may have, rising, if that is known: for many
+                such forms on the CPU machine code takes over.
+        """
+        if supports is not None and box.radius.device.type == "cpu":
+            key = (box.dimension, *supports)
+            self._seen[key] += len(box.radius)
+            if self._seen[key] > MANY:
+                if key not in self._kernels:
+                    self._kernels[key] = self._kernel_of(supports, box.dimension)
+                if (kernel := self._kernels[key]) is not None:
+                    return kernel.image(box)
+        inputs = iter([_rows(box, 0), _rows(box, slice(1, None))])
+        values: dict[Node, Any] = dict(self._constants)
+        for node in self._nodes:
+            if node.op == "placeholder":
+                values[node] = next(inputs)
+            elif node.op == "output":
+                results: Any = map_arg(node.args[0], values.__getitem__)
+                return [y if isinstance(y, TaylorForm) else taylor.constant_form(y, box) for y in results]
+            elif node not in values:
+                values[node] = _apply(node, values)
+            for source in node.all_input_nodes:
+                if self._last_use[source] is node and source not in self._constants:
+                    del values[source]
+        raise AssertionError("a graph ends with its output")
+
+    def on(self, device: torch.device) -> "BoundedFunction":
+        """The same bounds on another device, of boxes that lie there; what its constants are stays as it is."""
+        other = copy.copy(self)
+        other._constants = {
+            node: tree_map_only(Tensor, lambda value: value.to(device), value)
+            for node, value in self._constants.items()
+        }
+        return other
+
+    @property
+    def fingerprint(self) -> str:
+        """A hash of the function: its operations and every number in them."""
+        found = hashlib.sha256(str(self.graph.graph).encode())
+        for node in self._nodes:
+            if node.op == "get_attr":
+                value = self._constants[node]
+                found.update(f"{value.dtype} {tuple(value.shape)}".encode())
+                found.update((value.double() if value.is_floating_point() else value).contiguous().numpy().tobytes())
+        return found.hexdigest()
+
+    def bounds(self, lower: Corners, upper: Corners) -> list[tuple[OnBoxes, OnBoxes]]:
+        """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where there are none."""
+        return [form.interval() for form in self.forms(lower, upper)]
+
+    @property
+    def operators(self) -> set[Any]:
+        """The operators that depend on the point; the others are folded to constants."""
+        return {node.target for node in self._nodes if node.op == "call_function" and node not in self._constants}
+
+    def _fold_constants(self) -> None:
+        self._constants: dict[Node, Any] = {}
+        for node in self._nodes:
+            if node.op == "get_attr":
+                self._constants[node] = _attribute(self.graph, str(node.target))
+            elif node.op == "call_function" and all(source in self._constants for source in node.all_input_nodes):
+                arguments, keywords = _values(node, self._constants)
+                self._constants[node] = node.target(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+
+
+def _apply(node: Node, values: dict[Node, Any]) -> Any:
+    """What the node's operator makes of its arguments, by its rule where one of them depends on the point.
+
+    Raises:
+        UsageError: the operator has no rule; or its rule does not cover these arguments, or this result.
+    """
+    arguments, keywords = _values(node, values)
+    rule = node.target
+    if any(isinstance(values[source], TaylorForm | list) for source in node.all_input_nodes):
+        rule = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
+    if rule is None:
+        raise UsageError(
+            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
+            "lyapnet.prover.bound_rules.RULES."
+        )
+    try:
+        result = rule(*arguments, **keywords)  # pyright: ignore[reportCallIssue]
+    except LyapnetError:
+        raise
+    except Exception as error:
+        raise UsageError(
+            f"Expected arguments that the rule for bounds of {node.target} covers, got {one_line(error)}; "
+            "write it with other operators."
+        ) from error
+    recorded = node.meta.get("val")
+    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # constant: of the shape of its argument alone
+        return result.to(torch.get_default_device(), recorded.dtype)
+    for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
+        if isinstance(form, TaylorForm):
+            truth = value.dtype == torch.bool and node.target in OF_TRUTHS and _compares_as_it_is(node, values)
+            real = value.dtype == torch.float64 or truth
+            if not real or form.shape != value.shape:
+                raise UsageError(
+                    f"Expected operators with a rule for bounds, got {node.target} in {value.dtype} of shape "
+                    f"{tuple(value.shape)}; stay in x.dtype, to which truths convert, or write it with others."
+                )
+    return result
+
+
+def _compares_as_it_is(node: Node, values: dict[Node, Any]) -> bool:
+    """Whether torch rounds neither of two numbers before it compares them: one without axes takes the other's dtype."""
+    sources = node.all_input_nodes
+    both = [values[source] if isinstance(values[source], Tensor) else source.meta["val"] for source in sources]
+    return len(both) != 2 or torch.result_type(*both) in (torch.float64, torch.bool)
+
+
+def _values(node: Node, values: dict[Node, Any]) -> tuple[Any, Any]:
+    return map_arg(node.args, values.__getitem__), map_arg(node.kwargs, values.__getitem__)
+
+
+def _rows(form: TaylorForm, rows: int | slice) -> TaylorForm:
+    return form.with_parts(form.terms[:, :, rows], form.radius[:, rows])
+
+
+def _attribute(module: Any, path: str) -> Tensor:
+    for name in path.split("."):
+        module = getattr(module, name)
+    return module.detach()

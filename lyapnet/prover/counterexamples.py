@@ -1,0 +1,107 @@
+"""Counterexamples: points (t, x) at which a condition fails, by samples and by ascent."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.base.types import Corner, PerState, Points
+from lyapnet.prover.bounds import BoundedFunction
+from lyapnet.prover.condition import DecreaseCondition
+
+
+class Counterexample(NamedTuple):
+    """A point at which the condition fails, in plain arithmetic and by a lower bound of its value."""
+
+    t: float
+    x: list[float]
+    condition: float  # c(t, x) > 0
+    height: float  # W(t, x) = V(t, x) − δt
+
+
+def find_counterexample(
+    condition: DecreaseCondition,
+    bounded: BoundedFunction,
+    lower: Corner,
+    upper: Corner,
+    level: float,
+    generator: torch.Generator | None = None,
+) -> Counterexample | None:
+    """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64.
+
+    Args:
+        bounded: (c, W, Ẇ).
+    """
+    points = _likely_violations(condition, lower, upper, level, generator)
+    return lowest_violation(condition, bounded, points, level)
+
+
+def lowest_violation(
+    condition: DecreaseCondition, bounded: BoundedFunction, points: Points, level: float
+) -> Counterexample | None:
+    """Among points at which c > 0 and W ≤ level, by bounds too, the one of lowest W."""
+    c, W = _values(condition, points)
+    candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
+    candidates = candidates[W[candidates].argsort()][:256]
+    if not len(candidates):
+        return None
+    (c_low, _), *_ = bounded.bounds(points[candidates], points[candidates])
+    candidates = candidates[c_low > 0]
+    if not len(candidates):
+        return None
+    first = candidates[0]
+    return Counterexample(float(points[first, 0]), points[first, 1:].tolist(), float(c[first]), float(W[first]))
+
+
+def violations(
+    condition: DecreaseCondition,
+    domain: tuple[Corner, Corner],
+    level: float,
+    count: int,
+    generator: torch.Generator | None = None,
+) -> Points:
+    """The worst points (t, x) found with c > 0 and W ≤ level, in plain arithmetic; at most `count`."""
+    points = _likely_violations(condition, *domain, level, generator)
+    c, W = _values(condition, points)
+    worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
+    return points[worst.indices[worst.values > 0]]
+
+
+def _likely_violations(
+    condition: DecreaseCondition,
+    lower: Corner,
+    upper: Corner,
+    level: float,
+    generator: torch.Generator | None,
+    samples: int = 20_000,
+    steps: int = 40,
+) -> Points:
+    """Samples of the box, and the points that ascent passes from the worst 64 of them with W ≤ level."""
+    points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
+    c, W = _values(condition, points)
+    start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
+    return torch.cat([points, _ascend(condition, start, lower, upper, steps)])
+
+
+def _ascend(
+    condition: DecreaseCondition, points: Points, lower: Corner, upper: Corner, steps: int
+) -> Float[Tensor, "passed axes"]:
+    """Points on the way up c, by the signs of its gradient in units of the box, with shrinking steps."""
+    path = [points]
+    for step in range(steps):
+        with torch.enable_grad():
+            leaf = path[-1].detach().requires_grad_()
+            c = condition(leaf[:, 0], leaf[:, 1:]).sum()
+            (slope,) = torch.autograd.grad(c, leaf, materialize_grads=True)
+        length = 0.05 * 0.9**step * (upper - lower)
+        path.append((path[-1] + length * slope.sign().nan_to_num()).clamp(lower, upper))
+    return torch.cat(path)
+
+
+def _values(condition: DecreaseCondition, points: Points) -> tuple[PerState, PerState]:
+    """(c, W); c is −∞ where a constraint excludes the state, so that no counterexample lies there."""
+    with torch.no_grad():
+        t, x = points[:, 0], points[:, 1:]
+        c = condition(t, x)
+        return torch.where(condition.excluded(x), -torch.inf, c), condition.height(t, x)

@@ -1,0 +1,324 @@
+"""Functions of one number on Taylor forms: each by a line or a parabola, and what that leaves.
+
+What torch's own functions are trusted with is in lyapnet.prover.taylor.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.prover import taylor
+from lyapnet.prover.taylor import EPSILON, FLOOR, TINY, TaylorForm
+
+Range = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+class Derivatives(NamedTuple):
+    """Those of a function beyond the first: values at points, and (lo, hi) ↦ bounds on [lo, hi]."""
+
+    second: Callable[[Tensor], Tensor]
+    third: Callable[[Tensor], Tensor]
+    third_range: Range
+    fourth_range: Range
+
+
+def linearised(
+    x: TaylorForm,
+    function: Callable[[Tensor], Tensor],
+    derivative: Callable[[Tensor], Tensor],
+    stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
+    defined: Callable[[Tensor, Tensor], Tensor] | None = None,
+    derivatives: Derivatives | None = None,
+) -> TaylorForm:
+    """f(x) = a x + b ± e, a being the secant's slope over the interval [l, u] of x; for higher degrees see _expanded.
+
+    h(x) = f(x) − a x takes its extremes on [l, u] at l, at u, or where f'(x) = a: b is their middle, e half their
+    distance. Any slope is sound, so a needs no care; the secant's makes e of second order in u − l, and for convex and
+    concave f the smallest possible. A point where f' = a is found up to rounding, within η = 1e-12 (1 + |x|): h there
+    differs from the extreme by at most |h'|η (and terms in η², which are beyond double precision).
+
+    Args:
+        stationary: (a, lo, hi) ↦ points that include each solution of f'(x) = a in [lo, hi]; any others do no harm.
+        defined: (lo, hi) ↦ whether f is smooth on [lo, hi]; the remainder is infinite where it is not.
+        derivatives: those beyond the first; without them forms stay linear in x.
+    """
+    lo, hi = x.interval()
+    known = torch.isfinite(lo) & torch.isfinite(hi)
+    if defined is not None:
+        known = known & defined(lo, hi)
+    lo, hi = torch.where(known, lo, 1.0), torch.where(known, hi, 1.0)
+    if x.degree > 1 and derivatives is not None:
+        result = _expanded(x, lo, hi, function, derivative, derivatives)
+    else:
+        result = _secant(x, lo, hi, function, derivative, stationary)
+    nothing = torch.zeros_like(result.terms)
+    return x.with_parts(torch.where(known, result.terms, nothing), torch.where(known, result.radius, torch.inf))
+
+
+def _secant(
+    x: TaylorForm,
+    lo: Tensor,
+    hi: Tensor,
+    function: Callable[[Tensor], Tensor],
+    derivative: Callable[[Tensor], Tensor],
+    stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]],
+) -> TaylorForm:
+    f_l, f_u = function(lo), function(hi)
+    wide = hi - lo > 1e-6 * torch.maximum(-lo, hi)  # else the secant's slope is a quotient of rounding errors
+    a = torch.where(wide, (f_u - f_l) / torch.where(wide, hi - lo, 1.0), derivative((lo + hi) / 2))
+    a = a if len(x.coefficients) else torch.zeros_like(a)  # of an interval: its image, b ± e
+    points = torch.stack([torch.where(p.isnan(), lo, p).clamp(lo, hi) for p in stationary(a, lo, hi)])
+    f_p = function(points)
+    h = torch.cat([(f_l - a * lo)[None], (f_u - a * hi)[None], f_p - a * points])
+    low, high = h.amin(0), h.amax(0)
+    nearby = (((derivative(points) - a).abs() + TINY) * 1e-12 * (1 + points.abs())).amax(0)
+    largest = torch.maximum(f_l.abs(), f_u.abs()).maximum(f_p.abs().amax(0)) + 2 * a.abs() * torch.maximum(-lo, hi)
+    b, e = (low + high) / 2, (high - low) / 2 + nearby + 16 * EPSILON * largest + TINY
+    return x.with_parts(torch.cat([(a * x.center + b)[None], a * x.terms[1:]]), a.abs() * x.radius + e).rounded(2)
+
+
+def _expanded(
+    x: TaylorForm,
+    lo: Tensor,
+    hi: Tensor,
+    function: Callable[[Tensor], Tensor],
+    derivative: Callable[[Tensor], Tensor],
+    derivatives: Derivatives,
+) -> TaylorForm:
+    """f(x) by Taylor's formula in y = x − m about the middle m of [l, u], with |y| ≤ w. In forms of second degree, with
+    M₋ ≤ f‴ ≤ M₊ on [l, u] and M = ½ (M₋ + M₊),
+
+        f(x) = f(m) + (f'(m) + M w²/8) y + ½ f''(m) y² ± (|M| w³/24 + (M₊ − M₋) w³/12),
+
+    as y³ lies within w³/4 of ¾ w² y (Chebyshev), and f − its expansion with f‴ = M within (M₊ − M₋)/2 · w³/6. In those
+    of third, with such bounds of f⁗,
+
+        f(x) = f(m) − M w⁴/192 + f'(m) y + (½ f''(m) + M w²/24) y² + f‴(m)/6 y³ ± (|M| w⁴/192 + (M₊ − M₋) w⁴/48),
+
+    as y⁴ lies within w⁴/8 of w² y² − w⁴/8.
+    """
+    m = (lo + hi) / 2
+    w = (hi - lo) / 2 * (1 + 8 * EPSILON) + 4 * EPSILON * m.abs()
+    cubic = x.degree == 3
+    low, high = (derivatives.fourth_range if cubic else derivatives.third_range)(lo, hi)  # m ± w may leave the domain
+    M = (low + high) / 2
+    a, b, c, k = function(m), derivative(m), derivatives.second(m) / 2, torch.zeros_like(m)
+    if cubic:
+        a, c, k = a - M * w * w * w * w / 192, c + M * w * w / 24, derivatives.third(m) / 6
+        e = (M.abs() / 192 + (high - low) / 48) * w * w * w * w * (1 + 1e-9)
+    else:
+        b = b + M * w * w / 8
+        e = (M.abs() / 24 + (high - low) / 12) * w * w * w * (1 + 1e-9)
+    higher = k.abs() + FLOOR + M.abs() * (w if cubic else 1)
+    size = a.abs() + (b.abs() + FLOOR + (c.abs() + FLOOR + higher * w) * w) * w
+    e = e + 32 * EPSILON * size + TINY
+    y = x.with_parts(torch.cat([(x.center - m)[None], x.terms[1:]]), x.radius).rounded()
+    yy = taylor.multiply(y, y)
+    terms, radius = b * y.terms + c * yy.terms, b.abs() * y.radius + c.abs() * yy.radius
+    if cubic:
+        yyy = taylor.multiply(yy, y)
+        terms, radius = terms + k * yyy.terms, radius + k.abs() * yyy.radius
+    return x.with_parts(torch.cat([(terms[0] + a)[None], terms[1:]]), radius + e).rounded(6)
+
+
+def square(x: TaylorForm) -> TaylorForm:
+    """x²; 2x = a."""
+    if x.degree > 1:
+        return taylor.multiply(x, x)
+    return linearised(x, lambda v: v * v, lambda v: 2 * v, lambda a, lo, hi: [a / 2])
+
+
+def exp(x: TaylorForm) -> TaylorForm:
+    """eˣ; eˣ = a."""
+    grows = _monotone(torch.exp)
+    return linearised(
+        x, torch.exp, torch.exp, lambda a, lo, hi: [torch.log(a)],
+        derivatives=Derivatives(torch.exp, torch.exp, grows, grows),
+    )  # fmt: skip
+
+
+def log(x: TaylorForm) -> TaylorForm:
+    """log x for x > 0; 1/x = a."""
+    third, fourth = (lambda v: 2 / v**3), (lambda v: -6 / v**4)
+    return linearised(
+        x, torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], lambda lo, hi: lo > 0,
+        Derivatives(lambda v: -1 / v**2, third, _monotone(third), _monotone(fourth)),
+    )  # fmt: skip
+
+
+def log1p(x: TaylorForm) -> TaylorForm:
+    """log(1 + x) for x > −1; 1/(1 + x) = a."""
+    third, fourth = (lambda v: 2 / (1 + v) ** 3), (lambda v: -6 / (1 + v) ** 4)
+    return linearised(
+        x, torch.log1p, lambda v: 1 / (1 + v), lambda a, lo, hi: [1 / a - 1], lambda lo, hi: lo > -1,
+        Derivatives(lambda v: -1 / (1 + v) ** 2, third, _monotone(third), _monotone(fourth)),
+    )  # fmt: skip
+
+
+def sqrt(x: TaylorForm) -> TaylorForm:
+    """√x for x > 0; 1/(2√x) = a."""
+    third, fourth = (lambda v: 0.375 * v**-2.5), (lambda v: -0.9375 * v**-3.5)
+    return linearised(
+        x, torch.sqrt, lambda v: 0.5 / v.sqrt(), lambda a, lo, hi: [1 / (4 * a * a)], lambda lo, hi: lo > 0,
+        Derivatives(lambda v: -0.25 * v**-1.5, third, _monotone(third), _monotone(fourth)),
+    )  # fmt: skip
+
+
+def reciprocal(x: TaylorForm) -> TaylorForm:
+    """1/x for x of one sign; −1/x² = a."""
+    third, fourth = (lambda v: -6 / v**4), (lambda v: 24 / v**5)
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        return [torch.copysign((-a).rsqrt(), lo)]
+
+    return linearised(
+        x, torch.reciprocal, lambda v: -1 / (v * v), stationary, lambda lo, hi: (lo > 0) | (hi < 0),
+        Derivatives(lambda v: 2 / v**3, third, _monotone(third), _monotone(fourth)),
+    )  # fmt: skip
+
+
+def sigmoid(x: TaylorForm) -> TaylorForm:
+    """σ(x) = 1/(1 + e⁻ˣ); σ(1 − σ) = a at x = ±(log s − log(1 − s)), s = 2a/(1 + √(1 − 4a))."""
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        s = 2 * a / (1 + (1 - 4 * a).clamp_min(0).sqrt())  # the smaller root, without cancellation
+        point = _logit(s)
+        return [point, -point]
+
+    def fourth(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+        # σ⁗ = p (12 p − 1) tanh(x/2), each factor with the range of its own
+        p = _steepness(lo, hi)
+        ranges = p, (12 * p[0] - 1, 12 * p[1] - 1), (torch.tanh(lo / 2), torch.tanh(hi / 2))
+        ends = torch.stack([a * b * c for a in ranges[0] for b in ranges[1] for c in ranges[2]])
+        return _between(ends.amin(0), ends.amax(0))
+
+    derivatives = Derivatives(_sigmoid_curvature, _sigmoid_third, _sigmoid_third_range, fourth)
+    return linearised(x, torch.sigmoid, _sigmoid_derivative, stationary, None, derivatives)
+
+
+def softplus(x: TaylorForm) -> TaylorForm:
+    """log(1 + eˣ); σ(x) = a."""
+
+    def third(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+        # σ'' has its extremes where σ' = 1/6
+        steepest = torch.log(torch.tensor(2 + 3**0.5, dtype=lo.dtype))
+        points = torch.stack([lo, hi, steepest.clamp(lo, hi), (-steepest).clamp(lo, hi)])
+        values = _sigmoid_curvature(points)
+        return _between(values.amin(0), values.amax(0))
+
+    derivatives = Derivatives(_sigmoid_derivative, _sigmoid_curvature, third, _sigmoid_third_range)
+    return linearised(x, softplus_of, torch.sigmoid, lambda a, lo, hi: [_logit(a)], None, derivatives)
+
+
+def sin(x: TaylorForm) -> TaylorForm:
+    """sin x on at most two periods; cos x = a at x = ±arccos a + 2πk."""
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        return _periodic(torch.acos(a.clamp(-1, 1)), lo, hi)
+
+    derivatives = Derivatives(
+        lambda v: -torch.sin(v), lambda v: -torch.cos(v), _around(lambda v: -torch.cos(v)), _around(torch.sin)
+    )
+    return linearised(x, torch.sin, torch.cos, stationary, _two_periods, derivatives)
+
+
+def cos(x: TaylorForm) -> TaylorForm:
+    """cos x on at most two periods; −sin x = a at x = −π/2 ± arccos a + 2πk."""
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        quarter = torch.pi / 2
+        return [point - quarter for point in _periodic(torch.acos(a.clamp(-1, 1)), lo + quarter, hi + quarter)]
+
+    derivatives = Derivatives(lambda v: -torch.cos(v), torch.sin, _around(torch.sin), _around(torch.cos))
+    return linearised(x, torch.cos, lambda v: -torch.sin(v), stationary, _two_periods, derivatives)
+
+
+def _between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """A range with room for the rounding of its ends."""
+    room = 64 * EPSILON * torch.maximum(low.abs(), high.abs()) + TINY
+    return low - room, high + room
+
+
+def _monotone(function: Callable[[Tensor], Tensor]) -> Range:
+    """The range on [lo, hi] of a function that rises or falls there."""
+
+    def between_ends(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+        ends = torch.stack([function(lo), function(hi)])
+        return _between(ends.amin(0), ends.amax(0))
+
+    return between_ends
+
+
+def _around(wave: Callable[[Tensor], Tensor]) -> Range:
+    """The range of a sine or cosine on [lo, hi], from its value in the middle: its slope is at most 1."""
+
+    def around_middle(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+        middle, reach = wave((lo + hi) / 2), (hi - lo) / 2 + 2 * EPSILON * torch.maximum(-lo, hi)
+        return _between((middle - reach).clamp_min(-1), (middle + reach).clamp_max(1))
+
+    return around_middle
+
+
+def tan(x: TaylorForm) -> TaylorForm:
+    """tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
+
+    def branch(lo: Tensor, hi: Tensor) -> Tensor:
+        return ((lo + hi) / (2 * torch.pi)).round() * torch.pi
+
+    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+        base = torch.atan((a - 1).clamp_min(0).sqrt())
+        return [branch(lo, hi) - base, branch(lo, hi) + base]
+
+    def defined(lo: Tensor, hi: Tensor) -> Tensor:
+        return (lo - branch(lo, hi) > -1.57) & (hi - branch(lo, hi) < 1.57)
+
+    return linearised(x, torch.tan, lambda v: 1 + torch.tan(v) ** 2, stationary, defined)
+
+
+def _two_periods(lo: Tensor, hi: Tensor) -> Tensor:
+    return hi - lo < 4 * torch.pi
+
+
+def _periodic(base: Tensor, lo: Tensor, hi: Tensor) -> list[Tensor]:
+    """All of ±base + 2πk, 0 ≤ base ≤ π, in an interval of at most two periods."""
+    turn = 2 * torch.pi
+    middle = ((lo + hi) / (2 * turn)).round() * turn
+    return [sign * base + middle + k * turn for sign in (-1, 1) for k in range(-2, 3)]
+
+
+def _logit(s: Tensor) -> Tensor:
+    return torch.log(s) - torch.log1p(-s)
+
+
+def _sigmoid_derivative(v: Tensor) -> Tensor:
+    return torch.sigmoid(v) * torch.sigmoid(-v)  # 1 − σ would lose all its digits where σ is close to 1
+
+
+def _steepness(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    """The range of σ' on [lo, hi]; it falls with |x|."""
+    ends = torch.stack([_sigmoid_derivative(lo), _sigmoid_derivative(hi)])
+    return _between(ends.amin(0), torch.where((lo < 0) & (hi > 0), 0.25, ends.amax(0)))
+
+
+def _sigmoid_third(v: Tensor) -> Tensor:
+    p = _sigmoid_derivative(v)
+    return p * (1 - 6 * p)
+
+
+def _sigmoid_third_range(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    """The range of p − 6p² on [lo, hi] with p = σ'; the parabola has its top at p = 1/12."""
+    least, top = _steepness(lo, hi)
+    p = torch.stack([least, top, least.maximum(top.clamp_max(1 / 12))])
+    values = p - 6 * p**2
+    return _between(values.amin(0), values.amax(0))
+
+
+def _sigmoid_curvature(v: Tensor) -> Tensor:
+    return -_sigmoid_derivative(v) * torch.tanh(v / 2)
+
+
+def softplus_of(v: Tensor) -> Tensor:
+    """log(1 + eᵛ) of plain numbers, without overflow."""
+    return v.clamp_min(0) + torch.log1p(torch.exp(-v.abs()))

@@ -1,0 +1,40 @@
+"""What a problem charges: a running cost and a terminal cost."""
+
+from lyapnet.task.cost.base import Cost
+from lyapnet.task.cost.goal import goal_in_words, reason_for_no_goal, spread
+from lyapnet.task.cost.made_of_another import (
+    MadeOfAnother,
+    ObstacleCost,
+    PeriodicCost,
+    PseudoHuberCost,
+    RegulatorTail,
+    TargetCost,
+    innermost,
+    is_quadratic_about_target,
+)
+from lyapnet.task.cost.penalty import PenaltyCost, closeness
+from lyapnet.task.cost.quadratic import QuadraticCost, is_quadratic
+from lyapnet.task.cost.smoothed import SmoothedCost
+
+COSTS: dict[str, type[Cost]] = {"quadratic": QuadraticCost}
+
+__all__ = [
+    "COSTS",
+    "Cost",
+    "MadeOfAnother",
+    "ObstacleCost",
+    "PenaltyCost",
+    "PeriodicCost",
+    "PseudoHuberCost",
+    "QuadraticCost",
+    "RegulatorTail",
+    "SmoothedCost",
+    "TargetCost",
+    "closeness",
+    "goal_in_words",
+    "innermost",
+    "is_quadratic",
+    "is_quadratic_about_target",
+    "reason_for_no_goal",
+    "spread",
+]

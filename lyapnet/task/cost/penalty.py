@@ -1,0 +1,71 @@
+"""The price of coming close to what constraints exclude, which training pays in their place."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.base.types import PerState, State
+from lyapnet.task.cost.base import Cost
+from lyapnet.task.cost.made_of_another import MadeOfAnother
+
+
+def closeness(constraints: nn.Module, margin: Tensor, x: State) -> PerState:
+    """Σ_j max(0, 1 + h_j(x)/m_j)³: 1 at h = 0 of a single constraint, zero from h_j = −m_j on."""
+    return (torch.relu(1 + constraints(x) / margin) ** 3).sum(-1)
+
+
+class PenaltyCost(MadeOfAnother):
+    """Another cost, and w Σ_j max(0, 1 + h_j(x)/m_j)³ per second for constraints h(x) ≤ 0: w at h_j = 0, 0 below −m_j.
+
+    The last state pays for one step more, for which it would stay. The penalty is twice continuously differentiable, as
+    the value function then is. With w large enough for the task the
+    optimum keeps within h ≤ 0, at less cost than if h ≤ −m were asked for.
+
+    Args:
+        cost: what is paid besides.
+        constraints: h, x ↦ (*batch, k).
+        margin: m of all h_j, or m_j of each, in the unit of h.
+        weight: w.
+        step: Δt, in s.
+
+    Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalties), with the constraint moved by m.
+    """
+
+    constraints: nn.Module
+    margin: Float[Tensor, "*k"]
+    step: float
+    weight: Float[Tensor, ""]  # w, in cost per second
+
+    def __init__(
+        self,
+        cost: Cost,
+        constraints: nn.Module,
+        margin: float | Sequence[float],
+        weight: float = 0.0,
+        step: float = 0.0,
+    ):
+        super().__init__(cost)
+        self.constraints, self.step = constraints, step
+        self.register_buffer("margin", torch.tensor(margin, dtype=torch.float64), persistent=False)
+        self.register_buffer("weight", torch.tensor(float(weight)), persistent=False)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(x) + self.penalty(x)
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(x) + self.step * self.penalty(x)
+
+    def penalty(self, x: State) -> PerState:
+        """What a state pays per second for being close to constraints."""
+        return self.weight * closeness(self.constraints, self.margin, x)
+
+    def ignores(self, i: int, n: int) -> bool:
+        return self.cost.ignores(i, n) and self._constraints_ignore(i, n)
+
+    def ignores_at_end(self, i: int, n: int) -> bool:
+        return self.cost.ignores_at_end(i, n) and self._constraints_ignore(i, n)
+
+    def _constraints_ignore(self, i: int, n: int) -> bool:
+        return bool(self.constraints.ignores(i, n))  # pyright: ignore[reportCallIssue]

@@ -1,0 +1,305 @@
+"""Families: one problem for every parameter in a range, as a problem whose parameters are states that stay.
+
+With p among the states, z = (x, p) and ṗ = 0, V(t, x, p) is a V(t, z) like any other: training, optima, evaluation and
+certificates of the family are those of one problem in n + k states.
+"""
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.base.contracts import differences, state_of
+from lyapnet.base.errors import UsageError, one_line
+from lyapnet.base.shapes import Shape
+from lyapnet.base.types import Control, ControlMatrix, InputMatrix, PerState, State
+from lyapnet.graphs.tracing import trace
+from lyapnet.task.cost import Cost
+from lyapnet.task.systems import ControlAffineSystem
+
+ALIKE = 1e-9  # relative: f and g of a member, by attributes and by its constructor
+PREFIX = "target_"
+
+
+class FamilySystem(ControlAffineSystem):
+    """ẋ = f(x; p) + g(x; p)u and ṗ = 0, in the state z = (x, p).
+
+    A parameter of the dynamics is a number that the system keeps under the name of its constructor's argument and reads
+    in f and g; there it becomes a tensor (*batch,), one number for each state. Other parameters are carried along.
+
+    Args:
+        system: f and g.
+        names: of p, (k,).
+        units: of p.
+    """
+
+    def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
+        super().__init__()
+        self.system = system
+        self.parameters_in_f = {name: i for i, name in enumerate(names) if not name.startswith(PREFIX)}
+        self.state_names = (*system.state_names, *names)
+        self.state_units = (*system.state_units, *units)
+        self.control_names, self.control_units = tuple(system.control_names), tuple(system.control_units)
+        self.angles = tuple(system.angles)
+        self.constants = tuple(range(system.n, system.n + len(names)))
+
+    @property
+    def title(self) -> str:
+        return f"family of {self.system.title}"
+
+    def split(self, z: State) -> tuple[Tensor, Tensor]:
+        """(x, p)."""
+        return z[..., : self.system.n], z[..., self.system.n :]
+
+    def joined(self, x: Tensor, parameters: Mapping[str, Any]) -> Tensor:
+        """(x, p) of states and parameters by their names, each scalar or (*batch,).
+
+        Raises:
+            ValueError: other names than those of the family, or other shapes.
+        """
+        names, n = [self.state_names[i] for i in self.constants], self.system.n
+        if parameters.keys() != set(names):
+            raise ValueError(f"Expected values for {', '.join(names)}, got {', '.join(parameters)}; give each.")
+        if not x.ndim or x.shape[-1] != n:
+            listed = ", ".join(self.system.state_names)
+            raise ValueError(f"Expected x of shape (*batch, {n}), got {tuple(x.shape)}; the last axis holds {listed}.")
+        return torch.cat([x, torch.stack([_of_each(x, name, parameters[name]) for name in names], -1)], -1)
+
+    def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
+        """The system with parameters (k,), or with those of each of a batch of states."""
+        return with_attributes(self.system, {name: p[..., i] for name, i in self.parameters_in_f.items()})
+
+    def f(self, x: State) -> State:
+        x, p = self.split(x)
+        return torch.cat([self.member(p).f(x), torch.zeros_like(p)], -1)
+
+    def g(self, x: State) -> InputMatrix:
+        x, p = self.split(x)
+        g = self.member(p).g(x)
+        return torch.cat([g, g.new_zeros(*g.shape[:-2], p.shape[-1], self.m)], -2)
+
+    def dynamics(self, x: State, u: Control) -> State:
+        x, p = self.split(x)
+        return torch.cat([self.member(p).dynamics(x, u), torch.zeros_like(p)], -1)
+
+    def inverse_mass(self, x: State) -> ControlMatrix:
+        """BᵀM(q; p)⁻¹B of each member, of a system that has one."""
+        x, p = self.split(x)
+        member: Any = self.member(p)
+        return member.inverse_mass(x)
+
+    def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
+        n = self.system.n
+        values = {name: float(x[n + i]) for name, i in self.parameters_in_f.items()}
+        return with_attributes(self.system, values).draw(x[:n], u)
+
+
+class FamilyCost(Cost):
+    """The cost of each member: q(x − E(p − p̄)) and φ(x − E(p − p̄)), and R(x) or R(x; p).
+
+    Args:
+        cost: q, R and φ at p̄, in x alone.
+        shift: E (n, k): how the target moves with p.
+        center: p̄ (k,).
+        R: z ↦ (*batch, m, m), where it depends on p; None: that of the cost.
+    """
+
+    shift: Float[Tensor, "n k"]
+    center: Float[Tensor, " k"]
+
+    def __init__(self, cost: Cost, shift: Tensor, center: Tensor, R: Callable[[State], ControlMatrix] | None = None):
+        super().__init__()
+        self.cost, self.R_of_member = cost, R
+        self.register_buffer("shift", shift, persistent=False)
+        self.register_buffer("center", center, persistent=False)
+        self.goal = torch.cat([shift.new_zeros(len(shift)) if cost.goal is None else cost.goal, center])
+        self.rest, self.R_constant, self.R_inverse = cost.rest, cost.R_constant, cost.R_inverse
+
+    def _centred(self, z: Tensor) -> Tensor:
+        n = len(self.shift)
+        return z[..., :n] - (z[..., n:] - self.center) @ self.shift.mT
+
+    def from_goal(self, x: State) -> State:
+        n = len(self.shift)
+        return torch.cat([self.cost.from_goal(self._centred(x)), torch.zeros_like(x[..., n:])], -1)
+
+    def state(self, x: State) -> PerState:
+        return self.cost.state(self._centred(x))
+
+    def terminal(self, x: State) -> PerState:
+        return self.cost.terminal(self._centred(x))
+
+    def R(self, x: State) -> ControlMatrix:
+        return self.cost.R(x[..., : len(self.shift)]) if self.R_of_member is None else self.R_of_member(x)
+
+
+def _of_each(x: State, name: str, value: Any) -> PerState:
+    """The value of a parameter for each of a batch of states."""
+    batch = tuple(x.shape[:-1])
+    try:
+        return torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(batch)
+    except (TypeError, ValueError, RuntimeError) as error:
+        got = tuple(value.shape) if hasattr(value, "shape") else repr(value)
+        raise ValueError(f"Expected {name} scalar or of shape {batch}, got {got}; give a number per state.") from error
+
+
+def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> ControlAffineSystem:
+    """A copy of a system that shares what it is made of, but for some of its numbers."""
+    member = copy.copy(system) if values else system
+    for name, value in values.items():
+        setattr(member, name, value)
+    return member
+
+
+def check_members(
+    family: FamilySystem,
+    build: Callable[[Mapping[str, float]], ControlAffineSystem],
+    z: State,
+    called: str = "parameters of a family",
+) -> None:
+    """Hold f and g of a family, at some states (b, n + k), against systems that are built with their parameters.
+
+    Args:
+        build: a system from the values of the parameters in f.
+        called: what messages call the parameters.
+
+    Raises:
+        UsageError: f or g reads no such number, or not it alone, or does not take it as a tensor.
+    """
+    names, cls = list(family.parameters_in_f), type(family.system).__name__
+    if unread := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
+        known = [name for name, value in vars(family.system).items() if type(value) in (int, float)]
+        raise UsageError(
+            f"Expected {called} among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "
+            f"{unread[0]}; write self.{unread[0]} = {unread[0]} in its __init__, and read it in f and g."
+        )
+    try:
+        f, g = family.f(z), family.g(z)
+    except Exception as error:  # of any kind: f and g may be the user's
+        raise UsageError(
+            f"Expected {cls}.f and g that take {', '.join(names)} as a tensor, one number for each state, got "
+            f"{one_line(error)[:160]}; read states as x[..., i], and write c + torch.zeros_like(x[..., 0]) for "
+            "torch.full_like(x[..., 0], c)."
+        ) from error
+    if unread := _unread(family, z):
+        raise UsageError(
+            f"Expected {cls}.f or g to read {unread[0]}, got the same for each; read self.{unread[0]}, or leave it out."
+        )
+    for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
+        member = build(_values(family, p)).to(z)
+        for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
+            got = own[i][: len(x)] if own.ndim > 1 and len(own) == len(z) else own
+            if got.shape != expected.shape or not torch.allclose(got, expected, ALIKE, ALIKE):
+                raise UsageError(
+                    f"Expected {cls}.{symbol} to read {', '.join(names)} as self.{names[0]} and so on, a number for "
+                    f"each state x[..., i], got another {symbol} than that of {cls} built with {p.tolist()}; what "
+                    "__init__ derives from them has to be derived in f and g, and a system that is passed has the "
+                    "other parameters of the config."
+                )
+    _require_same_operations(family, build, z)
+
+
+def _values(family: FamilySystem, p: Tensor) -> dict[str, float]:
+    """The parameters in f at some p (k,)."""
+    return {name: float(p[i]) for name, i in family.parameters_in_f.items()}
+
+
+def _require_same_operations(
+    family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State
+) -> None:
+    """Refuse a family whose members are others than systems built with their parameters, at any state there is.
+
+    Two objects that hold the same are the same functions. What the constructor makes of its arguments beside the
+    parameters themselves, and f or g reads, shows as another operation or number in the trace.
+    """
+    low, high = family.split(torch.stack([z.amin(0), z.amax(0)]))[1]
+    share = torch.rand(BUILT, len(low), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(z)
+    compared = _Compared()
+    build({name: compared.number(value) for name, value in _values(family, (low + high) / 2).items()})
+    before, traced = state_of({"": family.system}), 0
+    for p in [low, high, *compared.beside(low, high), *(low + (high - low) * share)]:
+        values = _values(family, p)
+        built, member = build(values).to(z), with_attributes(family.system, values).to(z)
+        derived = differences(state_of({"self": member}), state_of({"self": built}))
+        if derived and traced < TRACED:
+            traced += 1
+            if _operations(member, values, z) != _operations(built, values, z):
+                raise UsageError(
+                    f"Expected {type(built).__name__}.f and g to read no more of {', '.join(values)} than self."
+                    f"{next(iter(values))} and so on, got others than those of {type(built).__name__} built with "
+                    f"{p.tolist()}, of which __init__ derives {derived[0]}; derive it in f and g."
+                )
+    if changed := differences(before, state_of({"": family.system})):
+        raise UsageError(
+            f"Expected {type(family.system).__name__}.__init__ to change nothing but its object, got {changed[0]}, "
+            "which is another one after it; write self.NAME = … for each number."
+        )
+
+
+BUILT = 32  # members at random that are held against what the constructor builds, beside those at the ends and at jumps
+TRACED = 4  # how many of their f and g are compared as graphs, where the constructor makes more of its arguments
+
+
+class _Compared(list[float]):
+    """The numbers that a constructor compares its arguments with: at each of them it may do something else."""
+
+    def number(self, value: float) -> float:
+        """The value, as a number that notes what it is compared with."""
+        met = self
+
+        class Noting(float):
+            """A number that notes what it is compared with."""
+
+        for sign in ("__lt__", "__le__", "__gt__", "__ge__", "__eq__", "__ne__"):
+
+            def compare(one: float, other: Any, sign: str = sign) -> Any:
+                if isinstance(other, int | float):
+                    met.append(float(other))
+                return getattr(float(one), sign)(other)
+
+            setattr(Noting, sign, compare)
+        Noting.__hash__ = float.__hash__
+        return Noting(value)
+
+    def beside(self, low: Tensor, high: Tensor) -> list[Tensor]:
+        """Parameters with one of them at such a number, or on either side of it, within a box."""
+        found = list[Tensor]()
+        for axis, (least, greatest) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
+            for value in {met + step * (greatest - least) for met in self for step in (-1e-3, 0.0, 1e-3)}:
+                if least <= value <= greatest:
+                    found.append((low + high) / 2)
+                    found[-1][axis] = value
+        return found
+
+
+def _operations(system: ControlAffineSystem, values: Mapping[str, float], z: State) -> Any:
+    """f, g and all that a problem asks of a system as operators and numbers, of parameters as numbers and as tensors;
+    None where they have no trace, as no certificate has."""
+    like = z[0, : system.n]
+
+    def asked(x: Tensor, u: Tensor, *p: Tensor) -> tuple[Tensor, ...]:
+        here = with_attributes(system, dict(zip(values, p[0].unbind(-1), strict=True))) if p else system
+        weight = getattr(here, "inverse_mass", None)
+        return here.f(x), here.g(x), here.dynamics(x, u), *([] if weight is None else [weight(x)])
+
+    try:
+        p = torch.tensor([*values.values()]).to(z)
+        graphs = [trace(asked, [like, like.new_zeros(system.m), *more]) for more in ([], [p])]
+    except Exception:  # of any kind: f and g may be the user's
+        return None
+    return [(str(graph.graph), state_of({"": dict(graph.named_buffers())})) for graph in graphs]
+
+
+def _unread(family: FamilySystem, z: State) -> list[str]:
+    """The parameters that neither f nor g reads."""
+    x, p = family.split(z)
+    with torch.enable_grad():
+        read = {name: p[:, k].clone().requires_grad_() for name, k in family.parameters_in_f.items()}
+        member = with_attributes(family.system, read)
+        total = member.f(x).sum() + member.g(x).sum() + 0 * x.new_zeros((), requires_grad=True)
+        found = torch.autograd.grad(total, [*read.values()], allow_unused=True)
+    return [name for name, gradient in zip(read, found, strict=True) if gradient is None]

@@ -1,0 +1,396 @@
+"""The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.contracts import called, check_function, check_memory, copied
+from lyapnet.base.errors import UsageError
+from lyapnet.base.findings import Findings
+from lyapnet.base.linear_algebra import apply, convex_or
+from lyapnet.base.types import Control, PerState, State
+from lyapnet.task.constraints import Constraints
+from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
+from lyapnet.task.domain import Border, Domain, DomainCost, as_written, found_borders, size_of, within
+from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
+from lyapnet.task.sets import Box, ControlSet
+from lyapnet.task.systems import ControlAffineSystem
+
+LOOKED = 200  # steps, along which it is seen whether a task has a goal
+TRIED = 64  # states at which functions of others are tried
+LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
+ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
+
+
+class Response(NamedTuple):
+    """One step with u held: F to first order in u, and ℓ to second."""
+
+    x: State  # F(x, u), where it leads
+    by_control: Tensor  # F_u/Δt (*batch, n, m); with Euler g(x)
+    slope: Control  # ℓ_u of the mean ℓ over the step
+    curvature: Tensor  # ℓ_uu (*batch, m, m), symmetric positive definite; with Euler 2R
+
+
+class Problem(nn.Module):
+    """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U subject to ẋ = f(x) + g(x)u, h(x) ≤ 0, for all x₀ ∈ X₀.
+
+    Args:
+        system: f and g.
+        cost: ℓ and φ.
+        controls: U.
+        initial_states: X₀.
+        horizon: T, its steps, and the method by which each is taken with u held.
+        constraints: h; None: there are none.
+
+    Raises:
+        ValueError: X₀, or a goal or rest of the cost, has another dimension than the system.
+    """
+
+    system: ControlAffineSystem
+    cost: Cost
+    controls: ControlSet
+    initial_states: Box
+    horizon: Horizon
+    constraints: Constraints | None
+    findings: Findings
+
+    def __init__(
+        self,
+        system: ControlAffineSystem,
+        cost: Cost,
+        controls: ControlSet,
+        initial_states: Box,
+        horizon: Horizon,
+        constraints: Constraints | None = None,
+    ):
+        super().__init__()
+        if initial_states.dimension != system.n:
+            raise ValueError(
+                f"Expected initial_states with {system.n} entries ({', '.join(system.state_names)}), got "
+                f"{initial_states.dimension}; give one for each."
+            )
+        for name, expected in (("goal", system.n), ("rest", system.m)):
+            given = getattr(cost, name)
+            if given is not None and given.shape != (expected,):
+                raise UsageError(
+                    f"Expected {name} of {type(cost).__name__} of shape ({expected},), got {tuple(given.shape)}; give "
+                    "one number for each."
+                )
+        self.system, self.cost, self.controls = system, cost, controls
+        self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
+        self.findings = Findings()
+
+    @property
+    def goal(self) -> State:
+        """The state (n,) at which q and φ vanish; where there is none, the centre of X₀, as a state that is typical."""
+        like = self.initial_states.lower
+        if not self.has_goal:
+            return self.initial_states.center
+        return torch.zeros_like(like) if self.cost.goal is None else self.cost.goal.to(like)
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether q and φ vanish at a state, the cost's goal or else the origin, and are nowhere negative."""
+        return not self.no_goal
+
+    @property
+    def no_goal(self) -> str:
+        """Why there is no goal; empty where there is one."""
+        if "no_goal" not in self.findings:
+            try:
+                own = copied(self)
+                cost = as_written(own.cost)
+                goal = torch.zeros_like(own.initial_states.lower) if cost.goal is None else cost.goal
+                self.findings["no_goal"] = reason_for_no_goal(cost, goal, own._typical_states())
+            except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
+                return ""
+        return self.findings["no_goal"]
+
+    @torch.no_grad()
+    def _typical_states(self) -> State:
+        """States (b, n) of X₀, and where random controls that do not change lead from there, within LOOKED steps."""
+        generator = torch.Generator().manual_seed(0)
+        x = self.initial_states.sample(TRIED, generator)
+        u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
+        states, N = [x], min(self.horizon.steps, LOOKED)
+        for n in range(1, N + 1):
+            x = self.step(x, u)[0]
+            if n in (N // 2, N):
+                states.append(x)
+        every = torch.cat(states)
+        kept = every.isfinite().all(-1)
+        return every[kept if self.domain is None else kept & ~self.domain.left(every[None])]
+
+    @property
+    def domain(self) -> Domain | None:
+        """The states at which f, g, q and φ are defined; None where those are all that there are, or nobody asked."""
+        domain = getattr(self.system, "domain", None)
+        return domain if isinstance(domain, Domain) else None
+
+    @property
+    def rest(self) -> Control:
+        """The control (m,) that costs nothing: u*, zero where there is no target."""
+        rest, like = self.cost.rest, self.initial_states.lower
+        return like.new_zeros(self.system.m) if rest is None else rest.to(like)
+
+    def rates(self, x: State, u: Control) -> tuple[State, PerState]:
+        """The means of ẋ and of ℓ over one step from x with u held, by the method of the horizon."""
+        tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
+        for row in tableau.a:
+            X = x + self.horizon.dt * weighted_sum(row, slopes) if any(row) else x
+            slopes.append(self.system.dynamics(X, u))
+            costs.append(self.cost.running(X, u))
+        return weighted_sum(tableau.b, slopes), weighted_sum(tableau.b, costs)
+
+    def step(self, x: State, u: Control) -> tuple[State, PerState]:
+        """(F(x, u), ∫ℓ): where one step with u held leads, and what it costs; with Euler (x + Δt(f + gu), Δt ℓ)."""
+        rate, cost = self.rates(x, u)
+        return x + self.horizon.dt * rate, self.horizon.dt * cost
+
+    def response(self, x: State, u: Control | None = None) -> Response:
+        """How one step from x answers to u.
+
+        Args:
+            u: where; None: u*, the control that costs nothing.
+        """
+        if self.horizon.method == "euler":
+            return self._euler_response(x, u)
+        n, recording = self.system.n, torch.is_grad_enabled()
+        u = self.rest.expand(*x.shape[:-1], -1) if u is None else u
+        with torch.enable_grad():
+            u = u if recording and u.requires_grad else u.detach().requires_grad_()
+            # one copy of u for each component of ẋ: all rows of the Jacobian in one sweep
+            copies = u.expand(n, *u.shape)
+            rate = self.rates(x.expand(n, *x.shape), copies)[0]
+            rows = (
+                torch.eye(n, dtype=rate.dtype, device=rate.device).reshape(n, *[1] * (rate.ndim - 2), n).expand_as(rate)
+            )
+            (by_control,) = torch.autograd.grad(rate, copies, rows, create_graph=recording)
+            (slope,) = torch.autograd.grad(self.rates(x, u)[1].sum(), u, create_graph=True)
+            bends = [torch.autograd.grad(s.sum(), u, create_graph=True)[0] for s in slope.unbind(-1)]
+        parts = x + self.horizon.dt * rate[0], by_control.movedim(0, -2), slope, self._convex(torch.stack(bends, -2), x)
+        return Response(*(part if recording else part.detach() for part in parts))
+
+    def _convex(self, curvature: Tensor, x: State) -> Tensor:
+        """ℓ_uu, or 2R in its place where it is not well above zero."""
+        least = 2 * self.cost.R(x)
+        return convex_or((curvature + curvature.mT) / 2, least, least)
+
+    def _euler_response(self, x: State, u: Control | None) -> Response:
+        rest = self.cost.rest
+        if u is None:
+            rate = self.system.f(x) if rest is None else self.system.dynamics(x, rest.expand(*x.shape[:-1], -1))
+            zero = x.new_zeros(self.system.m).expand(*x.shape[:-1], -1)
+            return Response(x + self.horizon.dt * rate, self.system.g(x), zero, 2 * self.cost.R(x))
+        after, R2 = x + self.horizon.dt * self.system.dynamics(x, u), 2 * self.cost.R(x)
+        return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2)
+
+    def replaced(self, **parts: Any) -> "Problem":
+        """The problem with some of its parts exchanged."""
+        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
+        other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+        if parts.keys().isdisjoint(("cost", "system")):
+            other.findings = self.findings
+        if "initial_states" in parts:
+            other.findings = Findings({name: found for name, found in other.findings.items() if name != "no_goal"})
+        return other
+
+    def in_steps(self, **changes: Any) -> "Problem":
+        """The problem in other steps: its horizon with some of steps, dt and method exchanged."""
+        return self.replaced(horizon=replace(self.horizon, **changes))
+
+    def relaxed(self, weight: float = 0.0) -> "Problem":
+        """The problem that training solves, whose cost keeps closed loops off the constraints; itself without any.
+
+        Args:
+            weight: of the penalty, in cost per second at h = 0; training from a config finds its own.
+        """
+        if self.constraints is None:
+            return self
+        cost = PenaltyCost(self.cost, self.constraints, self.constraints.margin, weight, self.horizon.dt)
+        return self.replaced(cost=cost.to(self.initial_states.lower))
+
+    def borders(self) -> list[Border]:
+        """Where f, g, q and φ end, each state by itself; none where they are finite everywhere."""
+        own = copied(self)
+        system, cost = own.system, own.cost
+        functions = {"f": system.f, "g": system.g, "q": cost.state, "φ": cost.terminal}
+        try:
+            return found_borders(functions, own.initial_states, system.state_names)
+        except Exception:  # of any kind: a function of the user's that refuses such states
+            return []
+
+    @torch.no_grad()
+    def within(self, borders: Sequence[Border]) -> "Problem":
+        """The problem in the domain between some borders: beyond them its functions are those of the nearest state just
+        within, and each step that is spent there costs about as much as a closed loop, in units of a state's size.
+        """
+        if not borders:
+            return self
+        box, horizon = self.initial_states, self.horizon
+        domain = Domain(self.system.state_names, size_of(box), borders)
+        x = box.sample(TRIED, torch.Generator().manual_seed(0))
+        running, terminal = (part.abs().mean() for part in (self.cost.state(x), self.cost.terminal(x)))
+        price = float(horizon.duration * running + terminal) or 1.0
+        cost = DomainCost(self.cost, domain, price, horizon.dt)
+        return self.replaced(system=within(self.system, domain), cost=cost.to(box.lower))
+
+    def check(self) -> None:
+        """Hold f, g, the cost and the controls against their contracts on states of X₀, in float64.
+
+        Raises:
+            UsageError: naming what is wrong, and where.
+        """
+        own = copied(self)
+        system, cost, n, m = own.system, own.cost, own.system.n, own.system.m
+        system.check_coordinates()
+        name = type(system).__name__
+        generator = torch.Generator().manual_seed(0)
+        x = own.initial_states.sample(256, generator)
+        for symbol, function, shape in (
+            (f"{name}.f(x)", system.f, (n,)),
+            (f"{name}.g(x)", system.g, (n, m)),
+            (f"q(x) of {type(cost).__name__}", cost.state, ()),
+            (f"φ(x) of {type(cost).__name__}", cost.terminal, ()),
+            (f"R(x) of {type(cost).__name__}", cost.R, (m, m)),
+        ):
+            check_function(symbol, function, [x[:TRIED]], shape)
+        cost.check(x)
+        own._check_constraints(x)
+        b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
+        if not torch.allclose(system.dynamics(x, b), ControlAffineSystem.dynamics(system, x, b), rtol=1e-6):
+            raise UsageError(
+                f"Expected {name}.dynamics(x, u) = f(x) + g(x)u, got another sum; a class that overrides f or g of "
+                "another system may have to override its dynamics too."
+            )
+        u = own.controls.minimise(cost.R(x), 100 * b)
+        inside = u.shape == b.shape and torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9)
+        if not inside:
+            raise UsageError(
+                f"Expected {type(own.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
+                f"{tuple(u.shape)} or a control outside; correct it."
+            )
+        check_memory(own.parts, lambda: own.call(x[:TRIED]), lambda: own.call(own.initial_states.ends(TRIED)))
+
+    @property
+    def parts(self) -> dict[str, nn.Module]:
+        """The parts that others may have written, by what messages call them."""
+        parts = (self.system, self.cost, self.controls, self.constraints)
+        return {type(part).__name__: part for part in parts if part is not None}
+
+    def call(self, x: State) -> None:
+        """Compute all that its parts have to say of some states, for what that leaves behind."""
+        system, cost = self.system, self.cost
+        R, u = cost.R(x), torch.ones_like(x[..., :1]).expand(*x.shape[:-1], system.m)
+        u = self.controls.project(self.controls.minimise(R, u))
+        _ = system.dynamics(x, u), cost.running(x, u), cost.terminal(x), self.controls.contains(u), self.rates(x, u)
+        if self.constraints is not None:
+            self.constraints(x)
+
+    def _check_constraints(self, x: State) -> None:
+        """Hold h against its contract, and some states of X₀ against h."""
+        if self.constraints is None:
+            return
+        constraints, name = self.constraints, type(self.constraints).__name__
+        if not constraints.names:
+            raise UsageError(f"Expected {name}.names with a name for each component of h(x), got none; declare them.")
+        check_function(f"h(x) of {name}", constraints, [x[:TRIED]], (len(constraints.names),))
+        h = constraints(x)
+        outside = (h > 0).any(-1)
+        if bool(outside.any()):
+            first = int(torch.nonzero(outside)[0])
+            raise UsageError(
+                f"Expected X₀ within the constraints, got {float(outside.double().mean()):.1%} of its states outside, "
+                f"as {x[first].tolist()}, which violates {constraints.names[int(h[first].argmax())]!r}; shrink "
+                "initial_states, or widen the constraints."
+            )
+
+    def check_value_function(self, V: nn.Module) -> None:
+        """Hold V and its V_x against their contracts at times and states of the problem, in float64.
+
+        Raises:
+            UsageError: naming what is wrong, and where.
+        """
+        name, generator = type(V).__name__, torch.Generator().manual_seed(0)
+        own: Any = copied(V).eval()
+        x = self.initial_states.sample(TRIED, generator).double().cpu()
+        t = self.horizon.duration * torch.rand(TRIED, generator=generator, dtype=torch.float64)
+        check_function(f"{name}.forward(t, x)", own, [t, x], ())
+        leaf = x.clone().requires_grad_()
+        with torch.enable_grad():
+            (expected,) = torch.autograd.grad(own(t, leaf).sum(), leaf, materialize_grads=True)
+        ends = self.initial_states.ends(TRIED).double().cpu()
+        check_memory(
+            {name: own},
+            lambda: own.value_and_state_gradient(t, x),
+            lambda: own.value_and_state_gradient(t.flip(0), ends),
+        )
+        value, V_x = called(f"{name}.value_and_state_gradient(t, x)", own.value_and_state_gradient, [t, x])
+        same = V_x.shape == x.shape and torch.allclose(
+            V_x, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().max())
+        )
+        if not same or not torch.allclose(value, own(t, x), rtol=1e-6):
+            raise UsageError(
+                f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than "
+                "autograd's: correct it, or leave it out."
+            )
+
+    def record(self) -> dict[str, list[Any]]:
+        """What a checkpoint keeps of its problem, as plain data: state names; f, g, the cost and U in numbers.
+
+        They are evaluated in float64 at 3 fixed states of X₀. Where X₀ is thin they are apart nevertheless: friction
+        counts for those who start at rest too.
+        """
+        own = copied(self)
+        box, m = own.initial_states, own.system.m
+        cost = as_written(own.cost)  # what keeps closed loops off constraints, and in a domain, is lyapnet's own
+        generator = torch.Generator().manual_seed(0)
+        x = box.sample(3, generator)
+        thin = torch.where(box.widths > 0, 0.0, torch.where(box.center == 0, 1.0, box.center.abs()))
+        x = x + 0.1 * thin * torch.rand(x.shape, generator=generator, dtype=x.dtype)
+        b = torch.tensor([[1e4], [-1e4], [1.0]], dtype=x.dtype).expand(-1, m)  # which a bounded set clips at its bounds
+        with torch.no_grad():
+            numbers = {
+                "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
+                "φ": cost.terminal(x), "U": own.controls.minimise(torch.eye(m, dtype=x.dtype).expand(3, m, m), b),
+            }  # fmt: skip
+        if cost.rest is not None:
+            numbers["u*"] = cost.rest.expand(3, m)
+        if own.constraints is not None:
+            numbers["h"] = own.constraints(x)
+        if own.controls.limits is not None:
+            for side, limit in zip(LIMITS, own.controls.limits, strict=True):
+                numbers[side] = limit.to(x).expand(1, m)
+        return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
+
+    def differences(self, record: Any) -> list[str]:
+        """The parts in which the problem of a record is another one; none where there is no record for this X₀."""
+        own = self.record()
+        if not isinstance(record, dict) or not _alike(record.get("x"), own.pop("x")):
+            return []
+        m = self.system.m
+        unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
+        if "u*" in record:
+            own = {"u*": unsaid["u*"], **own}
+        if "h" in record:
+            own = {"h": [[0.0]] * 3, **own}
+        return [name for name, value in own.items() if not _alike(record.get(name, unsaid.get(name)), value)]
+
+
+def _alike(recorded: Any, own: list[Any]) -> bool:
+    """Whether two records of the same hold equal names, or equal numbers up to rounding."""
+    if isinstance(own[0], str):
+        return recorded == own
+    try:
+        one, other = (torch.tensor(numbers, dtype=torch.float64) for numbers in (recorded, own))
+    except Exception:  # of any kind: what was recorded comes from a file
+        return False
+    if one.shape != other.shape:
+        return False
+    size = other.nan_to_num(0.0, 0.0, 0.0).abs()
+    tolerance = ALIKE * size.amax(0) + 1e-7 * size.max()  # a component that cancels has the rounding of its terms
+    return bool(((one == other) | (one.isnan() & other.isnan()) | ((one - other).abs() <= tolerance)).all())

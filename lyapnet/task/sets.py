@@ -1,0 +1,371 @@
+"""Sets of states and of controls."""
+
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from lyapnet.base.linear_algebra import apply, has_values, solve
+from lyapnet.base.operators import are_operators, operator
+from lyapnet.base.types import Control, ControlMatrix, State
+
+
+class Box(nn.Module):
+    """The box {x : lower ≤ x ≤ upper}, componentwise; a component with lower = upper is fixed.
+
+    Args:
+        lower: (n,) lower bounds, in the units of the state.
+        upper: (n,) upper bounds.
+
+    Raises:
+        ValueError: bounds of different or no length, not finite, or reversed.
+    """
+
+    lower: Float[Tensor, " n"]
+    upper: Float[Tensor, " n"]
+
+    def __init__(self, lower: Sequence[float] | Tensor, upper: Sequence[float] | Tensor):
+        super().__init__()
+        low, high = torch.as_tensor(lower), torch.as_tensor(upper)
+        if low.ndim != 1 or low.shape != high.shape or not len(low):
+            raise ValueError(
+                f"Expected lower and upper of the same shape (n,), got {tuple(low.shape)} and {tuple(high.shape)}; "
+                "give one bound for each state."
+            )
+        dtype = torch.promote_types(torch.promote_types(low.dtype, high.dtype), torch.get_default_dtype())
+        low, high = low.to(dtype), high.to(dtype)
+        if not (torch.isfinite(low).all() and torch.isfinite(high).all()):
+            raise ValueError(
+                f"Expected finite bounds, got lower {low.tolist()} and upper {high.tolist()}; choose a bounded set."
+            )
+        reversed_at = torch.nonzero(low > high).flatten().tolist()
+        if reversed_at:
+            i = reversed_at[0]
+            raise ValueError(f"Expected lower ≤ upper, got {low[i]} > {high[i]} at index {i}; swap the two bounds.")
+        self.register_buffer("lower", low, persistent=False)
+        self.register_buffer("upper", high, persistent=False)
+
+    @property
+    def dimension(self) -> int:
+        """n."""
+        return len(self.lower)
+
+    @property
+    def center(self) -> Float[Tensor, " n"]:
+        """The midpoint (lower + upper) / 2."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def widths(self) -> Float[Tensor, " n"]:
+        """Side lengths upper − lower; zero where a component is fixed."""
+        return self.upper - self.lower
+
+    @property
+    def magnitude(self) -> Float[Tensor, " n"]:
+        """max |x_i| over the box, for each component."""
+        return self.reach_from(torch.zeros_like(self.lower))
+
+    def reach_from(self, point: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+        """max |x_i − point_i| over the box, for each component."""
+        return torch.maximum((self.lower - point).abs(), (self.upper - point).abs())
+
+    def corners(self, axes: int = 12) -> State:
+        """The corners; those along so many of its axes, the others at the centre, where it has more."""
+        free = torch.nonzero(self.widths > 0).flatten()[:axes]
+        found = self.center.repeat(2 ** len(free), 1)
+        for k, i in enumerate(free):
+            upper = torch.arange(len(found)).bitwise_right_shift(k) % 2 == 1
+            found[:, i] = torch.where(upper, self.upper[i], self.lower[i])
+        return found
+
+    def ends(self, count: int) -> State:
+        """`count` of its corners, over and over where it has fewer."""
+        corners = self.corners(max(1, count.bit_length() - 1))
+        return corners[torch.arange(count) % len(corners)]
+
+    def extra_repr(self) -> str:
+        return f"{self.lower.tolist()}, {self.upper.tolist()}"
+
+    def sample(self, count: int, generator: torch.Generator | None = None) -> State:
+        """`count` states drawn uniformly and independently; on a CPU generator whatever the box's device,
+        so that a seed names the same states everywhere."""
+        unit = torch.rand(count, self.dimension, generator=generator, dtype=torch.float64)
+        x = self.lower + self.widths * unit.to(self.lower)
+        return torch.minimum(x, self.upper)  # rounding may pass the upper bound, never the lower one
+
+    def contains(self, x: State) -> Bool[Tensor, "*batch"]:
+        """Whether each state lies in the closed box."""
+        return ((self.lower <= x) & (x <= self.upper)).all(-1)
+
+
+class ControlSet(nn.Module, ABC):
+    """U ⊂ ℝᵐ, the controls that a problem admits: closed and convex.
+
+    A subclass writes its three methods with torch operations on tensors of any leading shape. What it is made of are
+    buffers: they follow the problem's precision and device, and tell its controls apart from those of other problems.
+    """
+
+    @property
+    def limited(self) -> bool:
+        """Whether some control of ℝᵐ is left out."""
+        return True
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor] | None:
+        """(lower, upper), each () or (m,), where U is a box: what oracles and starts need to know; else None."""
+        return None
+
+    @abstractmethod
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        """argmin over u ∈ U of uᵀRu + bᵀu, (*batch, m): the control law, with b = gᵀV_x.
+
+        Args:
+            R: (*batch, m, m), symmetric positive definite.
+            b: (*batch, m).
+        """
+
+    @abstractmethod
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        """Whether each control lies in U."""
+
+    @abstractmethod
+    def project(self, u: Control) -> Control:
+        """The point of U closest to each control."""
+
+
+class Unbounded(ControlSet):
+    """U = ℝᵐ."""
+
+    @property
+    def limited(self) -> bool:
+        return type(self) is not Unbounded  # a set derived from it may leave something out
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor] | None:
+        return None if self.limited else (torch.tensor(-math.inf), torch.tensor(math.inf))
+
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        return -0.5 * solve(R, b[..., None])[..., 0]
+
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        return torch.isfinite(u).all(-1)
+
+    def project(self, u: Control) -> Control:
+        return u
+
+
+class ControlBox(ControlSet):
+    """U = {u : lower ≤ u ≤ upper}, componentwise: limits of actuators.
+
+    The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with two, clipped
+    twice; with three or four, each way to hold some of them at a limit leaves a linear system for the others, and all
+    3ᵐ are solved as one batch; with more, by an active-set method, which is one operator where a reader of traces has
+    it. Of numbers, from which no gradient is asked, with three and more by rounds that a trace could not have, as it
+    may not look at them.
+
+    Args:
+        lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none on that side.
+
+    Raises:
+        ValueError: limits of different lengths, equal, reversed, or not numbers.
+
+    Source: Nocedal, Wright, Numerical Optimization, 2006, § 16.5 (primal active-set methods for convex programs).
+    """
+
+    lower: Float[Tensor, "*m"]
+    upper: Float[Tensor, "*m"]
+
+    def __init__(self, lower: float | Sequence[float] | Tensor, upper: float | Sequence[float] | Tensor):
+        super().__init__()
+        low, high = (torch.as_tensor(side, dtype=torch.get_default_dtype()) for side in (lower, upper))
+        if low.ndim > 1 or low.shape != high.shape:
+            raise ValueError(
+                f"Expected lower and upper as two numbers, or one for each control, got {low.tolist()} and "
+                f"{high.tolist()}; write ∓inf where there is no limit."
+            )
+        if not bool((low < high).all()):
+            remedy = "swap the two" if bool((low > high).any()) else "a control that cannot move belongs into f"
+            raise ValueError(f"Expected lower < upper, got {low.tolist()} and {high.tolist()}; {remedy}.")
+        self.register_buffer("lower", low, persistent=False)
+        self.register_buffer("upper", high, persistent=False)
+        self._limited = bool(low.isfinite().any() | high.isfinite().any())
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ControlBox":
+        """In another precision, limits are rounded inwards, so that no control exceeds those that were given."""
+        given = self.lower, self.upper
+        super()._apply(fn, recurse)
+        nearest, far = (self.lower, self.upper), self.lower.new_tensor(math.inf)
+        low, high = (
+            torch.where((side * (old - new.to(old)) > 0).to(new.device), new.nextafter(side * far), new)
+            for side, old, new in zip((1, -1), given, nearest, strict=True)
+        )
+        crossed = low > high  # limits that this precision does not tell apart
+        self.lower, self.upper = torch.where(crossed, nearest[0], low), torch.where(crossed, nearest[1], high)
+        return self
+
+    @property
+    def limited(self) -> bool:
+        return self._limited
+
+    @property
+    def limits(self) -> tuple[Tensor, Tensor]:
+        return self.lower, self.upper
+
+    def minimise(self, R: ControlMatrix, b: Control) -> Control:
+        m = b.shape[-1]
+        if self.lower.numel() not in (1, m):
+            raise ValueError(f"Expected limits of {m} controls, got {self.lower.numel()}; give one for each.")
+        if m == 1:
+            return self.project(-b / (2 * R[..., 0]))
+        # in double precision: costs of single precision do not tell the ways apart
+        given, low, high = b, self.lower.double().expand(m), self.upper.double().expand(m)
+        R, b = R.double(), b.double()
+        if m == 2:
+            return self._of_two(R, b, low, high).to(given)
+        few = m <= FEW and not are_operators()
+        way = self._of_numbers if _are_numbers(R, b) else self._of_few if few else self._of_many
+        u = way(R, b, low, high).clamp(low, high)
+        known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
+        return torch.where(known[..., None], u, torch.nan).to(given)  # what is no number stays none
+
+    def _of_numbers(self, R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """By rounds each of which holds those that the last one drives outwards; what is not settled so, if anything,
+        by the active-set method."""
+        m, shape = b.shape[-1], b.shape
+        R, b = R.expand(*shape, m).reshape(-1, m, m), b.reshape(-1, m)
+        u, settled = _by_rounds(R, b, low, high)
+        if not bool(settled.all()):
+            u[~settled] = self._of_many(R[~settled], b[~settled], low, high)
+        return u.reshape(shape)
+
+    @staticmethod
+    def _of_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """u₂ where the slope in it of min over u₁ vanishes, which is the middle one of three lines; then u₁."""
+        finite = (side.clamp(-HUGE, HUGE) for side in (low, high))
+        roots = [-(b[..., 1] + 2 * R[..., 0, 1] * side[0]) / (2 * R[..., 1, 1]) for side in finite]  # u₁ held
+        determinant = R[..., 0, 0] * R[..., 1, 1] - R[..., 0, 1] * R[..., 0, 1]
+        free = (R[..., 0, 1] * b[..., 0] - R[..., 0, 0] * b[..., 1]) / (2 * determinant)
+        middle = free.clamp(torch.minimum(*roots), torch.maximum(*roots))
+        second = middle.clamp(low[1], high[1])
+        first = (-(b[..., 0] + 2 * R[..., 0, 1] * second) / (2 * R[..., 0, 0])).clamp(low[0], high[0])
+        return torch.stack([first, second], -1)
+
+    @staticmethod
+    def _of_few(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """Of all ways to hold some of them at a limit, the one of least cost among those that end within the limits."""
+        m = b.shape[-1]
+        held = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=m))).to(b)  # at lower, free, at upper
+        sides = torch.where(held < 0, low, torch.where(held > 0, high, 0.0))
+        exists = sides.isfinite().all(-1)
+        u_held, free = sides.where(sides.isfinite(), 0), (held == 0).to(b)
+        each = (slice(None), *(None,) * (b.ndim - 1))  # the ways come first
+        u_held, free = u_held[each], free[each]
+        A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
+        rest = free * (-b / 2 - apply(R, u_held)) + u_held
+        u = torch.where(free == 0, u_held, solve(A, rest[..., None])[..., 0])
+        fits = exists[each] & ((u >= low) & (u <= high) | (free == 0)).all(-1)
+        cost = ((apply(R, u) + b) * u).sum(-1)
+        best = cost.where(fits & cost.isfinite(), torch.inf).argmin(0)
+        return u.gather(0, best[None, ..., None].expand(1, *b.shape))[0]
+
+    @staticmethod
+    def _of_many(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """The minimum over the controls that no limit holds at it, the others at theirs."""
+        shape = torch.broadcast_shapes(R.shape[:-1], b.shape)
+        side = active_set(b.detach().expand(shape), R.detach(), low, high)
+        held = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))  # finite, where side is not 0
+        return torch.where(side == 0, _minimum_beside(R, b, held, side), held)
+
+    def contains(self, u: Control) -> Bool[Tensor, "*batch"]:
+        return ((self.lower <= u) & (u <= self.upper)).all(-1)
+
+    def project(self, u: Control) -> Control:
+        return u.clamp(self.lower, self.upper)
+
+
+def _minimum_beside(R: Tensor, b: Control, held: Control, side: Control) -> Control:
+    """argmin of uᵀRu + bᵀu over the controls with side 0; the others are held, and come back as zero or less."""
+    free = (side == 0).to(b)
+    A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
+    return solve(A, (free * (-b / 2 - apply(R, held)))[..., None])[..., 0]
+
+
+def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Control, Tensor]:
+    """The minimum of each of a batch (k, m), and which are settled: those whose controls at limits are those of the
+    last round, where the slope vanishes for the others and points outwards for these.
+
+    All controls change sides at once; after SETTLING rounds, as few batches may go round in circles so, only the first
+    of those that would, which comes to an end.
+
+    Source: Bergounioux, Ito, Kunisch, "Primal-dual strategy for constrained optimal control problems", SIAM Journal on
+    Control and Optimization 1999; Murty, "Note on a Bard-type scheme for solving the complementarity problem", Opsearch
+    1974 (the least index).
+    """
+    m, each = b.shape[-1], torch.arange(b.shape[-1])
+    diagonal = 2 * R.diagonal(dim1=-2, dim2=-1)
+    u, before = (-b / diagonal).clamp(low, high), torch.full_like(b, 2.0)
+    rows, minimum = torch.arange(len(b)), u.clone()
+    for k in range(SETTLING * (1 + m)):
+        towards = u - (2 * (R @ u[..., None])[..., 0] + b) / diagonal
+        side = (towards >= high).to(b) - (towards <= low).to(b)
+        changes = side != before
+        going = changes.any(-1)
+        if not bool(going.all()):
+            minimum[rows[~going]] = u[~going]
+            parts = (rows, R, b, diagonal, side, before, changes)
+            rows, R, b, diagonal, side, before, changes = (part[going] for part in parts)
+            if not len(rows):
+                break
+        if k >= SETTLING:
+            first = changes.to(torch.uint8).argmax(-1, keepdim=True)
+            side = torch.where(each == first, torch.where(before == 0, side, 0.0), before)
+        free = (side == 0).to(b)
+        held = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))
+        A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
+        rest = free * (-b / 2 - (R @ held[..., None])[..., 0]) + held
+        u, before = torch.linalg.solve_ex(A, rest[..., None])[0][..., 0], side
+    settled = torch.ones(len(minimum), dtype=torch.bool)
+    settled[rows] = False
+    return minimum, settled
+
+
+@operator
+def active_set(b: Control, R: ControlMatrix, low: Tensor, high: Tensor) -> Control:
+    """Which controls are at a limit at the minimum: −1 at the lower, 1 at the upper, 0 at none.
+
+    From a control in the box, towards the minimum over those that no limit holds: up to the first limit on the way,
+    which holds from there; or all the way, and then of the held ones that is let go which gains most. The cost falls in
+    each round, and the minimum is reached where none gains. On random R and b of up to 8 controls, R of condition up to
+    1e6, that took 2.3m rounds at most; ROUNDS m are made.
+    """
+    m, scale = b.shape[-1], R.diagonal(dim1=-2, dim2=-1).sqrt()
+    each = torch.arange(m, device=b.device)
+    u = (-b / (2 * scale**2)).clamp(low, high)
+    side = (u >= high).to(b) - (u <= low).to(b)
+    for _ in range(ROUNDS * m):
+        step = torch.where(side == 0, _minimum_beside(R, b, torch.where(side == 0, 0.0, u), side) - u, 0.0)
+        room = torch.where(step > 0, high - u, low - u) / torch.where(step == 0, 1.0, step)
+        share, first = torch.where(step == 0, torch.inf, room).min(-1, keepdim=True)
+        arrived = share >= 1
+        side = torch.where((each == first) & ~arrived, step.sign(), side)
+        u = torch.where(side < 0, low, torch.where(side > 0, high, u + share.clamp_max(1) * step))
+        gain, which = (side * (2 * apply(R, u) + b) / scale).max(-1, keepdim=True)
+        side = torch.where((each == which) & arrived & (gain > 0), 0.0, side)
+    return side
+
+
+def _are_numbers(*tensors: Tensor) -> bool:
+    """Whether values may be looked at, and nothing asks for a gradient."""
+    return all(has_values(each) and not (torch.is_grad_enabled() and each.requires_grad) for each in tensors)
+
+
+FEW = 4  # controls of which all ways are tried: 3⁴ = 81 systems, less code to compile than that many rounds
+ROUNDS = 4
+SETTLING = 8  # rounds in which all controls may change sides at once; as many for each control follow
+HUGE = 1e150  # in the place of a limit that is none, where it is multiplied
+
+CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}  # limits are controls.lower and upper

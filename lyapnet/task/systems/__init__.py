@@ -1,0 +1,51 @@
+"""The registered systems; a new one is a subclass and one line here, or `module:Class` in a config."""
+
+from lyapnet.task.systems.acrobot import Acrobot
+from lyapnet.task.systems.base import ControlAffineSystem, MechanicalSystem
+from lyapnet.task.systems.cartpole import Cartpole
+from lyapnet.task.systems.linear import DoubleIntegrator, IntegratorChain, Linear, is_linear
+from lyapnet.task.systems.path_tracking import PathTracking
+from lyapnet.task.systems.pendulum import Pendulum
+from lyapnet.task.systems.planar_quadrotor import PlanarQuadrotor
+from lyapnet.task.systems.reacher import Reacher
+from lyapnet.task.systems.rigid_body import BodyFrameQuadrotor, Quadrotor, Satellite
+from lyapnet.task.systems.three_link_arm import ThreeLinkArm
+from lyapnet.task.systems.van_der_pol import VanDerPol
+
+SYSTEMS: dict[str, type[ControlAffineSystem]] = {
+    "double_integrator": DoubleIntegrator,
+    "integrator_chain": IntegratorChain,
+    "linear": Linear,
+    "cartpole": Cartpole,
+    "reacher": Reacher,
+    "pendulum": Pendulum,
+    "planar_quadrotor": PlanarQuadrotor,
+    "acrobot": Acrobot,
+    "three_link_arm": ThreeLinkArm,
+    "quadrotor": Quadrotor,
+    "body_frame_quadrotor": BodyFrameQuadrotor,
+    "satellite": Satellite,
+    "van_der_pol": VanDerPol,
+    "path_tracking": PathTracking,
+}
+
+__all__ = [
+    "SYSTEMS",
+    "Acrobot",
+    "BodyFrameQuadrotor",
+    "Cartpole",
+    "ControlAffineSystem",
+    "DoubleIntegrator",
+    "IntegratorChain",
+    "Linear",
+    "MechanicalSystem",
+    "PathTracking",
+    "Pendulum",
+    "PlanarQuadrotor",
+    "Quadrotor",
+    "Reacher",
+    "Satellite",
+    "ThreeLinkArm",
+    "VanDerPol",
+    "is_linear",
+]

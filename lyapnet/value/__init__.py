@@ -1,0 +1,1 @@
+"""V(t, x), its derivatives and expansions, and the control laws that it defines."""

@@ -1,0 +1,38 @@
+"""V of a family of problems at one value of its parameters."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lyapnet.base.types import PerState, State, Time
+from lyapnet.value.calculus import ValueFunction
+
+
+class AtParameters(ValueFunction):
+    """V(t, (x, p)) of a family as a function of (t, x), at one p.
+
+    Args:
+        V: of the family.
+        p: (k,).
+    """
+
+    p: Float[Tensor, " k"]
+
+    def __init__(self, V: ValueFunction, p: Tensor):
+        super().__init__()
+        self.V, self.made_for = V, V.made_for
+        self.register_buffer("p", p, persistent=False)
+
+    def _joined(self, x: Tensor) -> Tensor:
+        return torch.cat([x, self.p.expand(*x.shape[:-1], -1)], -1)
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.V(t, self._joined(x))
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        value, gradient = self.V.value_and_state_gradient(t, self._joined(x))
+        return value, gradient[..., : x.shape[-1]]
+
+    def curvature(self, t: Time) -> Tensor | None:
+        H, n = self.V.curvature(t), -len(self.p)
+        return None if H is None else H[..., :n, :n]

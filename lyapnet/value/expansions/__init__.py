@@ -1,0 +1,39 @@
+"""Optimal trajectories, and the value function to second order around them."""
+
+from lyapnet.value.expansions.dynamic_programming import (
+    FLOOR,
+    TRIES,
+    Optimum,
+    follow_expansions,
+    optimal_trajectories,
+    penalty_of_one_step,
+    regulator,
+    riccati,
+    sizes,
+    without_penalty,
+)
+from lyapnet.value.expansions.laws import Expansion, at_rest, greedy_law, held_control
+from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
+
+__all__ = [
+    "FLOOR",
+    "TRIES",
+    "Expansion",
+    "Optimum",
+    "Path",
+    "at_rest",
+    "cheapest",
+    "exchanged",
+    "follow_expansions",
+    "greedy_law",
+    "held_control",
+    "in_float64",
+    "optimal_trajectories",
+    "path_of",
+    "path_under",
+    "penalty_of_one_step",
+    "regulator",
+    "riccati",
+    "sizes",
+    "without_penalty",
+]

@@ -1,0 +1,207 @@
+"""A network on top of what is known of V before training: its expansion to second order around a trajectory."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.base.interpolation import Curve, SmoothCurve
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import PerState, State, Time
+from lyapnet.task.domain import Border
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks.base import Scaling
+from lyapnet.value.networks.fcn import FCN
+from lyapnet.value.networks.near_borders import NearBorders
+
+FEW = 4  # states for which a narrower network is enough
+SINGULAR = 1e-6  # of the greatest curvature, below which there is no valley to follow
+ROUGHLY = 1e-6  # of a state's magnitude, below which it does not spread
+ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
+NODES = 65  # of the piecewise linear curves in time; an expansion with more of them keeps those that matter
+
+
+def standard_widths(n: int) -> list[int]:
+    """The widths of the hidden layers for n states."""
+    return [64 if n <= FEW else 128] * 2
+
+
+class ExpansionNetwork(ValueFunction):
+    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s ρ(ξ) N(t, ξ), ξ = Cᵀδ, δ = x − x̄(t); N is zero until it is trained.
+
+    Where c = 0, around a goal that is an equilibrium, ρ = ‖ξ‖²/(1 + ‖ξ‖²), so that V and V_x stay zero there, and what
+    costs little has a V that is off by little; elsewhere ρ = 1. C are the coordinates in which the expansion curves
+    equally in every direction: H ≈ 2s CCᵀ. A correction that is small in V is then small in u = −½R⁻¹gᵀV_x too; in
+    units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, V = s N and
+    C = diag(1/scale), or, once optima are known, diag(1/spread) about a centre x̄.
+
+    Constant states p, the parameters of a family, are told apart from the others, y: ξ is (Cᵀ(δy + Sδp), δp / spread),
+    S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
+    ξ_y.
+
+    Where f, g, q or φ end at borders of some states, the logarithms of distances from these are further inputs of N.
+
+    Where the expansion is φ at T, N is multiplied by 1 − t/T: V(T, ·) = φ for any weights, and close to T, where hardly
+    anything is left to pay and to learn from, V is what the Riccati equation or the optimum says.
+
+    Args:
+        scaling: of the task, for what starts without an expansion.
+        hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
+        constants: indices of the states that stay what they are.
+        borders: of the domain, with the indices of their states.
+        smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear.
+    """
+
+    scale: Float[Tensor, ""]  # s, in units of cost
+    coordinates: Float[Tensor, "n n"]  # C
+    at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
+    moves: Float[Tensor, " n"]  # 0 for a constant state, 1 for any other
+    ends: Float[Tensor, ""]  # 1 where the expansion is φ at T, else 0
+
+    def __init__(
+        self,
+        scaling: Scaling,
+        hidden: Sequence[int] | None = None,
+        activation: str = "tanh",
+        constants: Sequence[int] = (),
+        smooth: bool = False,
+        borders: Sequence[tuple[int, Border]] = (),
+    ):
+        super().__init__()
+        self.constants = list(constants)
+        n = self.n = len(scaling.state)
+        hidden = standard_widths(n) if hidden is None else hidden
+        self.near_borders = NearBorders(borders) if borders else None
+        self.network = FCN(Scaling([1.0] * (n + len(borders)), scaling.duration, 1.0), hidden, activation)
+        nn.init.zeros_(self.network.output.weight)
+        nn.init.zeros_(self.network.output.bias)
+        self.register_buffer("scale", torch.tensor(scaling.value))
+        self.register_buffer("coordinates", torch.diag(1 / torch.tensor(scaling.state)))
+        self.register_buffer("at_goal", torch.tensor(0.0))
+        self.register_buffer(
+            "moves", torch.ones(n).index_fill(0, torch.tensor(self.constants, dtype=torch.long), 0.0), persistent=False
+        )
+        T, parts = scaling.duration, 1 + 2 * n + 2 * n * n
+        nodes = torch.linspace(0, T, NODES)
+        self.expansion = SmoothCurve(T, [parts]) if smooth else Curve(nodes, torch.zeros(NODES, parts))
+        self.duration = T
+        self.register_buffer("ends", torch.tensor(0.0))
+
+    def forward(self, t: Time, x: State) -> PerState:
+        c, p, H, delta = self._around(t, x)
+        xi = delta @ self.coordinates
+        rest = self._fading(t, 1 - self.at_goal * self._near(xi)) * self.network(t, self._inputs(x, xi))
+        return c + ((p + apply(H, delta) / 2) * delta).sum(-1) + self.scale * rest
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V and V_x = p + Hδ + s C (ρ N_ξ + N ρ_ξ)."""
+        c, p, H, delta = self._around(t, x)
+        xi = delta @ self.coordinates
+        N, slopes = self.network.value_and_state_gradient(t, self._inputs(x, xi))
+        near, curved = self._near(xi), apply(H, delta)
+        share = self._fading(t, 1 - self.at_goal * near)
+        value = c + ((p + curved / 2) * delta).sum(-1) + self.scale * share * N
+        slope = self._fading(t, 2 * self.at_goal * near**2)
+        rest_xi = share[..., None] * slopes[..., : self.n] + (slope * N)[..., None] * self._moving(xi)
+        rest_x = rest_xi @ self.coordinates.mT
+        if self.near_borders is not None:
+            rest_x = rest_x + self.near_borders.pull_back(x, share[..., None] * slopes[..., self.n :])
+        return value, p + curved + self.scale * rest_x
+
+    def _inputs(self, x: State, xi: State) -> Tensor:
+        """ξ, and the logarithms."""
+        return xi if self.near_borders is None else torch.cat([xi, self.near_borders(x)], -1)
+
+    def _fading(self, t: Time, rho: PerState) -> PerState:
+        """ρ, or its slope, of which nothing is left at T where the expansion is φ there."""
+        return rho * (1 - self.ends * t / self.duration)
+
+    def _near(self, xi: State) -> PerState:
+        """1 / (1 + ‖ξ_y‖²)."""
+        return 1 / (1 + (self._moving(xi) ** 2).sum(-1))
+
+    def _moving(self, xi: State) -> State:
+        """ξ_y, with zeros for the constant states."""
+        return self.moves * xi if self.constants else xi
+
+    def curvature(self, t: Time) -> Tensor:
+        return self.expansion(t)[..., -self.n * self.n :].unflatten(-1, (self.n, self.n))
+
+    def _around(self, t: Time, x: State) -> tuple[Tensor, Tensor, Tensor, State]:
+        """(c, p, H) at t, and δ."""
+        n = self.n
+        parts = self.expansion(t)
+        H = parts[..., 1 + 2 * n : 1 + 2 * n + n * n].unflatten(-1, (n, n))
+        return parts[..., 0], parts[..., 1 : 1 + n], H, x - parts[..., 1 + n : 1 + 2 * n]
+
+    def _take_curves(self, t: Tensor, parts: Tensor, exact_end: bool = False) -> None:
+        """Curves through the nodes; with H symmetric to the last bit, as V_x wants it, where they are fitted."""
+        self.expansion.take(t, parts)
+        self.ends.fill_(float(exact_end))
+        if isinstance(self.expansion, SmoothCurve):
+            for fitted in (self.expansion.end, self.expansion.weights):
+                H = fitted[..., 1 + 2 * self.n :].unflatten(-1, (2, self.n, self.n))
+                H.copy_((H + H.mT) / 2)
+
+    @torch.no_grad()
+    def take_nothing(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
+        """Start a new network from V = 0, with what is known of its size: N is in units of a spread around a centre.
+
+        V is not held at zero at a goal then.
+
+        Args:
+            t: the nodes (K,).
+            centre: x̄ (n,), the same at all times.
+            curvature: what stands for V_xx in control laws, (K, n, n), symmetric positive semidefinite.
+            spread: of each state, (n,).
+            value: s.
+        """
+        none = torch.zeros(len(t), 1 + self.n).to(centre)
+        parts = [none, centre.expand(len(t), -1), torch.zeros_like(curvature).flatten(1), curvature.flatten(1)]
+        self._take_curves(t, torch.cat(parts, 1))
+        self.at_goal.fill_(0)
+        self.scale.fill_(value)
+        magnitude = 1 / self.coordinates.diagonal()
+        self.coordinates.copy_(torch.diag(1 / spread.where(spread > ROUGHLY * magnitude, magnitude)))
+
+    @torch.no_grad()
+    def take(
+        self,
+        t: Tensor,
+        x: Tensor,
+        value: Tensor,
+        gradient: Tensor,
+        hessian: Tensor,
+        curvature: Tensor,
+        spread: Tensor,
+        exact_end: bool = False,
+    ) -> None:
+        """Start from an expansion at the nodes t (K,), whose parts are (K, …), for deviations δ of some spread.
+
+        Args:
+            exact_end: whether it is φ at the last node, at any x.
+            curvature: what stands for H in control laws, (K, n, n), symmetric positive semidefinite.
+            spread: deviations δ from x̄(0), (k, n): their mean ½ δᵀHδ is s, times the number of states.
+        """
+        parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
+        self._take_curves(t, torch.cat(parts, 1), exact_end)
+        y, p = [i for i in range(self.n) if i not in self.constants], self.constants
+        early = slice(max(1, 3 * len(curvature) // 4))
+        values, vectors = torch.linalg.eigh(curvature[early][:, y][..., y].mean(0) / 2)
+        values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
+        inverse = (vectors * values.reciprocal().where(values > SINGULAR * values.max(), 0)) @ vectors.mT
+        S = inverse @ hessian[early][:, y][..., p].mean(0) / 2
+        along = apply(vectors.mT, spread[:, y] + spread[:, p] @ S.mT)
+        s = (along**2 * values).sum(-1).mean() / len(y)
+        self.at_goal.fill_(float(value.abs().max() <= ROUNDING * s))
+        s = s.clamp_min(1e-6 * float(value.abs().max()))  # no spread: X₀ is a point
+        if s > 0:
+            self.scale.copy_(s)
+            C, reach = vectors * (values / s).sqrt(), spread[:, p].abs().amax(0)
+            self.coordinates.zero_()
+            for k, i in enumerate(y):
+                self.coordinates[i, y] = C[k]
+            for k, i in enumerate(p):
+                self.coordinates[i, y] = S[:, k] @ C
+                self.coordinates[i, i] = 1 / reach[k].where(reach[k] > 0, 1)

@@ -1,0 +1,51 @@
+"""V that does not depend on some of the states."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from lyapnet.base.types import PerState, State, Time
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.networks.with_penalty import learned_part
+
+
+class IgnoringStates(ValueFunction):
+    """V(t, x) = N(t, x_kept): the same whatever the other states are.
+
+    Where neither dynamics nor cost depends on them either, so does the cost-to-go, and nothing is lost.
+
+    Args:
+        network: N, of the kept states.
+        kept: their indices, in increasing order.
+        n: the number of states.
+    """
+
+    kept: Int[Tensor, " k"]
+
+    def __init__(self, network: ValueFunction, kept: Sequence[int], n: int):
+        super().__init__()
+        self.network, self.n = network, n
+        self.register_buffer("kept", torch.tensor(kept, dtype=torch.long), persistent=False)
+
+    def forward(self, t: Time, x: State) -> PerState:
+        return self.network(t, x[..., self.kept])
+
+    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
+        """V, and V_x with zeros for the states that are ignored."""
+        value, gradient = self.network.value_and_state_gradient(t, x[..., self.kept])
+        return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)
+
+    def curvature(self, t: Time) -> Tensor | None:
+        H = self.network.curvature(t)
+        if H is None:
+            return None
+        places = torch.eye(self.n, dtype=H.dtype, device=H.device)[self.kept]
+        return places.mT @ H @ places
+
+
+def kept_states(V: ValueFunction, n: int) -> list[int]:
+    """The indices of the states, of n, on which a V depends."""
+    V = learned_part(V)
+    return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(n))

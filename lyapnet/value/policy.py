@@ -1,0 +1,265 @@
+"""Control laws that a value function defines."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from lyapnet.base.errors import UsageError
+from lyapnet.base.interpolation import Curve
+from lyapnet.base.linear_algebra import apply, convex_or, multiply
+from lyapnet.base.types import Control, PerState, State, Time
+from lyapnet.task.cost import Cost
+from lyapnet.task.problem import Problem, Response
+from lyapnet.task.sets import ControlSet
+from lyapnet.task.systems import ControlAffineSystem
+from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradients, input_lie_derivative
+from lyapnet.value.derivatives import jacobian
+from lyapnet.value.expansions import held_control, riccati
+
+DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
+STEEP = 5  # as many steps where V is as steep as it is close to constraints
+
+
+class PolicyOutput(NamedTuple):
+    """A control, and the value function that it comes from, at the same (t, x)."""
+
+    u: Control
+    value: PerState
+    state_gradient: State  # V_x
+
+
+class ValuePolicy(nn.Module):
+    """u = policy(t, x), a control law that V defines."""
+
+    held: bool = False  # whether u is made to be held for Δt from t on
+    origin: str = ""  # where V and u come from, in words, if they were made elsewhere
+    precision: str | None = None  # of the arithmetic in which u is computed, if its rounding counts; else real numbers
+    system: ControlAffineSystem
+    cost: Cost
+    controls: ControlSet
+    V: ValueFunction
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        super().__init__()
+        self.system, self.cost, self.controls, self.V = problem.system, problem.cost, problem.controls, V
+
+    def with_value(self, t: Time, x: State) -> PolicyOutput:
+        """u, V and V_x; a law that needs V_x anyway shares it."""
+        return PolicyOutput(self(t, x), *self.V.value_and_state_gradient(t, x))
+
+
+class HJBPolicy(ValuePolicy):
+    """u*(t, x) = argmin over u ∈ U of ℓ(x, u) + V_xᵀ(f + gu); with U = ℝᵐ it is −½ R(x)⁻¹ g(x)ᵀ V_x(t, x)."""
+
+    def forward(self, t: Time, x: State) -> Control:
+        return self._minimise(x, self.V.value_and_state_gradient(t, x)[1])
+
+    def with_value(self, t: Time, x: State) -> PolicyOutput:
+        if type(self).forward is not HJBPolicy.forward:  # a law derived from this one
+            return super().with_value(t, x)
+        value, V_x = self.V.value_and_state_gradient(t, x)
+        return PolicyOutput(self._minimise(x, V_x), value, V_x)
+
+    def _minimise(self, x: State, V_x: State) -> Control:
+        b = input_lie_derivative(self.system, x, V_x)
+        if self.controls.limited:
+            R = self.cost.R(x)
+            return self.controls.minimise(R, self.cost.about_rest(R, b))
+        u = -0.5 * self.cost.solve_R(x, b)  # with the one inverse of a constant R
+        return u if self.cost.rest is None else u + self.cost.rest
+
+
+class SontagPolicy(ValuePolicy):
+    """Sontag's universal formula, weighted by the cost: with a = V_t + LfV, b = LgV and σ = bᵀR⁻¹b,
+
+        u = −(a + √(a² + qσ))/σ · R⁻¹b,   and 0 where b = 0,
+
+    so that V̇ = −√(a² + qσ) wherever b ≠ 0: V decreases for every control-Lyapunov function V, however far from
+    the value function. With the true value function it is the HJB policy. Close to the goal a and σ are small
+    differences of rounded numbers: in float32, u chatters within about ‖x‖ = 1e-4.
+
+    It is made for U = ℝᵐ. About a target u is counted from u*, and f is f + gu*.
+
+    Raises:
+        ValueError: the problem limits its controls.
+
+    Sources: Sontag, "A 'universal' construction of Artstein's theorem on nonlinear stabilization", Systems & Control
+    Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
+    function and receding horizon perspective", Asian Journal of Control 1999 (this form).
+    """
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        if problem.controls.limited:
+            raise ValueError(
+                f"Expected controls without limits for Sontag's formula, got {type(problem.controls).__name__}; take "
+                "rollout.policy=hjb or sampled."
+            )
+        super().__init__(problem, V)
+
+    def forward(self, t: Time, x: State) -> Control:
+        V_t, V_x = gradients(self.V, t, x)
+        LgV = input_lie_derivative(self.system, x, V_x)
+        direction = self.cost.solve_R(x, LgV)
+        a = V_t + drift_lie_derivative(self.system, x, V_x)
+        if self.cost.rest is not None:
+            a = a + (LgV * self.cost.rest).sum(-1)
+        q = self.cost.state(x)
+        sigma = (LgV * direction).sum(-1)
+        # √ has no derivative at 0, which the goal reaches: keep its argument positive
+        root = torch.sqrt(a**2 + q * sigma + torch.finfo(x.dtype).tiny)
+        # Where a < 0 the quotient is q/(root − a), which stays finite as σ → 0; each branch guards the other's zero.
+        falling = a < 0
+        gain_falling = q / torch.where(falling, root - a, 1.0)
+        gain_rising = (a + root) / torch.where(falling | (sigma <= 0), 1.0, sigma)
+        gain = torch.where(falling, gain_falling, torch.where(sigma > 0, gain_rising, 0.0))
+        u = -gain[..., None] * direction
+        return u if self.cost.rest is None else u + self.cost.rest
+
+
+class SampledPolicy(ValuePolicy):
+    """The law of a controller that holds u for Δt: the minimiser of ∫ℓ + V(t + Δt, F(x, u)) over u ∈ U,
+
+        u = argmin over u ∈ U of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x(t + Δt, F(x, 0)) + ℓ_u)ᵀu,
+
+    for V of curvature H along B = F_u/Δt. F and ∫ℓ are one step of the horizon's method: with Euler F = x + Δt(f + gu),
+    B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is the optimal
+    law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
+    exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the
+    goal, zero where there is no goal. About a target, u is counted from u*, and f is f + gu*.
+    """
+
+    held: bool = True
+
+    def __init__(self, problem: Problem, V: ValueFunction):
+        super().__init__(problem, V)
+        self.problem = problem
+        self.riccati: Curve | None = None
+        if V.curvature(torch.zeros(()).to(problem.goal)) is None:
+            times, n = problem.horizon.times(problem.goal), problem.system.n
+            H = riccati(problem).hessian if problem.has_goal else torch.zeros(len(times), n, n)
+            self.riccati = Curve(times, H.to(problem.goal))
+
+    def forward(self, t: Time, x: State) -> Control:
+        after, free = self._after(t), self.problem.response(x)
+        V_x = self.V.value_and_state_gradient(after, free.x)[1]
+        return held_control(self.problem, free, V_x, self._curvature(after))
+
+    def _after(self, t: Time) -> Time:
+        """t + Δt, within the horizon."""
+        return (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
+
+    def _curvature(self, t: Time) -> Tensor:
+        """H, (*batch, n, n)."""
+        H = self.V.curvature(t) if self.riccati is None else self.riccati(t)
+        assert H is not None
+        return H
+
+
+class LookaheadPolicy(SampledPolicy):
+    """The same minimiser, of V itself and not of a model of its curvature that is one for all states:
+
+        u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
+
+    From the sampled law on, DESCENTS Newton steps, STEEP where there are constraints, with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx
+    B, or H for V_xx where that is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is
+    steep within one step, as close to state constraints, where the sampled law overshoots. Its derivative is that of
+    the minimiser (implicit function theorem), up to what the steps leave of Q_u, and V_xᵀF_uu, which is zero with
+    Euler. Where Q_uu/Δt does not exceed CONVEX · ℓ_uu, both are those of the model H, and u may be short of the
+    minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
+
+    Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
+    Wright, Numerical Optimization, 2006, ch. 3 (the steps).
+    """
+
+    def forward(self, t: Time, x: State) -> Control:
+        step = _HeldStep(self.problem, self.V, self._after(t), x)
+        H = self._curvature(step.after)
+        with torch.no_grad():
+            u = super().forward(t, x)
+            for _ in range(DESCENTS if self.problem.constraints is None else STEEP):
+                u = step.descended(u, H)
+        if not torch.is_grad_enabled():
+            return u
+        moved = step.newton(u, H)
+        return u + (moved - moved.detach())
+
+
+class _HeldStep:
+    """One step from x with u held: Q(u) = ∫ℓ + V(t + Δt, F(x, u)), and ways down it."""
+
+    def __init__(self, problem: Problem, V: ValueFunction, after: Time, x: State):
+        self.problem, self.V, self.after, self.x = problem, V, after, x
+
+    def descended(self, u: Control, H: Tensor) -> Control:
+        """The best of u and some shares of the Newton step from it."""
+        direction = self.newton(u, H) - u
+        tried = torch.stack([u, *(self.problem.controls.project(u + share * direction) for share in SHARES)])
+        paid = self._paid(tried)
+        best, least = u, paid[0]
+        for control, cost in zip(tried[1:], paid[1:], strict=True):
+            better = cost < least
+            best, least = torch.where(better[..., None], control, best), torch.where(better, cost, least)
+        return best
+
+    def newton(self, u: Control, H: Tensor) -> Control:
+        """The minimiser over U of Q to second order around u, with its curvature as a number."""
+        answer = self.problem.response(self.x, u)
+        with torch.enable_grad():
+            z = answer.x if answer.x.requires_grad else answer.x.detach().requires_grad_()
+            V_x = self.V.value_and_state_gradient(self.after, z)[1]
+            curvature = self._curvature(answer, z, V_x, H)
+        slope = apply(answer.by_control.mT, V_x) + answer.slope
+        return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
+
+    def _paid(self, u: Control) -> PerState:
+        """Q of controls (k, *batch, m)."""
+        following, paid = self.problem.step(self.x.expand(*u.shape[:-1], -1), u)
+        return paid + self.V(self.after, following)
+
+    def _curvature(self, answer: Response, z: State, V_x: State, H: Tensor) -> Tensor:
+        """Q_uu/Δt where that is convex, else with H for V_xx; without a graph, from V_x at z with its graph."""
+        B, paid, dt = answer.by_control.detach(), answer.curvature.detach(), self.problem.horizon.dt
+        own = dt * multiply(jacobian(apply(B.mT, V_x), z).detach(), B)
+        own = paid + (own + own.mT) / 2
+        model = paid + dt * multiply(B.mT, multiply(H.detach(), B))
+        return convex_or(own, paid, model)
+
+
+def known_law(problem: Problem, V: ValueFunction) -> type[ValuePolicy] | None:
+    """The control law that V is made for, if that is known.
+
+    It is the one that V names. A V with a model of its curvature has it for laws that hold u: it is made for the law of
+    the standard recipe, with constraints the one that looks ahead.
+    """
+    if V.made_for is not None:
+        if not issubclass(V.made_for, ValuePolicy):
+            name = getattr(V.made_for, "__name__", V.made_for)
+            raise UsageError(f"Expected made_for of {type(V).__name__} as a ValuePolicy, got {name}; name a law of V.")
+        return V.made_for
+    if V.curvature(torch.zeros(()).to(problem.goal)) is None:
+        return None
+    return SampledPolicy if problem.constraints is None else LookaheadPolicy
+
+
+def gain_over_step(problem: Problem, V: ValueFunction) -> float:
+    """Δt λ_max(R⁻¹gᵀV_xx g)/2, the greatest of some states and times: by what share V's HJB and sampled law differ.
+
+    In −½R⁻¹gᵀV_x, R stands where the held law has R + ½Δt gᵀV_xx g.
+    """
+    X0, times = problem.initial_states, problem.horizon.times(problem.goal)
+    x = torch.stack([X0.center, (X0.center + X0.upper) / 2, problem.goal])
+    greatest = 0.0
+    for t in (times[0], times[len(times) // 2], times[-2]):
+        with torch.enable_grad():
+            z = x.detach().requires_grad_()
+            g = problem.system.g(x)
+            bent = jacobian(apply(g.mT, V.value_and_state_gradient(t, z)[1].to(g)), z).detach()
+        weighted = torch.linalg.solve(problem.cost.R(x).to(bent), multiply(bent, g.to(bent))).nan_to_num()
+        greatest = max(greatest, problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max()))
+    return greatest
+
+
+POLICIES: dict[str, type[ValuePolicy]] = {
+    "hjb": HJBPolicy, "sontag": SontagPolicy, "sampled": SampledPolicy, "lookahead": LookaheadPolicy,
+}  # fmt: skip

@@ -30,3 +30,14 @@ def test_equations_are_numbered_in_their_order():
     assert tags == [str(k + 1) for k in range(len(tags))]
     prose = re.sub(r"\\tag\{\w+\}", "", PAGES[THEORY])
     assert {*re.findall(r"(?<![\w^}])\((\d+)\)", prose)} <= {*tags}
+
+
+def escapes(page: str) -> list[str]:
+    """Formulas in sentences with a backslash that Markdown may take for its own, as some Git hosts do."""
+    prose = re.sub(r"^```.*?^```$", "", page, flags=re.DOTALL | re.MULTILINE)
+    return [formula for formula in INLINE.findall(prose) if re.search(r"\\[^A-Za-z]", formula)]
+
+
+def test_formulas_in_sentences_have_no_escapes():
+    assert escapes(PAGES[THEORY]) == []
+    assert escapes(r"the set $\{x\}$") == [r"\{x\}"]

@@ -255,7 +255,7 @@ def test_from_the_goal_alone_there_is_a_start():
 @pytest.mark.gate
 def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     """Of a pendulum between tight limits it lies far below what V is on a wide X₀, and a fit sees both."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 24)
     shorten_fits(monkeypatch, 150, 50)
     tight = ["controls={lower: -12, upper: 12}", "initial_states={lower: [-3, -3], upper: [3, 3]}", "cost.R=0.05"]
     (learner,) = build_module(config_from_plain(PENDULUM, tight)).members
@@ -272,7 +272,7 @@ def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
 @pytest.fixture
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)
 
 

@@ -172,7 +172,7 @@ def typical_cost(cost: PerState) -> float:
 
 
 def _draw_deviations(x: StatePath, generator: torch.Generator) -> Tensor:
-    """Random deviations (N, b, n) at all nodes but the last: up to half the difference to a neighbour's earlier state."""
+    """Random deviations (N, b, n) at all nodes but the last, each up to half an earlier difference to a neighbour."""
     nodes, b = len(x) - 1, x.shape[1]
     if b == 1:
         return torch.zeros_like(x[:-1])

@@ -67,8 +67,7 @@ class RisingCost(Callback):
                 module: Any = pl_module
                 raise DivergenceError(
                     f"{module.place(member.label)}: Expected a cost on the cheapest {COMPARED_SHARE:.0%} of the "
-                    "validation states "
-                    f"of at most {least + (DIVERGENCE_COST_RATIO - 1) * size:.4g}, as {least:.4g} "
+                    f"validation states of at most {least + (DIVERGENCE_COST_RATIO - 1) * size:.4g}, as {least:.4g} "
                     f"was reached before, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
                 )
 

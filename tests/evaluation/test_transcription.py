@@ -171,11 +171,11 @@ def test_further_starts_end_where_they_take_much_longer_than_the_first_minimum(m
     short = transcription_of("cartpole_swingup", iterations=count - 1)[0].minimise(x0, still)
     assert short == "IPOPT: Maximum_Iterations_Exceeded"
     unknown = transcription_of("cartpole_swingup")[0]
-    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    monkeypatch.setattr(transcription, "BRIEF_ITERATIONS", (2, 150))
     assert unknown.minimise(x0, still, briefly=True).cost == first.cost, "nothing is known of how long one takes"
     monkeypatch.undo()
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost
-    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    monkeypatch.setattr(transcription, "BRIEF_ITERATIONS", (2, 150))
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost, "as long as the first one took, and longer"
     monkeypatch.setattr(transcription, "LONGER", 0)
     assert oracle.minimise(x0, still, briefly=True) == "IPOPT: Maximum_Iterations_Exceeded"

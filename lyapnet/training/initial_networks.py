@@ -46,13 +46,17 @@ def start_from(learner: Learner, expansion: Expansion, x0: State, level: float =
     expansion, x0 = _remove_known_penalty(learner, expansion).restricted_to(kept), x0[..., kept].double().cpu()
     if isinstance(network, StationaryNetwork):
         mean = float(expansion.initially(x0).mean()) or 1.0  # zero if X₀ is the goal alone
-        network.take(*(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean)
+        network.start_from_regulator(
+            *(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean
+        )
         return
     curvature = _positive_curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
-    network.take(*(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost))
+    network.start_from_expansion(
+        *(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost)
+    )
     if network.near_borders is not None:
-        network.near_borders.take(torch.cat([expansion.x, x0]))
+        network.near_borders.fit(torch.cat([expansion.x, x0]))
 
 
 def start_from_zero(learner: Learner, optimum: Optimum) -> None:
@@ -73,7 +77,7 @@ def start_from_zero(learner: Learner, optimum: Optimum) -> None:
     t = problem.horizon.times(expansion.x)
     network.start_from_zero(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
     if network.near_borders is not None:
-        network.near_borders.take(expansion.x.flatten(0, 1))
+        network.near_borders.fit(expansion.x.flatten(0, 1))
 
 
 def _remove_known_penalty(learner: Learner, expansion: Expansion) -> Expansion:

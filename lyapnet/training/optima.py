@@ -187,15 +187,15 @@ def _concatenate(one: Optimum, other: Optimum) -> Optimum:
         torch.cat([one.path.cost, other.path.cost]),
     )
     parts = zip(one.expansion, other.expansion, strict=True)
-    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)), torch.cat([one.mended, other.mended]))
+    return Optimum(path, Expansion(*(torch.cat(both, 1) for both in parts)), torch.cat([one.replaced, other.replaced]))
 
 
 def _replace_rows(optimum: Optimum, rows: Tensor, others: Optimum) -> Optimum:
     """Replace some rows of a batch of optima."""
     parts = zip(optimum.expansion, others.expansion, strict=True)
     expansion = Expansion(*(part.index_copy(1, rows, new) for part, new in parts))
-    mended = optimum.mended.index_copy(0, rows, others.mended)
-    return Optimum(exchanged(optimum.path, rows, others.path), expansion, mended)
+    replaced = optimum.replaced.index_copy(0, rows, others.replaced)
+    return Optimum(exchanged(optimum.path, rows, others.path), expansion, replaced)
 
 
 def count_optima(problem: Problem) -> int:

@@ -68,7 +68,8 @@ class RisingCost(Callback):
                 raise DivergenceError(
                     f"{module.place(member.label)}: Expected a cost on the cheapest {COMPARED_SHARE:.0%} of the "
                     f"validation states of at most {least + (DIVERGENCE_COST_RATIO - 1) * size:.4g}, as {least:.4g} "
-                    f"was reached before, got {cost:.4g}; lower training.learning_rate or set trainer.gradient_clip_val."
+                    f"was reached before, got {cost:.4g}; lower training.learning_rate or set "
+                    "trainer.gradient_clip_val."
                 )
 
 

@@ -332,7 +332,7 @@ def expansions_of(
 
 def _describe_replaced_derivatives(optimum: Optimum) -> str:
     """Describe at how many nodes a derivative does not exist; empty if all exist."""
-    count, nodes = int(optimum.mended.sum()), optimum.path.x.shape[0] * len(optimum.mended)
+    count, nodes = int(optimum.replaced.sum()), optimum.path.x.shape[0] * len(optimum.replaced)
     return f"derivatives that do not exist at {count} of {nodes} nodes are those beside them" if count else ""
 
 

@@ -184,7 +184,7 @@ def network():
     """A network with random weights about a goal that is not the origin."""
     torch.manual_seed(1)
     V = StationaryNetwork(SCALING, [8, 6], embedded_angles=[0]).double()
-    V.take(torch.tensor([0.3, -0.2]).double(), torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double(), 0.4)
+    V.start_from_regulator(torch.tensor([0.3, -0.2]).double(), torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double(), 0.4)
     torch.nn.init.normal_(V.network.output.weight, std=0.5)
     return V.requires_grad_(False)
 

@@ -22,7 +22,7 @@ from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import names_of
-from lyapnet.task.domain import ROUNDED, SLACK
+from lyapnet.task.domain import BORDER_ROUNDING, SLACK
 from lyapnet.task.problem import Problem
 from lyapnet.value.after_horizon import LOOPS
 
@@ -191,7 +191,7 @@ def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, 
     """J_N of closed loops, infinite if they are far outside the domain, and whether they leave it; None without one."""
     if problem.domain is None:
         return trajectory.cost, None
-    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, ROUNDED))
+    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
     return trajectory.cost.masked_fill(far, torch.inf), left
 
 

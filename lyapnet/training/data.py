@@ -60,7 +60,7 @@ class InitialStateDataModule(L.LightningDataModule):
         return torch.cat([x0[len(lost) :], lost.to(x0)])
 
     def further(self, count: int, step: int) -> State:
-        """State of X₀ that are in no batch, drawn anew at each step; shape (count, n), or (E, count, n)."""
+        """States of X₀ that are in no batch, drawn anew at each step; shape (count, n), or (E, count, n)."""
         return self.problem.initial_states.sample(count, stream(self.seed, LOST, step))
 
     def train_dataloader(self) -> DataLoader[Tensor]:

@@ -214,8 +214,9 @@ class Film:
         grid = self._grid[1].subgridspec(rows + 1, 1)
         panels: list[Axes] = [*grid.subplots(sharex=True, squeeze=False)[:, 0]]
         growing = []
+        above: Any = {"loc": "left", "fontsize": 7, "pad": 2}  # beside a low panel a long label would not fit
         for k, panel in enumerate(panels[:-1]):
-            panel.set_ylabel(system.control_labels[k].replace(" (", "\n("), fontsize=8)
+            panel.set_title(system.control_labels[k], **above)
             for limit in limits or ():
                 if math.isfinite(height := float(limit.expand(system.m)[k])):
                     panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
@@ -223,7 +224,7 @@ class Film:
         last = panels[-1]
         growing += self._lines(last, self.to_go, ORANGE, "cost to go")
         growing += self._lines(last, self.value, BLUE, "V(t, x)", "--", others=False)
-        last.set_ylabel("cost", fontsize=8)
+        last.set_title("cost", **above)
         last.set_xlabel("time (s)", fontsize=8)
         last.set_xlim(0, self.t[-1])
         last.legend(fontsize=7, frameon=False, loc="upper right")

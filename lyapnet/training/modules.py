@@ -6,9 +6,9 @@ The losses are in programs/; progress, logs and checkpoints are in callbacks.
 import math
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning as L
 import torch
@@ -30,6 +30,8 @@ from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import HJBPolicy, known_law
 
+T = TypeVar("T")
+
 
 class TrainingModule(L.LightningModule):
     """Minimises the sum of its members' losses; each member has its own weights and initial states."""
@@ -42,12 +44,8 @@ class TrainingModule(L.LightningModule):
         self.metadata: dict[str, Any] = {}  # plain data for checkpoints, such as the config
 
     @abstractmethod
-    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
-        """The members' closed loops from their initial states, one after the other.
-
-        Raises:
-            DivergenceError: on reaching a closed loop that is not finite.
-        """
+    def states_of_each(self, x0: Tensor) -> Iterable[Tensor]:
+        """The initial states (b, n) of each member."""
 
     @abstractmethod
     def save_member(self, member: Learner, path: Path) -> None:
@@ -65,10 +63,14 @@ class TrainingModule(L.LightningModule):
                 loop.compile_like(first)
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
-        """The sum of the members' losses on their initial states."""
+        """The sum of the losses on their initial states of all members that still train."""
         draw = (POINTS, self.global_rank, self.global_step)
-        losses = self._for_each(x0, lambda member, trajectory: member.train_on(trajectory, draw))
-        return {"loss": torch.stack(losses).sum()}
+
+        def train(member: Learner, states: Tensor) -> Tensor | None:
+            ended = self._has_ended(member, self.global_step)
+            return None if ended else member.train_on(member.rollout(states), draw)
+
+        return {"loss": torch.stack([loss for loss in self._for_each(x0, train) if loss is not None]).sum()}
 
     def validation_step(self, x0: Tensor, batch_idx: int) -> None:
         """Fill the tables of the validation states and log the losses that choose the best checkpoints."""
@@ -76,20 +78,37 @@ class TrainingModule(L.LightningModule):
             self.log(labelled("loss/val", member.label), loss, logger=False, sync_dist=True)
 
     def validate_on(self, x0: Tensor) -> list[Tensor]:
-        """Fill each member's table `validation` and return the validation losses."""
-        return self.without_gradient(x0, Learner.measure_on)
+        """Fill each member's table `validation` and return the validation losses.
+
+        The validation states are always the same: once its training has ended, a member is measured no more.
+        """
+
+        def validate(member: Learner, states: Tensor) -> Tensor:
+            if self._has_ended(member, member.measured_at):
+                return states.new_tensor(member.validation_loss)
+            member.measured_at = self.global_step
+            return member.measure_on(member.rollout(states))
+
+        with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
+            return self._for_each(x0.clone(), validate)
+
+    def _has_ended(self, member: Learner, step: int) -> bool:
+        """Whether a member's training has ended before a step; no for processes that train together, which wait for a
+        gradient of each member.
+        """
+        return member.cooling is not None and step > member.cooling[1] and self.trainer.world_size == 1
 
     def without_gradient(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
         """Evaluate each member's trajectories without recording a gradient."""
         with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
-            return self._for_each(x0.clone(), evaluate)
+            return self._for_each(x0.clone(), lambda member, states: evaluate(member, member.rollout(states)))
 
-    def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
-        """Evaluate each member's trajectories; adds iteration and member to the message of a divergence."""
-        trajectories, results = self.trajectories(x0), []
-        for member in self.members:
+    def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Tensor], T]) -> list[T]:
+        """Evaluate each member on its initial states; adds iteration and member to the message of a divergence."""
+        results = []
+        for member, states in zip(self.members, self.states_of_each(x0), strict=True):
             try:
-                results.append(evaluate(member, next(trajectories)))
+                results.append(evaluate(member, states))
             except DivergenceError as error:
                 raise DivergenceError(f"{self.place(member.label)}: {error}") from error
         return results
@@ -114,6 +133,8 @@ class TrainingModule(L.LightningModule):
         """Record the norm of each member's gradient; raise DivergenceError if it is not finite."""
         for member in self.members:
             norms = [p.grad.norm() for p in member.V.parameters() if p.grad is not None]
+            if not norms:  # its training has ended
+                continue
             member.gradient_norm = float(torch.stack(norms).norm())
             if not math.isfinite(member.gradient_norm):
                 raise DivergenceError(
@@ -279,8 +300,8 @@ class ValueModule(TrainingModule):
         """The loss."""
         return self.members[0].program
 
-    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
-        yield self.rollout(x0)
+    def states_of_each(self, x0: Tensor) -> Iterable[Tensor]:
+        return (x0,)
 
     def save_member(self, member: Learner, path: Path) -> None:
         self.trainer.save_checkpoint(path)
@@ -300,9 +321,8 @@ class EnsembleModule(TrainingModule):
     def __init__(self, members: Sequence[Learner], optimizer: OptimizerOptions | None = None):
         super().__init__(members, optimizer or OptimizerOptions())
 
-    def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
-        for member, own in zip(self.members, x0, strict=True):
-            yield member.rollout(own)
+    def states_of_each(self, x0: Tensor) -> Iterable[Tensor]:
+        return x0.unbind()
 
     def save_member(self, member: Learner, path: Path) -> None:
         weights = {f"V.{name}": tensor for name, tensor in member.V.state_dict().items()}

@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.runs import Run
 from lyapnet.training.settling import COOLING, WINDOW, Settling, end_of
@@ -144,6 +145,27 @@ def test_a_settled_run_is_finished_until_all_steps_are_asked_for(run, tmp_path):
 def settles_at(step):
     """Have the first seed settle at its first chance, and others at a step."""
     Settling._has_stopped = lambda self, label, now: label in ("", "seed_0") or now >= step
+
+
+def count_rollouts(path):
+    """Write each training batch of a member to a file: its label and the step."""
+    train_on = Learner.train_on
+
+    def counted(self, trajectory, draw):
+        with path.open("a", encoding="utf-8") as file:
+            file.write(f"{self.label} {draw[-1]}\n")
+        return train_on(self, trajectory, draw)
+
+    Learner.train_on = counted
+
+
+def test_a_seed_that_has_settled_costs_no_more_rollouts(tmp_path):
+    two, counts = desk(tmp_path, seeds=2), tmp_path / "counts"
+    first = partial(both, partial(both, without_figures, partial(settles_at, 40)), partial(count_rollouts, counts))
+    assert two.train(prepare=first)[0] == 0
+    steps = [line.split() for line in counts.read_text(encoding="utf-8").splitlines()]
+    last = {label: max(int(step) for name, step in steps if name == label) for label in ("seed_0", "seed_1")}
+    assert last == {"seed_0": EVERY + COOLING, "seed_1": 40 + COOLING - 1}
 
 
 def test_a_seed_that_has_settled_waits_for_the_others(tmp_path):

@@ -14,7 +14,6 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import digest_of_file, write_atomically
 from lyapnet.base.provenance import versions
 from lyapnet.claims.certificates import Certificate
-from lyapnet.claims.tables import certificate_rows
 from lyapnet.controller.controller import Controller, parameters_of
 from lyapnet.experiment.config import Config
 from lyapnet.task.constraints import names_of
@@ -94,7 +93,7 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
             "verdict": certificate.of_the_verdict(),
         },
         "certificate": result,
-        "numbers": certificate_rows(result, certificate.labels),
+        "numbers": certificate.rows,
         "options": dict(certificate.options),
         "checkpoint": {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
         "experiment": config.experiment,

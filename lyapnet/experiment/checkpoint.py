@@ -7,6 +7,7 @@ import functools
 import hashlib
 import io
 import logging
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

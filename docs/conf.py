@@ -19,11 +19,13 @@ extensions = [
     "repository_links",
     "plain_docstrings",
     "printed_outputs",
+    "native_math",
 ]
 exclude_patterns = ["_extensions", "compare/details.md", "compare/table1.md"]  # the report's tables are downloads
 
 myst_heading_anchors = 3  # the anchors of Git hosts, which the pages link to
-myst_enable_extensions = ["fieldlist"]
+myst_enable_extensions = ["fieldlist", "dollarmath"]
+myst_fence_as_directive = ["math"]  # as on Git hosts
 nb_execution_mode = "off"  # the pages say what was printed; -D nb_execution_mode=force trains
 nb_execution_in_temp = True
 nb_execution_timeout = 600
@@ -40,6 +42,18 @@ python_maximum_signature_line_length = 100
 html_theme = "furo"
 html_title = f"lyapnet {version}"
 html_static_path = ["_static"]
-html_css_files = ["tables.css"]
+templates_path = ["_templates"]
+html_sidebars = {
+    "**": [
+        "sidebar/brand.html",
+        "sidebar/search.html",
+        "sidebar/scroll-start.html",
+        "sidebar/navigation.html",
+        "sidebar/versions.html",  # with sphinx-build -A versions="main v0.3.0", as .github/workflows/site.yml has it
+        "sidebar/scroll-end.html",
+    ]
+}
+html_css_files = ["tables.css", "formulas.css"]
+html_math_renderer = "mathml"
 html_show_sphinx = False
 html_show_copyright = False

@@ -119,7 +119,7 @@ def _each_test_explores_by_itself(monkeypatch):
     """What the oracle remembers of other batches in this process."""
     module = sys.modules.get("lyapnet.evaluation.oracles.transcription")
     if module is not None:
-        monkeypatch.setattr(module, "_WITH_ONE_MINIMUM", set())
+        monkeypatch.setattr(module, "_SINGLE_MINIMUM_TASKS", set())
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ def shorten_fits(patch: pytest.MonkeyPatch, first: int, later: int) -> None:
 def few_optima(count, first, later):
     """Starts that are sought with some optima and short fits; brief ones of 10 steps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.start.OPTIMA", count)
+        patch.setattr("lyapnet.training.start.MAX_OPTIMA", count)
         shorten_fits(patch, first, later)
-        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+        patch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
         yield

@@ -87,5 +87,7 @@ def with_expansion(V: ValueFunction) -> ValueFunction:
         wave = 1 + 0.3 * torch.sin(3 * t)[:, None]
         root = torch.randn(V.n, V.n)
         H = wave[..., None] * (root @ root.mT)
-        V.take(t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(20, V.n))
+        V.start_from_expansion(
+            t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(20, V.n)
+        )
     return V

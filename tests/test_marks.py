@@ -6,15 +6,15 @@ from tests.marks import at_the_gate, sample
 from tests.pages import ROOT
 
 GROUPS = {  # name ↦ files of its tests, or beginnings of their names in a file
-    "false claims": ["certification/test_false_claims.py"],
-    "false attempts": ["certification/test_false_attempts.py"],
-    "negative controls": ["certification/test_negative_controls.py"],
-    "rules of operators": ["graphs/test_rules.py"],
-    "all operators": ["graphs/test_operators.py", "importing/test_operators.py"],
+    "false claims": ["claims/test_false_claims.py"],
+    "false attempts": ["claims/test_false_attempts.py"],
+    "negative controls": ["claims/test_negative_controls.py"],
+    "rules of operators": ["prover/test_rules.py"],
+    "all operators": ["prover/test_operators.py", "exchange/importing/test_operators.py"],
     "broken files": ["test_malformed.py::test_what"],
     "hostile files": ["test_hostile_files.py"],
     "files that run something": ["test_evil_files.py"],
-    "kills": ["test_checkpoint.py::test_kill", "training/test_runs.py::test_killed"],
+    "kills": ["experiment/test_checkpoint.py::test_kill", "training/test_runs.py::test_killed"],
 }
 
 

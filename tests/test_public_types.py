@@ -142,7 +142,7 @@ def test_every_type_of_the_public_interface_is_known(site):
 
 @pytest.mark.gate
 def test_an_attribute_without_its_type_is_found(site):
-    problem = site / "lyapnet" / "problem.py"
+    problem = site / "lyapnet" / "task" / "problem.py"
     source = problem.read_text(encoding="utf-8")
     assert source.count(DECLARED) == 1
     problem.write_text(source.replace(DECLARED, ""), encoding="utf-8")

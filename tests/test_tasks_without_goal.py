@@ -240,7 +240,7 @@ def test_nothing_holds_a_goal_that_is_not_there():
 
 
 def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 4)
+    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 4)
     limit = lyapnet.task.constraints.StateLimits([0], [2.2], [1.0], [2.2], ["near"])
     problem = far().replaced(constraints=limit.double()).relaxed()
     found = find_relaxation(problem, silent)
@@ -254,10 +254,10 @@ def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
 @pytest.mark.gate
 def test_a_training_without_a_goal(tmp_path, monkeypatch, capsys):
     """From YAML to a table: one state, a cost of both signs, an end that is to be far."""
-    monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.optima.MAX_OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 100, 50)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
     (tmp_path / "task.yaml").write_text(
         json.dumps({
             "experiment": "far",

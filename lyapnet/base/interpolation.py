@@ -95,7 +95,7 @@ class Curve(nn.Module):
         return (y[0] + _share_behind(t, self.nodes) @ y.diff(dim=0)).unflatten(-1, self.values.shape[1:])
 
     @torch.no_grad()
-    def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
+    def fit(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
         """Become the curve through as many of these points as there are nodes, those that leave the least error.
 
         With fewer points than nodes, further ones are put between them.
@@ -159,7 +159,7 @@ class SmoothCurve(nn.Module):
         return torch.sigmoid((left[..., None] - self.STEPS.to(left)) / self.WIDTH)
 
     @torch.no_grad()
-    def take(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
+    def fit(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
         """Become the curve closest by least squares, in y and dy/dτ, to a cubic spline through these points.
 
         It passes the last of them, at T. Of numbers that are none it is none.

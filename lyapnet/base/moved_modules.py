@@ -1,11 +1,11 @@
 """Modules of lyapnet under the names that they had until 0.3: imports, configs and checkpoints that name them go on."""
 
 import sys
-from collections.abc import Sequence
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
 _FOLDERS = {  # of today ↦ what was beside them
     "base": "cluster contracts devices drawing errors files findings interpolation linear_algebra machine operators "
@@ -36,9 +36,7 @@ MOVED = {
 class MovedModules(MetaPathFinder):
     """Finds a module by its former name: the same module, not a copy."""
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
         package, *parts = fullname.split(".")
         if package != "lyapnet" or not parts:
             return None

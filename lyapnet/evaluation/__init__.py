@@ -1,4 +1,4 @@
-"""What a controller is worth: measured on states, held against optima, disturbed, drawn."""
+"""Evaluation of controllers: costs, comparison with optima, robustness, figures."""
 
 from lyapnet.evaluation.measurement import Evaluation, evaluate, evaluation
 from lyapnet.evaluation.oracles import Optima, Oracle, Report, oracle_of, silent

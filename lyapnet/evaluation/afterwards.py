@@ -1,4 +1,4 @@
-"""What a controller does after T, for which V was not trained, under each law that can follow."""
+"""The closed loop after T, where V was not trained, under each law that can follow."""
 
 import math
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ DIVERGES = "the closed loop diverges"
 
 
 class Afterwards(NamedTuple):
-    """Where closed loops go under one law after T."""
+    """The closed loops under one law after T."""
 
     beyond: str
-    distance: Float[Tensor, "nodes batch"] | None  # ‖x(t_n) − x*‖ up to the last time asked for; None: see refused
-    refused: str  # why this law has no closed loop; empty where it has
+    distance: Float[Tensor, "nodes batch"] | None  # ‖x(t_n) − x*‖ up to the last requested time; None: see refused
+    refused: str  # why this law has no closed loop; empty if it has
 
     def mean_at(self, node: int) -> float | None:
         """Mean ‖x(t_n) − x*‖."""
@@ -36,13 +36,13 @@ def afterwards(controller: Controller, x0: State, multiple: float) -> list[After
         UsageError: see check_multiple.
     """
     check_multiple(controller, multiple, len(x0))
-    return [_under(controller, beyond, x0, last_node(controller, multiple)) for beyond in LAWS]
+    return [_follow(controller, beyond, x0, last_node(controller, multiple)) for beyond in LAWS]
 
 
-def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterwards:
+def _follow(controller: Controller, beyond: str, x0: State, steps: int) -> Afterwards:
     try:
         other = controller.continued(beyond)
-    except ValueError as error:  # of a goal that the law cannot hold
+    except ValueError as error:  # the law cannot hold the goal
         return Afterwards(beyond, None, str(error))
     try:
         x = other.rollout(x0, steps).x
@@ -53,10 +53,10 @@ def _under(controller: Controller, beyond: str, x0: State, steps: int) -> Afterw
 
 
 def share_at_goal(controller: Controller, x0: State) -> float | None:
-    """The share of closed loops that the law after T holds up to MULTIPLE T; None where that is not asked.
+    """The share of closed loops that the law after T keeps near the goal up to MULTIPLE T; None where it is undefined.
 
-    It is not asked of a task without a goal, of an error, and of a time of more than LONGEST steps. Closed loops that
-    cannot be followed, as one of them diverges or f, g or the cost refuse a state, are not held.
+    It is undefined without a goal, without a law after T, and beyond LONGEST steps. If a closed loop diverges, or f, g
+    or the cost raise an error, the share is 0.
     """
     steps = MULTIPLE * controller.horizon.steps
     if steps > LONGEST or not controller.problem.has_goal or controller.law.beyond == "error":
@@ -64,15 +64,15 @@ def share_at_goal(controller: Controller, x0: State) -> float | None:
     try:
         x = controller.continued(controller.law.beyond).rollout(x0, steps).x
         return float(is_held(controller.problem, x).double().mean())
-    except Exception:  # of any kind: f, g and the cost may be the user's
+    except Exception:  # f, g and the cost may be the user's
         return 0.0
 
 
 def check_multiple(controller: Controller, multiple: float, states: int) -> None:
-    """Refuse a multiple of T that never comes, that is before T, or up to which closed loops fit into no memory.
+    """Check a multiple of T.
 
     Raises:
-        UsageError: naming it.
+        UsageError: it is infinite or below 1, or the closed loops do not fit into memory.
     """
     if not 1 <= multiple < math.inf:
         raise UsageError(f"Expected a multiple of T from 1 on, got {multiple:g}; give how many T to go on for.")
@@ -81,18 +81,18 @@ def check_multiple(controller: Controller, multiple: float, states: int) -> None
 
 
 def last_node(controller: Controller, multiple: float) -> int:
-    """The node of the horizon's steps that is a multiple of T away, one after T at the least."""
+    """The index n of the first node t_n at or after a multiple of T, at least one step after T."""
     return max(math.ceil(multiple * controller.horizon.steps), controller.horizon.steps + 1)
 
 
 def shown_nodes(controller: Controller, multiple: float) -> list[int]:
-    """The nodes that a table has: T, and a tenth, a half and all of the time after it."""
+    """The nodes shown in a table: T, and a tenth, a half and all of the time after T."""
     T, last = controller.horizon.steps, last_node(controller, multiple)
     return sorted({T, T + max((last - T) // 10, 1), T + max((last - T) // 2, 1), last})
 
 
 def in_plain_data(found: Sequence[Afterwards], controller: Controller, multiple: float) -> list[dict[str, Any]]:
-    """For JSON and tables: of each law, the mean distance at some times in s, or why there is none."""
+    """Plain data for JSON and tables: the mean distance at some times in s for each law, or why there is none."""
     nodes, dt = shown_nodes(controller, multiple), controller.horizon.dt
     return [
         {

@@ -1,4 +1,4 @@
-"""Closed loops in motion: the system's own shapes, or the plane of two states, beside controls and cost."""
+"""Animations of closed loops: the system's shapes, or a plane of two states, with controls and cost."""
 
 import io
 import math
@@ -28,27 +28,27 @@ from lyapnet.evaluation.scenes import artist_of, plane_axes, set_plane, set_stag
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.problem import Problem
 
-SHORTEST, LONGEST = 3.0, 10.0  # seconds of an animation whose speed nobody gave
-BEHIND = 0.18  # opacity of all closed loops but the first, where their shapes overlap
+SHORTEST, LONGEST = 3.0, 10.0  # limits in seconds of the default duration of an animation
+BACKGROUND_OPACITY = 0.18  # opacity of the shapes of all closed loops but the first
 
 
 class Film:
-    """Closed loops in motion, frame by frame.
+    """An animation of closed loops, frame by frame.
 
-    The left panel has the shapes that the system draws: the first closed loop's, in the background those of the others,
-    and in red the goal's. Of a system without shapes it has the plane of X₀'s two widest states, with level sets of
-    V(t, ·) through the centre of X₀ in the others; of a single state its course over time. On the right are the
-    controls with their limits, and the cost to go with V, of the first closed loop in full colour.
+    The left panel shows the system's shapes: those of the first closed loop, faintly those of the others, and in red
+    those of the goal. For a system without shapes it shows the plane of the two widest states of X₀ with level sets of
+    V(t, ·), the other states at the centre of X₀; for a single state, this state over time. The right panels show the
+    controls with their limits, and the cost to go with V; the first closed loop is in full colour.
 
     Args:
         trajectory: a batch (b,) of closed loops of a V.
-        problem: theirs.
-        V: of the level sets.
+        problem: their problem.
+        V: value function of the level sets.
         rate: frames per second.
-        speed: of the animation's time against the system's; None: 1, or what makes it 3 to 10 s long.
+        speed: seconds of the system per second of the animation; None: 1, adapted to a duration of 3 to 10 s.
 
     Raises:
-        UsageError: a rate or a speed that is no positive number; or a `draw` that fails.
+        UsageError: rate or speed is no positive number, or the system's `draw` fails.
     """
 
     def __init__(
@@ -74,9 +74,9 @@ class Film:
         self.figure.set_dpi(110)
 
     def frames(self) -> Iterator[np.ndarray]:
-        """Each frame as (height, width, 3) bytes; the sides are even, as video formats want them."""
+        """The frames as (height, width, 3) bytes; both sides are even, as video formats require."""
         canvas = self._canvas
-        canvas.draw()  # what does not move, once for all frames
+        canvas.draw()  # the background, drawn once for all frames
         still = canvas.copy_from_bbox(self.figure.bbox)
         for node in self.nodes:
             canvas.restore_region(still)
@@ -97,7 +97,7 @@ class Film:
         images = (Image.fromarray(frame) for frame in self.frames())
         first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
         buffer, pause = io.BytesIO(), 1000 / self.rate
-        pauses = [round(pause)] * len(others) + [1000]  # the end stays for a second
+        pauses = [round(pause)] * len(others) + [1000]  # the last frame is shown for a second
         first.save(buffer, "GIF", save_all=True, append_images=others, duration=pauses, loop=0, optimize=False)
         return buffer.getvalue()
 
@@ -105,7 +105,7 @@ class Film:
         """The animation as an MP4 video, made by ffmpeg.
 
         Raises:
-            UsageError: there is no ffmpeg, or it fails.
+            UsageError: ffmpeg is missing or fails.
         """
         program = shutil.which("ffmpeg")
         if program is None:
@@ -124,10 +124,10 @@ class Film:
             return target.read_bytes()
 
     def write(self, path: Path) -> None:
-        """Write the animation, all or nothing: a .gif, or an .mp4.
+        """Write the animation atomically to a .gif or .mp4 file.
 
         Raises:
-            UsageError: another ending; or no ffmpeg for an MP4.
+            UsageError: the file has another ending, or ffmpeg is missing for an MP4.
             OSError: the file cannot be written.
         """
         makers = {".gif": self.gif, ".mp4": self.mp4}
@@ -138,7 +138,7 @@ class Film:
     def _shapes(self, node: int, loop: int) -> Sequence[Shape]:
         return shapes_of(self.problem, self.x[node, loop], self.u[min(node, len(self.u) - 1), loop])
 
-    def _left(self) -> Axes:
+    def _left_panel(self) -> Axes:
         self._grid = self.figure.add_gridspec(1, 2, width_ratios=(1, 1))
         panel = self.figure.add_subplot(self._grid[0])
         self._panel, self._clock = panel, panel.set_title("t = 0.00 s", loc="left", fontsize=9, animated=True)
@@ -147,28 +147,28 @@ class Film:
         return panel
 
     def _stage(self) -> Any:
-        """The panel of the system's shapes; what puts those of a node into it."""
-        panel, problem = self._left(), self.problem
+        """Prepare the panel of the system's shapes; return the function that draws those of a node."""
+        panel, problem = self._left_panel(), self.problem
         shown = [self._shapes(node, loop) for node in self.nodes for loop in range(self.x.shape[1])]
         set_stage(panel, problem, np.concatenate([corners_of(shape) for shapes in shown for shape in shapes]))
 
-        def put(node: int) -> Iterator[Artist]:
+        def draw_node(node: int) -> Iterator[Artist]:
             for loop in reversed(range(self.x.shape[1])):
                 for shape in self._shapes(node, loop):
-                    yield panel.add_artist(artist_of(shape, BLUE, BEHIND if loop else 1.0))
+                    yield panel.add_artist(artist_of(shape, BLUE, BACKGROUND_OPACITY if loop else 1.0))
 
-        return put
+        return draw_node
 
     def _plane(self) -> Any:
-        """The panel of two states with level sets of V; what puts those of a node into it."""
-        panel, problem = self._left(), self.problem
+        """Prepare the panel of two states with level sets of V; return the function that draws those of a node."""
+        panel, problem = self._left_panel(), self.problem
         axes = plane_axes(problem)
         region = _grid(problem, axes, *set_plane(panel, problem, axes, self.x.reshape(-1, problem.system.n)))
         first = self._values(0, region)
         levels = np.quantile(first, np.linspace(0.03, 0.97, 9))
         levels = levels[np.append(True, np.diff(levels) > 0)]
 
-        def put(node: int) -> Iterator[Artist]:
+        def draw_node(node: int) -> Iterator[Artist]:
             coordinates = [numpy_of(line) for line in region.grid]
             yield panel.contour(*coordinates, self._values(node, region), levels=levels, colors=GREY, linewidths=0.7)
             for loop in range(self.x.shape[1]):
@@ -176,11 +176,11 @@ class Film:
                 yield from panel.plot(*path.T, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
                 yield from panel.plot(*path[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
 
-        return put
+        return draw_node
 
     def _course(self) -> Any:
-        """The panel of a single state over time, with level sets of V; what puts it until a node into it."""
-        panel, problem = self._left(), self.problem
+        """Prepare the panel of a single state over time; return the function that draws the curve up to a node."""
+        panel, problem = self._left_panel(), self.problem
         low, high = float(self.x.min()), float(self.x.max())
         margin = 0.06 * max(high - low, 1e-9)
         panel.set(xlim=(0, self.t[-1]), ylim=(low - margin, high + margin), xlabel="time (s)")
@@ -194,13 +194,13 @@ class Film:
             values = np.stack([numpy_of(self.V(t, heights)) for t in times], 1)
         panel.contour(self.t[self.nodes], numpy_of(heights[:, 0]), values, levels=9, colors=GREY, linewidths=0.7)
 
-        def put(node: int) -> Iterator[Artist]:
+        def draw_node(node: int) -> Iterator[Artist]:
             for loop in range(self.x.shape[1]):
                 t, x = self.t[: node + 1], self.x[: node + 1, loop, 0]
                 yield from panel.plot(t, x, color=BLUE, linewidth=1.0, alpha=0.35 if loop else 1.0)
                 yield from panel.plot(t[-1], x[-1], "o", color=BLUE, markersize=5, alpha=0.5 if loop else 1.0)
 
-        return put
+        return draw_node
 
     def _values(self, node: int, region: Slice) -> np.ndarray:
         with torch.no_grad():
@@ -208,14 +208,15 @@ class Film:
         return numpy_of(values).reshape([len(line) for line in region.grid]).T
 
     def _panels(self) -> list[tuple[Any, np.ndarray, np.ndarray]]:
-        """The panels of the controls and of the cost; their lines that grow, with times and values."""
+        """Draw the panels of controls and cost; return the lines that grow, with their times and values."""
         system, limits = self.problem.system, self.problem.controls.limits
         rows = min(system.m, 4)
         grid = self._grid[1].subgridspec(rows + 1, 1)
         panels: list[Axes] = [*grid.subplots(sharex=True, squeeze=False)[:, 0]]
         growing = []
+        above: Any = {"loc": "left", "fontsize": 7, "pad": 2}  # beside a low panel a long label would not fit
         for k, panel in enumerate(panels[:-1]):
-            panel.set_ylabel(system.control_labels[k].replace(" (", "\n("), fontsize=8)
+            panel.set_title(system.control_labels[k], **above)
             for limit in limits or ():
                 if math.isfinite(height := float(limit.expand(system.m)[k])):
                     panel.axhline(height, color=GREY, linewidth=0.9, linestyle="--")
@@ -223,7 +224,7 @@ class Film:
         last = panels[-1]
         growing += self._lines(last, self.to_go, ORANGE, "cost to go")
         growing += self._lines(last, self.value, BLUE, "V(t, x)", "--", others=False)
-        last.set_ylabel("cost", fontsize=8)
+        last.set_title("cost", **above)
         last.set_xlabel("time (s)", fontsize=8)
         last.set_xlim(0, self.t[-1])
         last.legend(fontsize=7, frameon=False, loc="upper right")
@@ -234,7 +235,7 @@ class Film:
     def _lines(
         self, panel: Axes, values: np.ndarray, color: str, label: str = "", style: str = "-", others: bool = True
     ) -> list[tuple[Any, np.ndarray, np.ndarray]]:
-        """The curves (N or N + 1, b) of all closed loops, faint, and the line of the first, which grows."""
+        """Draw the curves (N or N + 1, b) of all closed loops faintly; return the growing line of the first one."""
         times = self.t[: len(values)]
         shown = values if others else values[:, :1]
         panel.plot(times, shown, color=color, linewidth=0.7, alpha=0.25, linestyle=style)
@@ -243,7 +244,7 @@ class Film:
 
 
 def _palette() -> Image.Image:
-    """The colours of all figures, each in steps to white, and greys: at most 256."""
+    """A palette of at most 256 colours: the colours of all figures, each in steps towards white."""
     named = [to_rgb(color) for color in (BLUE, GREEN, ORANGE, VERMILION, GREY, "black")]
     shades = [1 - (1 - np.array(color)) * share for color in named for share in np.linspace(1, 0, 42)]
     palette = Image.new("P", (1, 1))
@@ -252,7 +253,7 @@ def _palette() -> Image.Image:
 
 
 def _grid(problem: Problem, axes: list[int], low: np.ndarray, high: np.ndarray, points: int = 41) -> Slice:
-    """A grid of two states, the others at the centre of X₀."""
+    """A grid over two states; the other states are at the centre of X₀."""
     like = problem.initial_states.center
     grid = [torch.linspace(float(a), float(b), points).to(like) for a, b in zip(low, high, strict=True)]
     mesh = torch.meshgrid(*grid, indexing="ij")

@@ -1,4 +1,4 @@
-"""Tables drawn as matplotlib figures: what a controller does, and where its condition holds."""
+"""Matplotlib figures of a controller: trajectories, slices of V, the region where its condition holds."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,21 +24,21 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
-MOST_NAMED = 4  # states beside those of a slice whose numbers fit into a line
+MOST_NAMED = 4  # other states whose values fit into a line under a slice
 
 
 class Slice(NamedTuple):
-    """A grid in X₀ over its widest components, the others at the centre."""
+    """A grid in X₀ over its widest components; the other components are at the centre."""
 
     axes: Sequence[int]  # one or two state indices
     grid: Sequence[Tensor]  # the coordinates along each axis
-    states: State  # (b, n), the last axis running fastest
+    states: State  # (b, n), with the last axis varying fastest
 
 
 def widest_slice(initial_states: Box, points: int) -> Slice:
-    """The slice of X₀ through its centre along its two widest components, or its only one that is not fixed."""
+    """The slice through the centre of X₀ along its two widest components, or along the only free one."""
     axes, widths = widest_axes(initial_states), initial_states.widths
-    # midpoints of equal cells, so that a share of cells is a share of X₀
+    # midpoints of equal cells: the share of cells equals the share of X₀
     middles = (torch.arange(points).to(widths) + 0.5) / points
     grid = [initial_states.lower[i] + widths[i] * middles for i in axes]
     mesh = torch.meshgrid(*grid, indexing="ij")
@@ -48,16 +48,16 @@ def widest_slice(initial_states: Box, points: int) -> Slice:
 
 
 def widest_axes(initial_states: Box) -> list[int]:
-    """The two widest components of X₀, or its only one that is not fixed; the first if all are."""
+    """The two widest components of X₀, or the only free one; the first if all are fixed."""
     widths = initial_states.widths
     return sorted(int(i) for i in widths.argsort(descending=True, stable=True)[:2] if widths[i] > 0) or [0]
 
 
 def certified_region(rollout: Callable[[State], Trajectory], problem: Problem, tolerance: float = 1e-2) -> Figure:
-    """Which initial states of a slice of X₀ satisfy the Lyapunov condition along their whole closed loop.
+    """The initial states in a slice of X₀ that satisfy the Lyapunov condition along their whole closed loop.
 
-    The condition is the paper's, on samples: Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ tolerance · V(0, x₀). Level sets of
-    V(0, ·) and some closed-loop trajectories are drawn over it; with one free component, the sum itself.
+    The condition is that of the paper, at the nodes: Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0) ≤ tolerance · V(0, x₀). Level
+    sets of V(0, ·) and some closed loops are drawn over it. With one free component the sum itself is drawn.
     """
     system, initial_states = problem.system, problem.initial_states
     region = widest_slice(initial_states, 41 if _free_components(initial_states) > 1 else 101)
@@ -92,7 +92,7 @@ def _draw_plane_region(
     system, initial_states = problem.system, problem.initial_states
     first, second = (numpy_of(g) for g in region.grid)
     shape = (len(first), len(second))
-    levels = ["#E8A06A", "#CFE6F3"]  # they also differ as greys
+    levels = ["#E8A06A", "#CFE6F3"]  # distinct in greyscale too
     axes.pcolormesh(
         first, second, numpy_of(holds).reshape(shape).T.astype(float), cmap=ListedColormap(levels), vmin=0, vmax=1,
         shading="nearest", rasterized=True,
@@ -100,8 +100,8 @@ def _draw_plane_region(
     contour = axes.contour(first, second, numpy_of(V0).reshape(shape).T, levels=8, colors=GREY, linewidths=0.8)
     axes.clabel(
         contour, list(contour.levels)[::2], fontsize=7, fmt="%.3g"
-    )  # where X₀ is narrow, those of neighbours collide
-    axes.use_sticky_edges = False  # the sides of X₀ keep a margin from the frame
+    )  # every second level: labels of neighbours overlap
+    axes.use_sticky_edges = False  # keep a margin between X₀ and the frame
     i, j = region.axes
     corners = _spread(region)
     paths = numpy_of(trajectory.x[:, corners])
@@ -151,15 +151,15 @@ def _draw_line_region(
 
 
 def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
-    """States, controls, the limits of both, and V with the cost still to come, over time, of a batch (b,) of loops.
+    """States, controls and their limits, V and the cost to go over time, for a batch (b,) of closed loops.
 
-    Dotted: the goal, where it is one, and the control that costs nothing. Parameters of a family have no panel.
+    Dotted lines are the common goal, if there is one, and the control at rest. Parameters of a family have no panel.
     """
     system, to_go = problem.system, trajectory.cost - trajectory.running_cost
     t = numpy_of(trajectory.t)
     drawn = [i for i in range(system.n) if i not in system.constants]
     x0 = trajectory.x[0]
-    goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # of each, in a family
+    goal = (x0 - problem.cost.from_goal(x0))[:, drawn]  # in a family each member has its own
     one = torch.where((goal - goal[0]).abs().amax(0) <= 1e-9 * (1 + goal[0].abs()), goal[0], torch.nan)
     one = one if problem.has_goal else torch.full_like(one, torch.nan)
     at_rest = torch.cat([one, problem.rest]).tolist()
@@ -167,7 +167,7 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
     curves += [(system.control_labels[i], numpy_of(trajectory.u[..., i]), GREEN) for i in range(system.m)]
     columns = _columns(len(curves) + 1)
     rows = -(-(len(curves) + 1) // columns)
-    figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # printed, 7 pt stay 7 pt
+    figure = Figure(figsize=(3.6 * columns, 1.3 * rows + 0.4), layout="constrained")  # fits a page without scaling
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     panels = list(grid.flatten(order="F"))
     for panel, (label, values_over_time, color), height in zip(panels, curves, at_rest, strict=False):
@@ -203,14 +203,14 @@ def trajectories(trajectory: Trajectory, problem: Problem) -> Figure:
 
 
 def _columns(panels: int) -> int:
-    """One for a few panels; else two or three, of which fewer places stay empty, three for many panels."""
+    """The number of columns: 1 for a few panels; else 2 or 3, whichever leaves fewer empty places."""
     return 1 if panels < 5 else min((2, 3), key=lambda columns: (-panels % columns, abs(columns - panels / 4)))
 
 
 def value_slices(V: Value, problem: Problem) -> Figure:
-    """V(t, ·) on the slice of X₀ at the start, the middle and near the end of the horizon; a stationary V once.
+    """V(t, ·) on a slice of X₀ at the start, the middle and near the end of the horizon; a stationary V once.
 
-    Each time has a scale of its own: between them V may change by orders of magnitude.
+    Each time has its own colour scale, because V may change by orders of magnitude.
     """
     system, initial_states, duration = problem.system, problem.initial_states, problem.horizon.duration
     region = widest_slice(initial_states, 61)
@@ -241,14 +241,14 @@ def value_slices(V: Value, problem: Problem) -> Figure:
 
 
 def _levels(values: np.ndarray) -> list[float]:
-    """Some 20 round levels from the least to the largest finite value."""
+    """About 20 round levels between the smallest and the largest finite value."""
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     return list(MaxNLocator(20).tick_values(low, high if high > low else low + 1.0))
 
 
 def optimality(table: StateTable) -> Figure:
-    """Cost and V(0, x₀) of each initial state against its optimum; on the line, they are the optimum."""
+    """Cost and V(0, x₀) of each initial state over its optimal cost, with the line of equality."""
     assert table.optimal_cost is not None
     known = torch.isfinite(table.optimal_cost)
     optimal = numpy_of(table.optimal_cost[known])
@@ -284,7 +284,7 @@ def _others_at_center(system: ControlAffineSystem, initial_states: Box, axes: Se
 
 
 def _spread(region: Slice) -> list[int]:
-    """Flat indices of a few states along the slice's border and middle."""
+    """Flat indices of a few states on the border and in the middle of a slice."""
     a, b = (len(g) - 1 for g in region.grid)
     places = [(0, 0), (0, b), (a, 0), (a, b), (0, b // 2), (a, b // 2), (a // 2, 0), (a // 2, b)]
     return [i * (b + 1) + j for i, j in places]

@@ -1,4 +1,4 @@
-"""Measurements of a controller, one number for each initial state, and their summary."""
+"""Measures of a controller for each initial state, and their summary."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,44 +22,42 @@ from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import names_of
-from lyapnet.task.domain import ROUNDED, SLACK
+from lyapnet.task.domain import BORDER_ROUNDING, SLACK
 from lyapnet.task.problem import Problem
 from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
-
-
-CORNER_AXES = 8  # of X₀ along which corners are asked, 256 at most
+CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
 
 class Corner(NamedTuple):
-    """The corner of X₀ with the dearest closed loop: uniform draws come near no corner."""
+    """The corner of X₀ with the most expensive closed loop; uniform samples hardly ever come near a corner."""
 
-    count: int  # of how many
+    count: int  # number of tested corners
     x0: list[float]
-    cost: float | None  # J; none where closed loops from the corners leave the finite numbers
+    cost: float | None  # J; None if a closed loop from a corner is not finite
     value: float  # V(0, x₀)
 
 
 class Evaluation(NamedTuple):
-    """What a controller does from fresh states of X₀."""
+    """The measures of a controller on new states of X₀."""
 
     table: StateTable
     paper: StateTable  # K = 100 further states
-    notes: Sequence[str]  # why J* is missing, one for each row of the table; empty where it is not
+    notes: Sequence[str]  # the reason why J* is missing for each row of the table; empty if it is known
     seed: int
     problem: Problem
     corner: Corner
-    held_cost: PerState  # of the table's states in continuous time, u held for Δt; infinite where it diverges
-    lqr_cost: PerState | None  # of the table's states under LQR, likewise; None where there is no such law
-    at_goal: float | None  # share of closed loops that the law after T holds; None where it is not asked
-    after: str  # the law after T
-    optimum_of: str = ""  # of which steps, or of continuous time; empty where no optimum was sought
+    held_cost: PerState  # cost from each state in continuous time with u held for Δt; infinite if it diverges
+    lqr_cost: PerState | None  # cost from each state under LQR; None if there is no such law
+    at_goal: float | None  # share of closed loops that the law after T keeps near the goal; None: see share_at_goal
+    after: str  # name of the law after T
+    optimum_of: str = ""  # model of the optimum: its steps, or continuous time; empty if none was computed
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
 
-        Costs, errors and the decreasing share are over the table; the satisfied shares over the K further states.
+        The satisfied shares are over the K further states, all other measures over the table.
         """
         paper = {key: value for key, value in self.paper.summary().items() if key.startswith("satisfied_fraction")}
         system = self.problem.system
@@ -85,12 +83,12 @@ class Evaluation(NamedTuple):
         }
 
     def _terminal_errors(self) -> dict[str, float]:
-        """Of each state, the mean distance from its goal at T."""
+        """The mean distance of each state from its goal at T."""
         system, errors = self.problem.system, self.problem.cost.from_goal(self.table.terminal_state).abs().mean(0)
         return {name: float(errors[i]) for i, name in enumerate(system.state_labels) if i not in system.constants}
 
     def write(self, path: Path) -> None:
-        """The table as comma-separated values with a line of names and units.
+        """Write the table as CSV with a header line of names and units.
 
         Raises:
             OSError: the file cannot be written.
@@ -113,7 +111,7 @@ class Evaluation(NamedTuple):
         path.write_text(csv_text(rows), encoding="utf-8")
 
     def _references(self) -> dict[str, float | None]:
-        """Mean costs of the plant in continuous time and of LQR, and their ratios to the optimum; None: not finite."""
+        """Mean costs in continuous time and of LQR, and their ratios to the optimum; None if not finite."""
         optimal = torch.full_like(self.table.cost, torch.nan)
         optimal = optimal if self.table.optimal_cost is None else self.table.optimal_cost
         measures = dict[str, float | None]()
@@ -140,11 +138,11 @@ class Evaluation(NamedTuple):
 def evaluate(
     controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
 ) -> dict[str, Any]:
-    """The summary of a controller on fresh states of X₀; see Evaluation.result.
+    """The summary of a controller on new states of X₀; see Evaluation.result.
 
     Raises:
         ValueError: fewer than one sample.
-        DivergenceError: the closed loop leaves the finite numbers.
+        DivergenceError: a closed loop is not finite.
     """
     return evaluation(controller, samples, seed, optimum, progress).result()
 
@@ -152,15 +150,16 @@ def evaluate(
 def evaluation(
     controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
 ) -> Evaluation:
-    """The measurements of a controller on fresh states of X₀, as many as `samples`, and on K = 100 further ones.
+    """The measures of a controller on new states of X₀.
 
     Args:
-        optimum: whether the first ones are compared with the optimum, where there is an oracle.
-        progress: of the oracle.
+        samples: number of states; K = 100 further states are drawn for the satisfied shares.
+        optimum: whether costs are compared with the optimum, if there is an oracle.
+        progress: progress callback of the oracle.
 
     Raises:
         ValueError: fewer than one sample.
-        DivergenceError: the closed loop leaves the finite numbers.
+        DivergenceError: a closed loop is not finite.
     """
     if samples < 1:
         raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
@@ -180,7 +179,7 @@ def evaluation(
         return Evaluation(first, paper, ["not asked for"] * samples, *further)
     try:
         oracle = oracle_of(problem, controller.method)
-        optima = oracle.solve(first.x0, trajectory.u[:, :samples], progress)  # the controller's own are starts
+        optima = oracle.solve(first.x0, trajectory.u[:, :samples], progress)  # the controller's u are initial guesses
     except OracleError as reason:
         return Evaluation(first, paper, [str(reason)] * samples, *further)
     exact = isinstance(oracle, RiccatiOracle) and controller.method != "euler"
@@ -189,17 +188,15 @@ def evaluation(
 
 
 def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
-    """J_N of closed loops, infinite where they go far out of the domain, and whether they leave it at all; None where
-    there is none.
-    """
+    """J_N of closed loops, infinite if they are far outside the domain, and whether they leave it; None without one."""
     if problem.domain is None:
         return trajectory.cost, None
-    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, ROUNDED))
+    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
     return trajectory.cost.masked_fill(far, torch.inf), left
 
 
 def dearest_corner(controller: Controller) -> Corner:
-    """The corner of X₀ whose closed loop costs most, of those along its first CORNER_AXES axes."""
+    """The corner of X₀ with the most expensive closed loop, among the corners along its first CORNER_AXES axes."""
     x0 = controller.initial_states.corners(CORNER_AXES)
     with torch.no_grad():
         value = controller.value(0.0, x0)

@@ -1,4 +1,4 @@
-"""Closed loops drawn in a plane of two states, around what they have to stay out of."""
+"""Figures of closed loops in a plane of two states, with disks that they must avoid or stay in."""
 
 from collections.abc import Iterator
 
@@ -14,15 +14,15 @@ from lyapnet.task.problem import Problem
 
 
 def has_plane(problem: Problem) -> bool:
-    """Whether there is a disk, of a constraint or of the cost, in a plane of two states."""
+    """Whether a constraint or the cost has a disk in a plane of two states."""
     return _plane(problem) is not None
 
 
 def paths(trajectory: Trajectory, problem: Problem) -> Figure:
-    """The closed loops (b,) of a batch in the plane of the first disk that a constraint or the cost has.
+    """A batch (b,) of closed loops in the plane of the first disk of a constraint or of the cost.
 
-    Disks that must not be entered are filled, those that must not be left dashed; those of the cost, whose weight at
-    the edge is a seventh of the centre's, are dotted.
+    Disks to avoid are filled, disks to stay in are dashed. Obstacles of the cost are dotted; the radius is where the
+    obstacle's cost is a seventh of that at its centre.
     """
     plane = _plane(problem)
     assert plane is not None
@@ -54,7 +54,7 @@ def _draw_disks(panel: Axes, problem: Problem, plane: tuple[int, int]) -> None:
     for kind, states, center, radius in _disks(problem):
         if states == plane:
             panel.add_patch(Circle((center[0], center[1]), radius, **styles[kind]))
-            styles[kind].pop("label", None)  # one entry of the legend
+            styles[kind].pop("label", None)  # one entry in the legend
 
 
 def _plane(problem: Problem) -> tuple[int, int] | None:

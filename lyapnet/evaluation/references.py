@@ -1,4 +1,4 @@
-"""What the cost of a closed loop is held against, from the same states: the plant in continuous time, and LQR."""
+"""Reference costs from the same states: the plant in continuous time, and LQR."""
 
 from collections.abc import Callable
 
@@ -11,7 +11,7 @@ from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import in_float64, path_under, regulator
 
-SUBSTEPS = 4  # of fourth order within Δt, for continuous time
+SUBSTEPS = 4  # Runge-Kutta steps of fourth order within Δt that stand for continuous time
 
 
 def in_continuous_time(problem: Problem) -> Problem:
@@ -21,11 +21,12 @@ def in_continuous_time(problem: Problem) -> Problem:
 
 
 def costs_of_holding(policy: nn.Module, own: Horizon, problem: Problem, x0: State) -> PerState:
-    """What a law costs in a problem, each control held for a step of the law's own horizon; infinite where it diverges.
+    """The costs of a law, with each control held for a step of the law's own horizon; infinite if it diverges.
 
     Args:
         policy: u(t, x).
-        problem: whose steps divide those of `own`.
+        own: the horizon of the law.
+        problem: the problem to roll out; its steps divide those of `own`.
     """
     times, each, u = own.times(x0), problem.horizon.steps // own.steps, x0
 
@@ -38,15 +39,14 @@ def costs_of_holding(policy: nn.Module, own: Horizon, problem: Problem, x0: Stat
 
 
 def costs_of_plant(problem: Problem, policy: nn.Module, x0: State) -> PerState:
-    """What the plant pays under a law: in continuous time, with u held for Δt."""
+    """The costs of a law on the plant in continuous time, with u held for Δt."""
     return costs_of_holding(policy, problem.horizon, in_continuous_time(problem), x0)
 
 
 def costs_of_lqr(problem: Problem, x0: State) -> PerState | None:
-    """What LQR costs: u = ū_n + K_n(x − x*) of the problem linearised at its goal, for its N steps, kept to U.
+    """The costs of LQR: u = ū_n + K_n(x − x*) of the problem linearised at its goal, over N steps, projected onto U.
 
-    None where there is no such law: there is no goal, or no finite linearisation there, or U is a set without limits
-    that are known.
+    None if there is no goal or no finite linearisation there, or if the limits of U are unknown.
     """
     law = _lqr(problem) if problem.has_goal and problem.controls.limits is not None else None
     if law is None:

@@ -1,4 +1,4 @@
-"""What a controller costs where its assumptions fail: other initial states, another plant, noise, a finer grid."""
+"""The cost of a controller under disturbances: other initial states, another plant, noise, smaller steps."""
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
@@ -20,14 +20,14 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
-BEYOND = 0.2  # relative to X₀'s extent, and to each physical parameter
-NOISE = 0.01  # standard deviation at each evaluation of the policy, relative to the undisturbed loop's largest |x_i|
+BEYOND = 0.2  # relative change of X₀'s extent and of each physical parameter
+NOISE = 0.01  # standard deviation of the measured x_i, relative to the largest |x_i| of the undisturbed loop
 
 
 def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """The positive real numbers among a constructor's arguments; gravity is no property of a system.
+    """The positive real numbers among a constructor's arguments, except gravity.
 
-    An integer counts where the constructor asks for a float: 1 kg, but not 3 links.
+    An integer counts if the constructor expects a float, as for a mass of 1 kg, but not for 3 links.
     """
     arguments = inspect.signature(type(system)).parameters
     return {
@@ -40,13 +40,13 @@ def physical_parameters(system: ControlAffineSystem, parameters: Mapping[str, An
 
 
 class Disturbance(NamedTuple):
-    """One way in which the task at hand is not the task of the training."""
+    """A task that differs from the trained one."""
 
     name: str
-    problem: Problem  # with the plant
-    policy: nn.Module  # u(t, x), which knows nothing of it
+    problem: Problem  # the disturbed problem
+    policy: nn.Module  # u(t, x), unaware of the disturbance
     x0: State
-    method: str  # how the closed loop is integrated
+    method: str  # integrator of the closed loop
 
 
 class DisturbanceRow(NamedTuple):
@@ -54,19 +54,19 @@ class DisturbanceRow(NamedTuple):
 
     disturbance: str
     cost_mean: float | None  # None: the closed loop diverged
-    optimal_cost_mean: float | None  # the disturbed task's, without noise; None: no oracle
+    optimal_cost_mean: float | None  # optimum of the disturbed task without noise; None: no oracle
     cost_ratio: float | None
-    optimum_failures: int | None  # states without an optimum, left out of the ratio
+    optimum_failures: int | None  # states without an optimum, not in the ratio
     terminal_error: float | None  # mean ‖x(T)‖
 
 
 class NoisyPolicy(nn.Module):
-    """u(t, x + w) with w ~ N(0, diag(σ²)), drawn anew at each call.
+    """u(t, x + w) with w ~ N(0, diag(σ²)), drawn at each call.
 
     Args:
         policy: u(t, x).
         deviation: σ (n,), in state units.
-        generator: of the draws.
+        generator: random generator of w.
     """
 
     def __init__(self, policy: nn.Module, deviation: Tensor, generator: torch.Generator):
@@ -80,14 +80,17 @@ class NoisyPolicy(nn.Module):
 
 
 def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Disturbance]:
-    """The task itself, and every disturbance of it, each from `samples` initial states.
+    """The task itself and its disturbances, each from `samples` initial states:
 
-    Those are: initial states up to 20 % outside X₀ and none inside; each positive physical parameter of the system 20 %
-    lower and higher, gravity aside, while the policy and the cost keep the old one; noise of 1 % on the state that the
-    policy reads; half the Δt; and continuous time. A law that is made to be held is held for Δt there, with steps of
-    fourth order, as in the optimum; another one is u(t, x) at every t, by an adaptive integrator, and the optimum,
-    where it is not Riccati's, has half the Δt. Of a family it is the task of one member, `nominal`; and where V can be
-    told a parameter, there is also the task of the member that has it.
+    1. initial states up to 20 % outside X₀, none inside;
+    2. each positive physical parameter, except gravity, 20 % lower and higher; policy and cost use the old value;
+    3. noise of 1 % on the measured state;
+    4. half the Δt;
+    5. continuous time. A law that is made to be held is held for Δt, with fourth order steps, and so is the optimum.
+       Another law is evaluated at every t by an adaptive integrator; its optimum uses half the Δt, or Riccati.
+
+    For a family it is the task of one member, see `nominal`. If V accepts the disturbed parameter, there is also the
+    task in which V is told its value.
     """
     family = dict[str, float]() if not controller.system.constants else nominal(controller)
     whole, controller = controller, controller.with_(**family) if family else controller
@@ -121,7 +124,7 @@ def disturbances(controller: Controller, samples: int, seed: int) -> Iterator[Di
 
 
 def nominal(family: Controller) -> dict[str, float]:
-    """The member of a family in whose task others are disturbances: the config's own, else the middle of a range."""
+    """The nominal member of a family: the parameters of the config, else the middle of each range."""
     assert isinstance(family.system, FamilySystem)
     own, middle = family.system.system, {name: sum(ends) / 2 for name, ends in family.config.family.items()}
     given = {name: getattr(own, name, middle[name]) for name in middle}
@@ -135,13 +138,13 @@ def robustness(
     optimum: bool = True,
     say: Callable[[str], object] = lambda name: None,
 ) -> list[DisturbanceRow]:
-    """What each disturbance costs, against the optimum of the disturbed task.
+    """The cost under each disturbance, compared with the optimum of the disturbed task.
 
     Args:
-        samples: initial states for each.
-        seed: of every draw.
-        optimum: whether the costs are compared with optima, where there is an oracle.
-        say: called with the name of the disturbance that is measured next.
+        samples: number of initial states.
+        seed: seed of all random draws.
+        optimum: whether costs are compared with optima, if there is an oracle.
+        say: called with the name of each disturbance before it is measured.
 
     Raises:
         ValueError: fewer than one sample.
@@ -179,7 +182,7 @@ def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
 
 
 def _outside(X0: Box, samples: int, generator: torch.Generator) -> State:
-    """States of the box 20 % larger than X₀, moved out along the ray from its centre where they are inside."""
+    """Random states between X₀ and a box that is 20 % larger; moved outwards along rays from the centre."""
     enlarged = Box(X0.center - (1 + BEYOND) * X0.widths / 2, X0.center + (1 + BEYOND) * X0.widths / 2)
     offset = enlarged.sample(samples, generator).to(X0.center) - X0.center
     half = torch.where(X0.widths > 0, X0.widths / 2, 1.0)

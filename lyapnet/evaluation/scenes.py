@@ -1,4 +1,4 @@
-"""What moves in animations and environments: the shapes that a system draws, or the plane of two of its states."""
+"""Drawing of a system's state in animations and environments: its shapes, or a plane of two states."""
 
 from collections.abc import Sequence
 
@@ -16,15 +16,15 @@ from lyapnet.base.shapes import Arrow, Disk, Line, Polygon, Shape, corners_of
 from lyapnet.evaluation.figures import widest_axes
 from lyapnet.task.problem import Problem
 
-SIDE = 4.4  # inches
+SIDE = 4.4  # side of the picture in inches
 
 
 class Picture:
-    """The present of one trajectory: the shapes that the system draws, and in red those of the goal.
+    """A picture of the current state of a trajectory: the system's shapes, and in red those of the goal.
 
-    Of a system without shapes it is the plane of X₀'s two widest states with the path so far and the goal; of one
-    state, this state over time. The view holds the least and the largest state of X₀, the goal and what was drawn since
-    `begin`: it grows with that.
+    For a system without shapes it shows the plane of the two widest states of X₀ with the path so far and the goal; for
+    a single state, this state over time. The view contains the lower and upper corner of X₀, the goal, and everything
+    drawn since `begin`.
     """
 
     def __init__(self, problem: Problem):
@@ -40,12 +40,12 @@ class Picture:
         self._seen = _corners(self.problem, [numpy_of(box.lower), numpy_of(box.upper), x], self.control)
 
     def go_on(self, x: np.ndarray, u: np.ndarray) -> None:
-        """Where a control (m,) led, (n,)."""
+        """Append the state x (n,) that the control u (m,) led to."""
         self.path.append(x)
         self.control = u
 
     def frame(self) -> np.ndarray:
-        """The present as (height, width, 3) bytes.
+        """The picture as (height, width, 3) bytes.
 
         Raises:
             UsageError: the system's `draw` fails.
@@ -88,7 +88,7 @@ class Picture:
 
 
 def set_stage(panel: Axes, problem: Problem, corners: np.ndarray) -> None:
-    """A panel in metres that shows these points (k, 2), and the shapes of a goal in red."""
+    """Set the view of a panel in metres so that it contains the points (k, 2); draw the shapes of the goal in red."""
     goal = shapes_of(problem, numpy_of(problem.goal), numpy_of(problem.rest)) if problem.has_goal else []
     corners = np.concatenate([corners, *map(corners_of, goal)])
     low, high = corners.min(0), corners.max(0)
@@ -104,12 +104,12 @@ def set_stage(panel: Axes, problem: Problem, corners: np.ndarray) -> None:
 
 
 def plane_axes(problem: Problem) -> list[int]:
-    """The two states of a plane: X₀'s widest."""
+    """The two states of the plane: the widest of X₀."""
     return [*widest_axes(problem.initial_states), 1, 0][:2]
 
 
 def set_plane(panel: Axes, problem: Problem, axes: list[int], states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A panel of two states that shows these (k, n), and a goal as a star; its lower left and upper right."""
+    """Set a panel of two states to contain the states (k, n), draw the goal as a star; return the panel's corners."""
     for axis, index in zip("xy", axes, strict=True):
         getattr(panel, f"set_{axis}label")(problem.system.state_labels[index], fontsize=8)
     low, high = states.min(0)[axes], states.max(0)[axes]
@@ -123,22 +123,22 @@ def set_plane(panel: Axes, problem: Problem, axes: list[int], states: np.ndarray
 
 
 def _corners(problem: Problem, states: Sequence[np.ndarray], u: np.ndarray) -> np.ndarray:
-    """The points (k, 2) between which the shapes of some states lie."""
+    """The corner points (k, 2) of the shapes of some states."""
     shapes = [shape for x in states for shape in shapes_of(problem, x, u)]
     return np.concatenate([np.zeros((0, 2)), *map(corners_of, shapes)])
 
 
 def shapes_of(problem: Problem, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
-    """What the system draws in a state (n,) under a control (m,).
+    """The shapes that the system draws in a state (n,) under a control (m,).
 
     Raises:
-        UsageError: its `draw` fails, or returns something else.
+        UsageError: its `draw` fails, or returns something other than shapes.
     """
     system = problem.system
     try:
         shapes = list(system.draw(np.asarray(x, dtype=float), np.asarray(u, dtype=float)))
         finite = all(isinstance(s, Shape) and np.isfinite(corners_of(s)).all() and corners_of(s).size for s in shapes)
-    except Exception as error:  # of any kind: the system may be the user's
+    except Exception as error:  # the system may be the user's
         raise UsageError(
             f"Expected {system.title}.draw(x, u) of arrays ({system.n},) and ({system.m},), got {one_line(error)}; "
             "return Line, Disk, Polygon and Arrow of lyapnet.base.shapes."
@@ -152,7 +152,7 @@ def shapes_of(problem: Problem, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]
 
 
 def artist_of(shape: Shape, color: str, alpha: float = 1.0) -> Artist:
-    """A shape for matplotlib; what is faint is grey, and an arrow of a blue system orange."""
+    """The matplotlib artist of a shape; faint lines are grey, arrows of a blue system are orange."""
     match shape:
         case Line(points, width, faint):
             tint = GREY if faint else color

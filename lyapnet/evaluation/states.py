@@ -1,4 +1,4 @@
-"""A row for each initial state of a batch of closed loops, and what the rows add up to."""
+"""The table of measures of a batch of closed loops, one row for each initial state, and its summary."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ class StateTable:
     x0: State
     cost: PerState  # J_N(x₀)
     value: PerState  # V(0, x₀)
-    optimal_cost: PerState | None  # J*(x₀), where there is an oracle; NaN where it found none
+    optimal_cost: PerState | None  # J*(x₀), NaN if none was found; None without an oracle
     constraint_loss: PerState  # the program's sum along the trajectory
     hinge: PerState  # Σ_n max(V_{n+1} − V_n + Δt ℓ_n, 0)
     decreasing: Tensor  # bool: V_{n+1} ≤ V_n at every step
     falling: Tensor  # bool: V falls by half of each step's cost, within 1e-6 of V(0, x₀)
-    largest_rise: PerState  # of V in a step, in units of V(0, x₀)
+    largest_rise: PerState  # largest rise of V in a step, relative to V(0, x₀)
     terminal_state: State  # x_N
     terminal_error: PerState  # ‖x_N − goal‖
     at_limits: Tensor | None = None  # (b, 2, m): share of the steps at the lower and upper limit of each control
-    worst: Tensor | None = None  # (b, k): max_n h(x_n), where there are constraints
-    worst_time: Tensor | None = None  # (b, k): when
-    left: Tensor | None = None  # (b,) bool: whether the closed loop leaves the domain, where there is one
-    has_goal: bool = True  # of the task; without one only costs, V and constraints say something
+    worst: Tensor | None = None  # (b, k): max_n h(x_n); None without constraints
+    worst_time: Tensor | None = None  # (b, k): time of this maximum
+    left: Tensor | None = None  # (b,) bool: whether the closed loop leaves the domain; None without a domain
+    has_goal: bool = True  # whether the task has a goal; otherwise only costs, V and constraints are meaningful
 
     def rows(self, chosen: slice) -> "StateTable":
         """The table of some of the states."""
@@ -60,7 +60,7 @@ class StateTable:
         return {**summary, **self._about_goal()} if self.has_goal else summary
 
     def _about_goal(self) -> dict[str, float | None]:
-        """What is said of V as a distance to the goal, in units of its size."""
+        """The measures of V as a Lyapunov function, relative to its size."""
         return {
             "value_to_cost": float(self.value.mean() / self.cost.mean()),
             "terminal_error": float(self.terminal_error.mean()),
@@ -74,7 +74,7 @@ class StateTable:
         }
 
     def use_of_limits(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Of each control: the share of all steps at its lower and upper limit, and of states that meet either."""
+        """For each control: the share of steps at its lower and upper limit, and of states that reach either."""
         if self.at_limits is None:
             return {}
         met = self.at_limits.any(1).to(self.at_limits)
@@ -83,7 +83,7 @@ class StateTable:
         return {name: dict(zip(keys, own, strict=True)) for name, own in zip(names, shares, strict=True)}
 
     def violations(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Of each constraint: the share of states whose closed loop violates it, the worst h, and when that is."""
+        """For each constraint: the share of states whose closed loop violates it, the largest h, and its time."""
         if self.worst is None or self.worst_time is None:
             return {}
         shares, (worst, of) = (~(self.worst <= 0)).double().mean(0).tolist(), self.worst.max(0)
@@ -93,13 +93,13 @@ class StateTable:
 
     @property
     def violated(self) -> Tensor | None:
-        """Whether each closed loop violates a constraint, or has no number for it, (b,); None where there are none."""
+        """Whether each closed loop violates a constraint, or h is NaN, (b,); None without constraints."""
         return None if self.worst is None else ~(self.worst <= 0).all(-1)
 
     def against_optimum(self) -> dict[str, float | None]:
-        """Ratio of the mean costs, J / J*, and mean |V(0, x₀) − J*| / mean J*: over the states whose J* is known.
+        """Mean J / mean J*, and mean |V(0, x₀) − J*| / mean J*, over the states whose J* is known.
 
-        Without a goal both are in units of the spread of J*, and the first is the regret, of J − J*.
+        Without a goal they are the regret, mean (J − J*) / spread of J*, and mean |V(0, x₀) − J*| / spread of J*.
         """
         optimal = torch.full_like(self.cost, torch.nan) if self.optimal_cost is None else self.optimal_cost
         error = (self.value - optimal).abs()
@@ -119,7 +119,7 @@ def measure(
     """The table of a batch (b,) of trajectories under the control law of a V.
 
     Args:
-        optimal_cost: J* of each, where it is known.
+        optimal_cost: J* of each trajectory, if known.
     """
     values = trajectory.require_value()
     worst, worst_time = _worst(problem, trajectory)
@@ -143,7 +143,7 @@ def measure(
 
 
 def _worst(problem: Problem, trajectory: Trajectory) -> tuple[Tensor | None, Tensor | None]:
-    """max_n h(x_n) of each trajectory and constraint, and when it is."""
+    """max_n h(x_n) of each trajectory and constraint, and its time."""
     if problem.constraints is None:
         return None, None
     worst, node = problem.constraints(trajectory.x).max(0)

@@ -1,4 +1,4 @@
-"""What evaluations show in a terminal."""
+"""Tables of evaluations for the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,13 +33,16 @@ ROWS = {
     "satisfied_fraction": "condition holds within 1 % of V(0, x₀), share of K = 100",
     "satisfied_fraction_1e-3": "… within 0.1 %",
 }
-REFERENCES = ("held", "lqr")  # costs from the same states, shown as a ratio where the optimum is known
-LEFT = "left_domain_fraction"
-KEPT = {"violated_fraction": "constraints violated, share of states", LEFT: "domain left, share of states"}  # if any
+REFERENCES = ("held", "lqr")  # reference costs, shown as a ratio if the optimum is known
+LEFT_DOMAIN = "left_domain_fraction"
+SHARES_IF_PRESENT = {
+    "violated_fraction": "constraints violated, share of states",
+    LEFT_DOMAIN: "domain left, share of states",
+}
 
 
 def evaluation_table(title: str, result: dict[str, Any]) -> Table:
-    """What a controller reaches, as evaluation.Evaluation.result has it."""
+    """The table of an Evaluation.result."""
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
         table.add_row(label, _entry(key, result[key]))
@@ -60,7 +63,7 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
 
 
 def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
-    """What several seeds reach, as experiment.over_seeds has it: mean, spread and both ends."""
+    """The table of several seeds, from experiment.over_seeds: mean, standard deviation, least and most."""
     seeds = result["seeds"]
     table = Table("measure", *(Column(name, no_wrap=True) for name in ("mean ± spread", "least (seed)", "most (seed)")))
     table.title = f"{title}\n{len(seeds)} seeds, {seeds[0]['samples']} unseen states of X₀ each"
@@ -76,11 +79,11 @@ def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
 
 
 def _rows(result: dict[str, Any]) -> dict[str, str]:
-    """The labels of what a result has; of a reference the ratio to the optimum, else its mean cost."""
+    """The labels of the rows of a result; reference costs as a ratio to the optimum, or as a mean if it is unknown."""
     known = result.get("regret", result["cost_ratio"]) is not None
     unknown = ("cost_mean",) if known else ("cost_ratio", "regret")
     left_out = {f"{name}_{key}" for name in REFERENCES for key in unknown}
-    labels = {**ROWS, **KEPT}
+    labels = {**ROWS, **SHARES_IF_PRESENT}
     if "regret" in result:
         left_out.add("cost_ratio")
         labels["value_error"] = "value error, mean |V(0, x₀) − J*| / spread of J*"
@@ -88,14 +91,14 @@ def _rows(result: dict[str, Any]) -> dict[str, str]:
 
 
 def _entry(key: str, value: float | None) -> str:
-    """A measure of a result as text; a reference without a number has left the finite ones."""
+    """Format a measure of a result; a reference cost without a number has diverged."""
     if value is None and key.startswith(REFERENCES):
         return DIVERGED
     return measured_or_not(key, value)
 
 
 def _caption(results: list[dict[str, Any]]) -> Text | None:
-    """What the optimum is of, and why some is missing: a sentence for each."""
+    """Sentences on the model of the optimum, and why some optima are missing."""
     notes = dict.fromkeys(result["no_optimum"] for result in results if "no_optimum" in result)
     if about := results[0].get("optimum_of"):
         notes = {f"The optimum is that of {about}": None, **notes}
@@ -103,11 +106,11 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
         notes["A plant in continuous time may pay less than that optimum: the steps overstate the cost"] = None
     notes |= {f"After T follows the law {result['after_T']}": None for result in results if "after_T" in result}
     caption = " ".join(f"{note.rstrip('.')}." for note in notes)
-    return Text(caption) if notes else None  # Text: a plain string's [oracle] would be read as markup
+    return Text(caption) if notes else None  # Text, because [oracle] in a string would be markup
 
 
 def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float]) -> Table:
-    """What a controller costs where its assumptions fail; of a family, in the task of one member."""
+    """The table of costs under disturbances; for a family, in the task of one member."""
     named = ", ".join(f"{name} = {value:g}" for name, value in member.items())
     title = f"{samples} states each" + f" of the member {named}" * bool(named)
     headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
@@ -122,7 +125,7 @@ def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[s
 
 
 def afterwards_table(rows: list[dict[str, Any]], samples: int) -> Table:
-    """Where closed loops go after T under each law, as afterwards.in_plain_data has it."""
+    """The table of distances after T under each law, from afterwards.in_plain_data."""
     columns = [Column(f"at {at['time']:g} s", justify="right") for at in rows[0]["distances"]]
     table = Table("beyond", *columns, title=f"what follows T: mean ‖x − x*‖ of {samples} closed loops")
     for row in rows:
@@ -133,12 +136,12 @@ def afterwards_table(rows: list[dict[str, Any]], samples: int) -> Table:
 
 
 def measured_or_not(key: str, value: float | None) -> str:
-    """A measure of an evaluation as text, a dash where it is not known."""
+    """Format a measure of an evaluation; a dash if it is unknown."""
     return "–" if value is None else measured(key, value)
 
 
 def measured(key: str, value: float) -> str:
-    """A measure of an evaluation as text: ratios with four decimals, shares in percent."""
+    """Format a measure of an evaluation: ratios with four decimals, shares in percent."""
     if key.endswith("cost_ratio"):
         return ratio(value)
     if key.endswith("regret"):

@@ -1,4 +1,4 @@
-"""State constraints h(x) ≤ 0: what no closed loop may enter."""
+"""State constraints h(x) ≤ 0."""
 
 import math
 from abc import ABC, abstractmethod
@@ -12,14 +12,14 @@ from lyapnet.base.types import State
 
 
 class Constraints(nn.Module, ABC):
-    """h(x) ≤ 0, component by component, at every time; where a component is positive, its constraint is violated.
+    """h(x) ≤ 0 in every component at every time; a positive component means that its constraint is violated.
 
-    A subclass writes `forward` with torch operations on tensors of any leading shape, smooth where h = 0, and each
-    component in such a unit that its margin is a small step.
+    A subclass implements `forward` with torch operations on tensors of any leading shape, smooth where h = 0. Each
+    component is scaled so that its margin is a small change.
     """
 
-    names: Sequence[str] = ()  # what each component asks for, in words
-    margin: float | Sequence[float] = 0.02  # of h, or of each h_j, within which training pays for coming close
+    names: Sequence[str] = ()  # a description of each component
+    margin: float | Sequence[float] = 0.02  # distance from h = 0, or for each h_j, at which the training penalty begins
 
     @abstractmethod
     def forward(self, x: State) -> Float[Tensor, "*batch k"]:
@@ -30,7 +30,7 @@ class Constraints(nn.Module, ABC):
         return self(x).amax(-1)
 
     def ignores(self, i: int, n: int) -> bool:
-        """Whether h does not depend on x_i, of n states: not a number in x_i makes nan of what depends on it."""
+        """Whether h does not depend on x_i, of n states, tested by h(x) with NaN as x_i."""
         numbers = [*self.buffers(), *self.parameters()]
         like = next((each for each in numbers if each.is_floating_point()), torch.zeros(()))
         x = 0.1 + 0.01 * torch.arange(n, dtype=torch.float64).sqrt()
@@ -39,17 +39,17 @@ class Constraints(nn.Module, ABC):
 
 
 class StateLimits(Constraints):
-    """h_j(x) = s_j (x_{i_j} − b_j) / scale_j: some states stay below or above limits.
+    """h_j(x) = s_j (x_{i_j} − b_j) / scale_j: upper and lower limits of some states.
 
     Args:
         states: i_j, indices of states.
-        limits: b_j, in their units.
+        limits: b_j, in units of the states.
         sides: s_j = 1 for an upper limit, −1 for a lower one.
-        scales: in the same units, what counts as 1.
-        names: of each, in words.
+        scales: scale_j, in units of the states.
+        names: a description of each limit.
 
     Raises:
-        ValueError: a scale is not positive, a limit not finite, or no state lies between two limits of one.
+        ValueError: a scale is not positive, a limit is not finite, or two limits of a state contradict each other.
     """
 
     states: Int[Tensor, " k"]
@@ -86,7 +86,7 @@ class StateLimits(Constraints):
 def _sides(
     states: Sequence[int], limits: Sequence[float], sides: Sequence[float]
 ) -> Iterator[tuple[int, float, float]]:
-    """(i, greatest lower limit, least upper one) of each state that has a limit."""
+    """(i, largest lower limit, smallest upper limit) of each state that has a limit."""
     for i in dict.fromkeys(states):
         own = [(side, limit) for j, limit, side in zip(states, limits, sides, strict=True) if j == i]
         below, above = ([limit for side, limit in own if (side > 0) is upper] for upper in (False, True))
@@ -94,19 +94,19 @@ def _sides(
 
 
 class Ball(Constraints):
-    """h(x) = ±½(1 − d²/r²), d the distance of some states from a centre: they stay outside (+) or inside (−) a ball.
+    """h(x) = ±½(1 − d²/r²): some states, at distance d from a centre, have to stay outside (+) or inside (−) a ball.
 
-    Close to its boundary it is how deep they are in it, or out of it, in units of r.
+    Near the boundary, h is the depth of the violation in units of r.
 
     Args:
-        states: indices of the states that the ball is in, (k,).
-        center: (k,), in their units.
+        states: indices of these states, (k,).
+        center: (k,), in units of the states.
         radius: r.
-        inside: whether they stay inside.
-        name: in words.
+        inside: whether they have to stay inside.
+        name: a description.
 
     Raises:
-        ValueError: r is not positive, or something not finite.
+        ValueError: r is not positive, or an entry is not finite.
     """
 
     states: Int[Tensor, " k"]
@@ -131,7 +131,7 @@ class Ball(Constraints):
 
 
 class AllOf(Constraints):
-    """Several constraints, one after the other.
+    """Several constraints, concatenated.
 
     Args:
         parts: at least one.
@@ -147,11 +147,11 @@ class AllOf(Constraints):
 
 
 class OfFirstStates(Constraints):
-    """Constraints of a system as those of a family of it, whose states are (x, p).
+    """Constraints on x, as constraints of a family with the states (x, p).
 
     Args:
-        constraints: of x.
-        n: how many states x has.
+        constraints: constraints on x.
+        n: number of states x.
     """
 
     constraints: Constraints
@@ -167,15 +167,15 @@ class OfFirstStates(Constraints):
 
 
 def names_of(constraints: Constraints | None) -> Sequence[str]:
-    """What each component of constraints asks for; nothing where there are none."""
+    """The descriptions of all components; empty without constraints."""
     return () if constraints is None else constraints.names
 
 
 def parts_of(constraints: Constraints | None) -> list[Constraints]:
-    """What constraints are made of, one after the other."""
+    """The elementary constraints of a composition, in order."""
     if isinstance(constraints, AllOf):
         return [each for part in constraints.parts for each in parts_of(part)]  # pyright: ignore[reportArgumentType]
     return [] if constraints is None else [constraints]
 
 
-CONSTRAINTS: dict[str, type[Constraints]] = {"listed": AllOf}  # what the other keys of the section list
+CONSTRAINTS: dict[str, type[Constraints]] = {"listed": AllOf}  # the other keys of the section list its parts

@@ -1,8 +1,8 @@
-"""Domains: the states at which f, g, q and φ are defined, found by asking them along each state, or declared.
+"""Domains: the states at which f, g, q and φ are defined, found by a search along each state, or declared.
 
-Beyond a border a logarithm, a root or a power is no number, and one such number makes a whole gradient one. So the
-functions of a task with a domain are asked at the nearest state just within it, where they and their slopes are finite,
-and whoever leaves pays for how far. A task whose functions are finite everywhere has no domain, and stays as it is.
+Beyond a border a logarithm, a root or a power is NaN, and a single NaN spoils a whole gradient. Therefore the functions
+of a task with a domain are evaluated at the nearest state just inside, where they and their slopes are finite, and
+leaving the domain costs a price that grows with the distance. A task without such borders has no domain.
 """
 
 import copy
@@ -19,19 +19,21 @@ from lyapnet.task.cost import Cost, MadeOfAnother, PenaltyCost, SmoothedCost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
 
-ROOM = 1e-9  # of a state's size: how far within its border functions are asked
-ROUNDINGS = 64  # of the precision that x has, where these are more
-SOFT = 1e-3  # of a state's size, from which on the price of being outside is proportional to how far
-SLACK = 1e-2  # of a state's size, by which a step may pass a border, at that price; beyond it the domain is left
-ROUNDED = 1e-6  # of a state's size, by which rounding may pass a border
-TRIED = 8  # states of X₀, from each of which a border has to be the same
-REACH, PLACES, HALVINGS = 8.0, 64, 60  # in sizes, how far borders are sought; in how many places; and then by halving
-BEYOND = (1e-6, 1e-3)  # sizes beyond a border at which a function is undefined still: a pole is no border
-OF_SYSTEM = ("f", "g", "dynamics", "inverse_mass")
+# Lengths are relative to a state's size, see `size_of`.
+INNER_MARGIN = 1e-9  # distance inside a border at which functions are evaluated
+ROUNDING_UNITS = 64  # the same in units of the machine precision of x, if that is more
+PRICE_SOFTNESS = 1e-3  # distance beyond a border at which the price changes from quadratic to linear
+SLACK = 1e-2  # distance by which a step may pass a border at that price; farther away the path counts as invalid
+BORDER_ROUNDING = 1e-6  # distance beyond a border that counts as rounding
+TEST_STATES = 8  # states of X₀ that must all have the same border
+SEARCH_REACH, SEARCH_PLACES = 8.0, 64  # distance of the search for borders; number of places on it
+HALVINGS = 60  # bisection steps that then locate a border
+TEST_DISTANCES = (1e-6, 1e-3)  # distances beyond a border at which a function must be undefined: excludes poles
+SYSTEM_FUNCTIONS = ("f", "g", "dynamics", "inverse_mass")  # methods that are evaluated inside the domain
 
 
 class Border(NamedTuple):
-    """Where a state ends: an entry of `domain` or `constraints` in a config, and why."""
+    """A border of a state: an entry of `domain` or `constraints` in a config, with the reason."""
 
     state: str
     side: str  # lower or upper
@@ -43,12 +45,12 @@ class Border(NamedTuple):
 
 
 class Domain:
-    """{x : lower ≤ x ≤ upper}, of which most bounds are infinite. Nothing in it changes.
+    """The immutable set {x : lower ≤ x ≤ upper}, where most bounds are infinite.
 
     Args:
-        names: of the states.
-        size: (n,), in their units: what of each counts as 1.
-        borders: at least one.
+        names: names of the states.
+        size: (n,), the unit of each state.
+        borders: at least one border.
     """
 
     lower: Float[Tensor, " n"]
@@ -73,68 +75,68 @@ class Domain:
         return "; ".join(map(str, self.borders))
 
     def narrowed(self, share: float) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """(lower, upper), each by a share of a state's size further within."""
+        """(lower, upper), moved inwards by a share of each state's size."""
         return self.lower + share * self.size, self.upper - share * self.size
 
     def nearest(self, x: State) -> State:
-        """The closest state just within, (*batch, n)."""
-        low, high = self.narrowed(max(ROOM, ROUNDINGS * torch.finfo(x.dtype).eps))
+        """The nearest state just inside the domain, (*batch, n)."""
+        low, high = self.narrowed(max(INNER_MARGIN, ROUNDING_UNITS * torch.finfo(x.dtype).eps))
         return x.clamp(low.to(x), high.to(x))
 
     def _outside(self, x: State) -> State:
-        """How far each state is outside, in sizes and with its sign; zero within."""
+        """The signed distance of each state from the domain, in units of its size; zero inside."""
         return (x - x.clamp(self.lower.to(x), self.upper.to(x))) / self.size.to(x)
 
     def price(self, x: State) -> PerState:
-        """√(d² + s²) − s at a distance d beyond the border, in sizes: zero within, ½d²/s close to it, d far away."""
+        """√(d² + s²) − s at a distance d from the domain: zero inside, about ½d²/s close to it, about d far away."""
         squared = (self._outside(x) ** 2).sum(-1)
-        return squared / (torch.sqrt(squared + SOFT**2) + SOFT)
+        return squared / (torch.sqrt(squared + PRICE_SOFTNESS**2) + PRICE_SOFTNESS)
 
     def left(self, x: StatePath, slack: float = SLACK) -> Bool[Tensor, "*batch"]:
-        """Whether a path (nodes, *batch, n) is outside at one of its nodes, by more than a share of a state's size."""
+        """Whether a path (nodes, *batch, n) is farther outside than `slack` at one of its nodes."""
         return (self._outside(x).abs() > slack).any(-1).any(0)
 
 
 def within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
-    """A copy of a system, of a class of the same name, whose f and g are asked at the nearest state of a domain."""
-    return _put_within(copy.deepcopy(system), domain)
+    """A copy of a system whose f and g are evaluated at the nearest state of a domain; its class has the same name."""
+    return _restrict(copy.deepcopy(system), domain)
 
 
-def _put_within(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
-    """The same object with a class of its own."""
+def _restrict(system: ControlAffineSystem, domain: Domain) -> ControlAffineSystem:
+    """Give a system a new subclass whose functions are evaluated inside the domain."""
 
     def at_nearest(function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
-        def asked(self: Any, x: State, *others: Any) -> Any:
+        def evaluate(self: Any, x: State, *others: Any) -> Any:
             return function(self, domain.nearest(x), *others)
 
-        return asked
+        return evaluate
 
     def reduced(self: Any, protocol: Any) -> tuple[Any, ...]:
-        """What copies and pickles are made of: the system without its domain, and the domain."""
+        """For copies and pickles: the system without its domain, and the domain."""
         plain = cls.__new__(cls)
         vars(plain).update(vars(self))
-        return _put_within, (plain, domain)
+        return _restrict, (plain, domain)
 
     cls = type(system)
-    functions = {name: at_nearest(getattr(cls, name)) for name in OF_SYSTEM if hasattr(cls, name)}
+    functions = {name: at_nearest(getattr(cls, name)) for name in SYSTEM_FUNCTIONS if hasattr(cls, name)}
     if cls.dynamics is ControlAffineSystem.dynamics:
-        functions.pop("dynamics")  # the sum of f and g, which ask there
-    said = {name: getattr(cls, name) for name in ("__module__", "__qualname__", "__doc__")}
-    own = {**functions, **said, "domain": domain, "__reduce_ex__": reduced}
+        functions.pop("dynamics")  # the sum of f and g, which are restricted already
+    texts = {name: getattr(cls, name) for name in ("__module__", "__qualname__", "__doc__")}
+    own = {**functions, **texts, "domain": domain, "__reduce_ex__": reduced}
     system.__class__ = type(cls.__name__, (cls,), own)
     return system
 
 
 class DomainCost(MadeOfAnother):
-    """Another cost, asked at the nearest state of a domain, and w · price(x) for each step that is spent outside.
+    """Another cost, evaluated at the nearest state of a domain, plus w · price(x) for each step outside.
 
-    The last state pays for one step too, for which it would stay. Within the domain it is the other cost.
+    The terminal cost includes the price of one step. Inside the domain it equals the other cost.
 
     Args:
-        cost: what is paid besides.
-        domain: of its states.
-        weight: w, in cost.
+        cost: the other cost.
+        domain: the domain.
+        weight: w, in units of cost.
         step: Δt, in s.
     """
 
@@ -168,36 +170,42 @@ class DomainCost(MadeOfAnother):
 
 
 def as_written(cost: Cost) -> Cost:
-    """The cost of a task without the prices that keep closed loops off constraints and in the domain, not rounded."""
+    """The original cost of a task: without penalties for constraints and domain, and without smoothing."""
     while isinstance(cost, PenaltyCost | DomainCost | SmoothedCost):
         cost = cost.cost
     return cost
 
 
 @torch.no_grad()
-def found_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, names: Sequence[str]) -> list[Border]:
-    """Where some function of a state has no finite value any more when one of its numbers alone is moved out of X₀.
+def find_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, names: Sequence[str]) -> list[Border]:
+    """The borders at which some function becomes non-finite when a single state component is moved out of X₀.
 
-    A border counts if it is the same from each of TRIED states of X₀, within rounding; that of √(x₁ + x₂) is none.
+    A border counts if it is the same from each of TEST_STATES states of X₀, up to rounding. √(x₁ + x₂), for example,
+    has no such border.
 
     Args:
-        functions: by the letters that messages have for them.
+        functions: symbol in messages ↦ function of the state.
         box: X₀, in float64.
-        names: of its states.
+        names: names of the states.
     """
-    x, size, n, every = box.sample(TRIED, torch.Generator().manual_seed(0)), size_of(box), box.dimension, [*functions]
-    i, side = torch.arange(n).repeat(2), torch.tensor([-1.0, 1.0]).to(x).repeat_interleave(n)  # the 2n ways out
+    x, size, n, every = (
+        box.sample(TEST_STATES, torch.Generator().manual_seed(0)),
+        size_of(box),
+        box.dimension,
+        [*functions],
+    )
+    i, side = torch.arange(n).repeat(2), torch.tensor([-1.0, 1.0]).to(x).repeat_interleave(n)  # 2n directions
     start, way = x[:, i].mT, (side * size[i])[:, None]
 
     def defined(names: Sequence[str], values: Tensor) -> Tensor:
-        """Whether functions are finite where the number i of the states of X₀ has other values (2n, TRIED, …)."""
-        own = x.reshape(1, TRIED, *[1] * (values.ndim - 2), n).expand(*values.shape, n)
+        """Whether functions are finite at the test states with given values (2n, TEST_STATES, …) of component i."""
+        own = x.reshape(1, TEST_STATES, *[1] * (values.ndim - 2), n).expand(*values.shape, n)
         chosen = i.reshape(-1, *[1] * values.ndim).expand(*values.shape, 1)
         states = own.scatter(-1, chosen, values[..., None]).reshape(-1, n)
         finite = [functions[name](states).reshape(len(states), -1).isfinite().all(-1) for name in names]
         return torch.stack(finite).all(0).reshape(values.shape)
 
-    shares = REACH * torch.arange(PLACES + 1).to(x) / PLACES
+    shares = SEARCH_REACH * torch.arange(SEARCH_PLACES + 1).to(x) / SEARCH_PLACES
     first = (~defined(every, start[..., None] + way[..., None] * shares)).int().argmax(-1)
     if not bool((first > 0).all(-1).any()):
         return []
@@ -207,32 +215,32 @@ def found_borders(functions: Mapping[str, Callable[[State], Tensor]], box: Box, 
         inside = defined(every, start + way * middle)
         low, high = torch.where(inside, middle, low), torch.where(inside, high, middle)
     border = start + way * low
-    beyond = border[..., None] + way[..., None] * torch.tensor(BEYOND).to(x)
-    same = (border - border[:, :1]).abs().amax(-1) <= ROOM * size[i]
+    beyond = border[..., None] + way[..., None] * torch.tensor(TEST_DISTANCES).to(x)
+    same = (border - border[:, :1]).abs().amax(-1) <= INNER_MARGIN * size[i]
     taken = (first > 0).all(-1) & same & ~defined(every, beyond).flatten(1).any(-1)
     ending = {name: ~defined([name], beyond).flatten(1).any(-1) for name in every}
     return [
         Border(
             names[int(i[k])],
             "lower" if side[k] < 0 else "upper",
-            _rounded(float(border[k, 0]), ROOM * float(size[i[k]])),
-            _because([name for name in every if ending[name][k]]),
+            _round_border(float(border[k, 0]), INNER_MARGIN * float(size[i[k]])),
+            _describe_functions([name for name in every if ending[name][k]]),
         )
         for k in torch.nonzero(taken).flatten().tolist()
     ]
 
 
 def size_of(box: Box) -> Float[Tensor, " n"]:
-    """How large the states of X₀ are; 1 where they are zero."""
+    """The largest |x_i| in X₀, or 1 if it is zero."""
     return box.magnitude.where(box.magnitude > 0, 1.0)
 
 
-def _rounded(value: float, room: float) -> float:
-    """A border found by halving as the number that is meant: 0, 1 or 0.25."""
+def _round_border(value: float, room: float) -> float:
+    """Round a border from bisection to the number that is meant, such as 0, 1 or 0.25."""
     return next(each for each in (0.0, float(f"{value:.6g}"), value) if abs(each - value) <= room)
 
 
-def _because(names: Sequence[str]) -> str:
-    """Of which functions a border is; of some together, where none ends by itself from every state."""
+def _describe_functions(names: Sequence[str]) -> str:
+    """Describe the functions that have a border; "something" if none of them has it from every state."""
     *others, last = names or ["something"]
     return f"where {', '.join(others)} and {last} are defined" if others else f"where {last} is defined"

@@ -1,7 +1,7 @@
-"""Families: one problem for every parameter in a range, as a problem whose parameters are states that stay.
+"""Families of problems: the parameters in a range become constant states.
 
-With p among the states, z = (x, p) and ṗ = 0, V(t, x, p) is a V(t, z) like any other: training, optima, evaluation and
-certificates of the family are those of one problem in n + k states.
+With z = (x, p) and ṗ = 0, V(t, x, p) is an ordinary V(t, z): training, optima, evaluation and certificates treat the
+family as one problem with n + k states.
 """
 
 import copy
@@ -21,20 +21,20 @@ from lyapnet.graphs.tracing import trace
 from lyapnet.task.cost import Cost
 from lyapnet.task.systems import ControlAffineSystem
 
-ALIKE = 1e-9  # relative: f and g of a member, by attributes and by its constructor
-PREFIX = "target_"
+MEMBER_TOLERANCE = 1e-9  # largest relative difference of f and g between a member and a newly constructed system
+PREFIX = "target_"  # of parameters that move the target instead of the dynamics
 
 
 class FamilySystem(ControlAffineSystem):
     """ẋ = f(x; p) + g(x; p)u and ṗ = 0, in the state z = (x, p).
 
-    A parameter of the dynamics is a number that the system keeps under the name of its constructor's argument and reads
-    in f and g; there it becomes a tensor (*batch,), one number for each state. Other parameters are carried along.
+    A parameter of the dynamics is an attribute of the system with the name of its constructor's argument, used in f and
+    g. In a family it becomes a tensor (*batch,), one number for each state. Other parameters do not enter f and g.
 
     Args:
         system: f and g.
-        names: of p, (k,).
-        units: of p.
+        names: names of p, (k,).
+        units: units of p.
     """
 
     def __init__(self, system: ControlAffineSystem, names: Sequence[str], units: Sequence[str]):
@@ -56,10 +56,10 @@ class FamilySystem(ControlAffineSystem):
         return z[..., : self.system.n], z[..., self.system.n :]
 
     def joined(self, x: Tensor, parameters: Mapping[str, Any]) -> Tensor:
-        """(x, p) of states and parameters by their names, each scalar or (*batch,).
+        """(x, p) from states, and parameters by name, each a scalar or (*batch,).
 
         Raises:
-            ValueError: other names than those of the family, or other shapes.
+            ValueError: names or shapes do not match the family.
         """
         names, n = [self.state_names[i] for i in self.constants], self.system.n
         if parameters.keys() != set(names):
@@ -67,10 +67,10 @@ class FamilySystem(ControlAffineSystem):
         if not x.ndim or x.shape[-1] != n:
             listed = ", ".join(self.system.state_names)
             raise ValueError(f"Expected x of shape (*batch, {n}), got {tuple(x.shape)}; the last axis holds {listed}.")
-        return torch.cat([x, torch.stack([_of_each(x, name, parameters[name]) for name in names], -1)], -1)
+        return torch.cat([x, torch.stack([_expand_parameter(x, name, parameters[name]) for name in names], -1)], -1)
 
     def member(self, p: Float[Tensor, "*batch k"]) -> ControlAffineSystem:
-        """The system with parameters (k,), or with those of each of a batch of states."""
+        """The system with parameters (k,), or with different ones for each of a batch of states."""
         return with_attributes(self.system, {name: p[..., i] for name, i in self.parameters_in_f.items()})
 
     def f(self, x: State) -> State:
@@ -87,7 +87,7 @@ class FamilySystem(ControlAffineSystem):
         return torch.cat([self.member(p).dynamics(x, u), torch.zeros_like(p)], -1)
 
     def inverse_mass(self, x: State) -> ControlMatrix:
-        """BᵀM(q; p)⁻¹B of each member, of a system that has one."""
+        """BᵀM(q; p)⁻¹B of each member, if the system has a mass matrix."""
         x, p = self.split(x)
         member: Any = self.member(p)
         return member.inverse_mass(x)
@@ -102,10 +102,10 @@ class FamilyCost(Cost):
     """The cost of each member: q(x − E(p − p̄)) and φ(x − E(p − p̄)), and R(x) or R(x; p).
 
     Args:
-        cost: q, R and φ at p̄, in x alone.
-        shift: E (n, k): how the target moves with p.
+        cost: q, R and φ at p̄, functions of x.
+        shift: E (n, k), the derivative of the target by p.
         center: p̄ (k,).
-        R: z ↦ (*batch, m, m), where it depends on p; None: that of the cost.
+        R: z ↦ (*batch, m, m), if it depends on p; None: R of the cost.
     """
 
     shift: Float[Tensor, "n k"]
@@ -137,8 +137,8 @@ class FamilyCost(Cost):
         return self.cost.R(x[..., : len(self.shift)]) if self.R_of_member is None else self.R_of_member(x)
 
 
-def _of_each(x: State, name: str, value: Any) -> PerState:
-    """The value of a parameter for each of a batch of states."""
+def _expand_parameter(x: State, name: str, value: Any) -> PerState:
+    """Expand the value of a parameter to a batch of states."""
     batch = tuple(x.shape[:-1])
     try:
         return torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(batch)
@@ -148,7 +148,7 @@ def _of_each(x: State, name: str, value: Any) -> PerState:
 
 
 def with_attributes(system: ControlAffineSystem, values: Mapping[str, Any]) -> ControlAffineSystem:
-    """A copy of a system that shares what it is made of, but for some of its numbers."""
+    """A shallow copy of a system with some attributes replaced."""
     member = copy.copy(system) if values else system
     for name, value in values.items():
         setattr(member, name, value)
@@ -161,39 +161,39 @@ def check_members(
     z: State,
     called: str = "parameters of a family",
 ) -> None:
-    """Hold f and g of a family, at some states (b, n + k), against systems that are built with their parameters.
+    """Compare f and g of a family at some states (b, n + k) with systems that are constructed with the parameters.
 
     Args:
-        build: a system from the values of the parameters in f.
-        called: what messages call the parameters.
+        build: values of the parameters in f ↦ system.
+        called: name of the parameters in messages.
 
     Raises:
-        UsageError: f or g reads no such number, or not it alone, or does not take it as a tensor.
+        UsageError: f and g do not use a parameter, use values derived from it, or do not accept it as a tensor.
     """
     names, cls = list(family.parameters_in_f), type(family.system).__name__
-    if unread := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
+    if unused := [name for name in names if not isinstance(getattr(family.system, name, None), int | float)]:
         known = [name for name, value in vars(family.system).items() if type(value) in (int, float)]
         raise UsageError(
             f"Expected {called} among the numbers that {cls} keeps ({', '.join(known) or 'none'}), got "
-            f"{unread[0]}; write self.{unread[0]} = {unread[0]} in its __init__, and read it in f and g."
+            f"{unused[0]}; write self.{unused[0]} = {unused[0]} in its __init__, and read it in f and g."
         )
     try:
         f, g = family.f(z), family.g(z)
-    except Exception as error:  # of any kind: f and g may be the user's
+    except Exception as error:  # f and g may be the user's
         raise UsageError(
             f"Expected {cls}.f and g that take {', '.join(names)} as a tensor, one number for each state, got "
             f"{one_line(error)[:160]}; read states as x[..., i], and write c + torch.zeros_like(x[..., 0]) for "
             "torch.full_like(x[..., 0], c)."
         ) from error
-    if unread := _unread(family, z):
+    if unused := _unused_parameters(family, z):
         raise UsageError(
-            f"Expected {cls}.f or g to read {unread[0]}, got the same for each; read self.{unread[0]}, or leave it out."
+            f"Expected {cls}.f or g to read {unused[0]}, got the same for each; read self.{unused[0]}, or leave it out."
         )
     for i, (x, p) in enumerate(zip(*family.split(z), strict=True)):
         member = build(_values(family, p)).to(z)
         for symbol, own, expected in (("f", f, member.f(x)), ("g", g, member.g(x))):
             got = own[i][: len(x)] if own.ndim > 1 and len(own) == len(z) else own
-            if got.shape != expected.shape or not torch.allclose(got, expected, ALIKE, ALIKE):
+            if got.shape != expected.shape or not torch.allclose(got, expected, MEMBER_TOLERANCE, MEMBER_TOLERANCE):
                 raise UsageError(
                     f"Expected {cls}.{symbol} to read {', '.join(names)} as self.{names[0]} and so on, a number for "
                     f"each state x[..., i], got another {symbol} than that of {cls} built with {p.tolist()}; what "
@@ -211,23 +211,23 @@ def _values(family: FamilySystem, p: Tensor) -> dict[str, float]:
 def _require_same_operations(
     family: FamilySystem, build: Callable[[Mapping[str, float]], ControlAffineSystem], z: State
 ) -> None:
-    """Refuse a family whose members are others than systems built with their parameters, at any state there is.
+    """Require that members equal newly constructed systems with the same parameters, at all states.
 
-    Two objects that hold the same are the same functions. What the constructor makes of its arguments beside the
-    parameters themselves, and f or g reads, shows as another operation or number in the trace.
+    Two objects with equal attributes are the same functions. If the constructor derives other attributes from the
+    parameters and f or g use them, the traces of member and new system differ in an operation or number.
     """
     low, high = family.split(torch.stack([z.amin(0), z.amax(0)]))[1]
-    share = torch.rand(BUILT, len(low), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(z)
-    compared = _Compared()
+    share = torch.rand(RANDOM_MEMBERS, len(low), generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(z)
+    compared = _ComparisonRecorder()
     build({name: compared.number(value) for name, value in _values(family, (low + high) / 2).items()})
     before, traced = state_of({"": family.system}), 0
     for p in [low, high, *compared.beside(low, high), *(low + (high - low) * share)]:
         values = _values(family, p)
         built, member = build(values).to(z), with_attributes(family.system, values).to(z)
         derived = differences(state_of({"self": member}), state_of({"self": built}))
-        if derived and traced < TRACED:
+        if derived and traced < MAX_TRACES:
             traced += 1
-            if _operations(member, values, z) != _operations(built, values, z):
+            if _traced_operations(member, values, z) != _traced_operations(built, values, z):
                 raise UsageError(
                     f"Expected {type(built).__name__}.f and g to read no more of {', '.join(values)} than self."
                     f"{next(iter(values))} and so on, got others than those of {type(built).__name__} built with "
@@ -240,19 +240,19 @@ def _require_same_operations(
         )
 
 
-BUILT = 32  # members at random that are held against what the constructor builds, beside those at the ends and at jumps
-TRACED = 4  # how many of their f and g are compared as graphs, where the constructor makes more of its arguments
+RANDOM_MEMBERS = 32  # random members that are checked, besides those at the ends of ranges and at comparisons
+MAX_TRACES = 4  # largest number of members whose traces are compared
 
 
-class _Compared(list[float]):
-    """The numbers that a constructor compares its arguments with: at each of them it may do something else."""
+class _ComparisonRecorder(list[float]):
+    """The numbers with which a constructor compares its arguments, where its behaviour may change."""
 
     def number(self, value: float) -> float:
-        """The value, as a number that notes what it is compared with."""
+        """The value as a float that records the numbers it is compared with."""
         met = self
 
-        class Noting(float):
-            """A number that notes what it is compared with."""
+        class RecordingFloat(float):
+            """A float that records the numbers it is compared with."""
 
         for sign in ("__lt__", "__le__", "__gt__", "__ge__", "__eq__", "__ne__"):
 
@@ -261,12 +261,12 @@ class _Compared(list[float]):
                     met.append(float(other))
                 return getattr(float(one), sign)(other)
 
-            setattr(Noting, sign, compare)
-        Noting.__hash__ = float.__hash__
-        return Noting(value)
+            setattr(RecordingFloat, sign, compare)
+        RecordingFloat.__hash__ = float.__hash__
+        return RecordingFloat(value)
 
     def beside(self, low: Tensor, high: Tensor) -> list[Tensor]:
-        """Parameters with one of them at such a number, or on either side of it, within a box."""
+        """Parameters in a box with one component at a recorded number or close to it on either side."""
         found = list[Tensor]()
         for axis, (least, greatest) in enumerate(zip(low.tolist(), high.tolist(), strict=True)):
             for value in {met + step * (greatest - least) for met in self for step in (-1e-3, 0.0, 1e-3)}:
@@ -276,9 +276,11 @@ class _Compared(list[float]):
         return found
 
 
-def _operations(system: ControlAffineSystem, values: Mapping[str, float], z: State) -> Any:
-    """f, g and all that a problem asks of a system as operators and numbers, of parameters as numbers and as tensors;
-    None where they have no trace, as no certificate has."""
+def _traced_operations(system: ControlAffineSystem, values: Mapping[str, float], z: State) -> Any:
+    """The traced operators and constants of a system's functions, with parameters as numbers and as tensors.
+
+    None if they cannot be traced; certificates are then impossible too.
+    """
     like = z[0, : system.n]
 
     def asked(x: Tensor, u: Tensor, *p: Tensor) -> tuple[Tensor, ...]:
@@ -289,13 +291,13 @@ def _operations(system: ControlAffineSystem, values: Mapping[str, float], z: Sta
     try:
         p = torch.tensor([*values.values()]).to(z)
         graphs = [trace(asked, [like, like.new_zeros(system.m), *more]) for more in ([], [p])]
-    except Exception:  # of any kind: f and g may be the user's
+    except Exception:  # f and g may be the user's
         return None
     return [(str(graph.graph), state_of({"": dict(graph.named_buffers())})) for graph in graphs]
 
 
-def _unread(family: FamilySystem, z: State) -> list[str]:
-    """The parameters that neither f nor g reads."""
+def _unused_parameters(family: FamilySystem, z: State) -> list[str]:
+    """The parameters on which neither f nor g depends."""
     x, p = family.split(z)
     with torch.enable_grad():
         read = {name: p[:, k].clone().requires_grad_() for name, k in family.parameters_in_f.items()}

@@ -1,4 +1,4 @@
-"""Time in steps: the grid of the horizon, and the explicit Runge–Kutta methods that take its steps."""
+"""The time grid of the horizon, and the explicit Runge–Kutta methods of its steps."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ class Horizon:
     """N steps of Δt seconds; T = NΔt.
 
     Args:
-        method: of a step with u held over it, a key of TABLEAUX.
-        stationary: whether the task has no end, so that V is a function of the state alone, and φ stands for what comes
+        method: integrator of a step with u held, a key of TABLEAUX.
+        stationary: whether the task has an infinite horizon: V is a function of the state alone, and φ is the cost
             after T.
 
     Raises:
@@ -64,6 +64,6 @@ class Horizon:
 
 
 def weighted_sum(weights: Sequence[float], tensors: Sequence[Tensor]) -> Tensor:
-    """Σ w_i y_i over the weights that are not zero."""
+    """Σ w_i y_i over the nonzero weights."""
     terms = [y if w == 1 else w * y for w, y in zip(weights, tensors, strict=True) if w]
     return sum(terms[1:], start=terms[0])

@@ -1,4 +1,4 @@
-"""Operating points: states that a control holds, f(x*) + g(x*)u* = 0, of which some components are given."""
+"""Operating points: states x* that a control u* holds, f(x*) + g(x*)u* = 0, with some components given."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -11,41 +11,43 @@ from lyapnet.base.types import Control, State
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
-HELD = 1e-9  # rates of a state that is held, in units of the rates seen on X₀
-STARTS = 8  # states of X₀ from which points are sought, as many of a box twice as wide, and of one ten times as wide
-SEEN = 64  # states of X₀ at which rates are looked at
-PULL, OF_CONTROLS = 1e-3, 1e-2  # weight of the distance from X₀'s centre against rates, and that of controls in it
-SAME = 1e-6  # distance, in units of X₀, of points that are the same one
-NOTHING = 1e-12  # in their units, of components that are 0 but for rounding
-STEPS = 40  # of Newton's method
-SMALL, SMALLEST = 1e-2, 1e-3  # of X₀'s extent: the largest move for a written digit, and one that is always made
+HELD = 1e-9  # largest rate of a held state, in units of the rates on X₀
+INITIAL_GUESSES = 8  # initial states in X₀, and as many in a box twice as wide and in one ten times as wide
+RATE_STATES = 64  # states of X₀ that give the units of the rates
+CENTRE_WEIGHT = 1e-3  # weight of the distance from X₀'s centre, relative to the rates, in the least squares problem
+CONTROL_WEIGHT = 1e-2  # weight of the controls in that distance
+SAME_POINT_DISTANCE = 1e-6  # distance below which two points count as equal, in units of X₀
+ZERO_TOLERANCE = 1e-12  # components below this count as zero, in their units
+MAX_STEPS = 40  # iterations of Newton's method
+MAX_ROUNDING_MOVE = 1e-2  # largest change of a given component that counts as rounding, in units of X₀'s extent
+ALWAYS_ALLOWED_MOVE = 1e-3  # change that always counts as rounding, in units of X₀'s extent
 
 
 class OperatingPoint(NamedTuple):
-    """A state that a control holds."""
+    """A state and the control that holds it."""
 
     x: State  # x*, (n,)
     u: Control  # u*, (m,)
-    rate: State  # what is left of ẋ, (n,), in units of the rates seen on X₀
-    admitted: bool  # whether x* and u* keep to their limits
+    rate: State  # remaining ẋ, (n,), in units of the rates on X₀
+    admitted: bool  # whether x* and u* are within their limits
 
     @property
     def held(self) -> bool:
-        """Whether ẋ vanishes up to rounding."""
+        """Whether ẋ is zero up to rounding."""
         return bool(self.rate.abs().max() <= HELD)
 
 
 class OperatingPoints:
-    """The search for operating points of a system about X₀.
+    """The search for operating points of a system near X₀.
 
-    States count in units of X₀'s extents (where it has none, of the state itself, or 1), rates in units of the largest
-    seen on X₀, and controls in those of their limits, or of what holds states of X₀.
+    States are in units of X₀'s extents (if zero, of the state itself, or 1), rates in units of the largest on X₀, and
+    controls in units of their limits, or of the controls that hold states of X₀.
 
     Args:
         system: f and g, in float64.
         controls: U.
-        initial_states: X₀, near whose centre points are sought.
-        state_limits: least and greatest values of states, (n,) each; None: there are none.
+        initial_states: X₀; points near its centre are preferred.
+        state_limits: smallest and largest values of states, (n,) each; None: there are none.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class OperatingPoints:
         if controls.limits is not None:
             self.low, self.high = (side.double().expand(system.m).clone() for side in controls.limits)
         with torch.no_grad():
-            x = initial_states.sample(SEEN, torch.Generator().manual_seed(0)).double()
+            x = initial_states.sample(RATE_STATES, torch.Generator().manual_seed(0)).double()
             f, g = system.f(x).nan_to_num(0, 0, 0), system.g(x).nan_to_num(0, 0, 0)
             holding = (torch.linalg.pinv(g) @ f[..., None])[..., 0].abs().amax(0)
             limits = torch.stack([self.low.abs(), self.high.abs()]).nan_to_num(posinf=0).amax(0)
@@ -75,22 +77,22 @@ class OperatingPoints:
         self.rate = rate.where(rate > 0, 1.0)
 
     def held_by(self, x: State) -> OperatingPoint:
-        """A state with the control that holds it best: by least squares, of least norm."""
+        """A state with the control that holds it best: the least squares solution of least norm."""
         return self._point(x, self.system.holding_control(x)[0])
 
     def find(self, given: Mapping[int, float]) -> list[OperatingPoint]:
-        """The points with given components, the nearest to X₀'s centre first; those outside of U come last.
+        """The points with given components, sorted by distance from X₀'s centre; points outside the limits come last.
 
-        Where they are a curve or a surface it is the nearest one alone, by a control of least norm. The last resort is
-        one point at which rates are as small as they could be made.
+        If the points form a curve or a surface, only the nearest one with a control of least norm is returned. If there
+        is none, the point with the smallest rates is returned.
 
         Args:
-            given: the components of x* by their indices.
+            given: the given components of x* by their indices.
         """
         found, best = list[OperatingPoint](), list[OperatingPoint]()
-        for x in self._starts(given):
+        for x in self._initial_guesses(given):
             for bounded in (True, False):
-                point, isolated = self._solved(x, [*given], self.center, bounded)
+                point, isolated = self._solve_from(x, [*given], self.center, bounded)
                 if point is None:
                     continue
                 best.append(point)
@@ -106,21 +108,21 @@ class OperatingPoints:
         return sorted(found, key=lambda point: (not point.admitted, self.distance(point.x)))
 
     def nearest(self, x: State, moved: Sequence[int]) -> OperatingPoint | None:
-        """The nearest point to a state that differs from it in some components alone, if one is found from there."""
+        """The operating point nearest to a state that differs from it only in some components; None if not found."""
         kept = [i for i in range(self.system.n) if i not in moved]
         for bounded in (True, False):
-            point, _ = self._solved(x, kept, x, bounded)
+            point, _ = self._solve_from(x, kept, x, bounded)
             if point is not None and point.held:
                 return point
         return None
 
     def to_move(self, x: State, given: Mapping[int, float]) -> list[int]:
-        """The components of a state that is almost held to move, so that it is: few, and not those written shortly.
+        """The components of an almost held state that should change so that it is held: few ones, with many digits.
 
-        They are those of the least Σ |Δx_i| over the extents, to first order; a component that is given with d digits
-        counts 10⁻ᵈ of that, as 15 is rather meant exactly than 0.4541 is, and one that is not given nothing.
+        They minimise Σ w_i |Δx_i| / extent_i to first order, a linear program with a sparse solution. The weight w_i is
+        10⁻ᵈ for a component given with d digits, because 15 is probably exact and 0.4541 rounded, and 0 if not given.
         """
-        from scipy.optimize import linprog  # loaded where it is asked for: it takes a quarter of a second
+        from scipy.optimize import linprog  # imported here because it takes 0.25 s
 
         n, m = self.system.n, self.system.m
         u = self.system.holding_control(x)[0]
@@ -137,33 +139,37 @@ class OperatingPoints:
         return [i for i in range(n) if i not in given or move[i] > 1e-14 * max(1.0, move.max())]
 
     def is_rounding(self, given: Mapping[int, float], after: State) -> bool:
-        """Whether given components moved no further than rounding would: half a unit of the last digit written, but
-        little of X₀'s extent."""
+        """Whether given components changed by no more than rounding: half a unit of their last digit, and little of X₀.
+
+        A component with one digit may only change by ALWAYS_ALLOWED_MOVE.
+        """
         for i, number in given.items():
             extent = float(self.extent[i])
             written = 0.5 * _last_digit(number) if _digits(number) > 1 else 0.0
-            if abs(float(after[i]) - number) > max(min(written, SMALL * extent), SMALLEST * extent):
+            if abs(float(after[i]) - number) > max(
+                min(written, MAX_ROUNDING_MOVE * extent), ALWAYS_ALLOWED_MOVE * extent
+            ):
                 return False
         return True
 
     def distance(self, x: State) -> float:
-        """That of a state from X₀'s centre, in units of X₀'s extents; angles count from the nearest turn."""
-        return float(self._apart(x, self.center).norm())
+        """The distance of a state from X₀'s centre, in units of X₀'s extents; angles modulo 2π."""
+        return float(self._difference(x, self.center).norm())
 
-    def _apart(self, x: State, y: State) -> Tensor:
+    def _difference(self, x: State, y: State) -> Tensor:
         apart = x - y
         for i in self.system.angles:
             apart[i] -= 2 * torch.pi * torch.round(apart[i] / (2 * torch.pi))
         return apart / self.extent
 
     def _same(self, one: OperatingPoint, other: OperatingPoint) -> bool:
-        apart = torch.cat([self._apart(one.x, other.x), (one.u - other.u) / self.control])
-        return bool(apart.abs().max() <= SAME)
+        apart = torch.cat([self._difference(one.x, other.x), (one.u - other.u) / self.control])
+        return bool(apart.abs().max() <= SAME_POINT_DISTANCE)
 
-    def _starts(self, given: Mapping[int, float]) -> Iterator[State]:
+    def _initial_guesses(self, given: Mapping[int, float]) -> Iterator[State]:
         generator = torch.Generator().manual_seed(0)
-        inside = self.box.sample(STARTS - 1, generator).double()
-        unit = 2 * torch.rand(2, STARTS, self.system.n, generator=generator, dtype=torch.float64) - 1
+        inside = self.box.sample(INITIAL_GUESSES - 1, generator).double()
+        unit = 2 * torch.rand(2, INITIAL_GUESSES, self.system.n, generator=generator, dtype=torch.float64) - 1
         x = torch.cat(
             [
                 self.center[None],
@@ -184,10 +190,10 @@ class OperatingPoints:
         return OperatingPoint(x.detach(), u.detach() + 0.0, rate, bool(self.controls.contains(u)) and all(within))
 
     def _rates(self, x: State, u: Control) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """ẋ and its slopes by x and by u, with ẋ, x and u in their units."""
+        """ẋ and its Jacobians in x and u, all in scaled units."""
         n = self.system.n
         with torch.enable_grad():
-            copies = x.detach().expand(n, n).clone().requires_grad_()  # all rows of the Jacobian in one sweep
+            copies = x.detach().expand(n, n).clone().requires_grad_()  # all rows of the Jacobian in one backward pass
             g = self.system.g(copies)
             rate = self.system.f(copies) + (g @ u.detach()[:, None])[..., 0]
             by_x = torch.zeros(n, n, dtype=torch.float64)
@@ -196,10 +202,10 @@ class OperatingPoints:
         by_x, by_u = by_x * self.extent / self.rate[:, None], g[0].detach() * self.control / self.rate[:, None]
         return (rate[0].detach() / self.rate).numpy(), by_x.numpy(), by_u.numpy()
 
-    def _solved(
+    def _solve_from(
         self, start: State, kept: Sequence[int], about: State, bounded: bool
     ) -> tuple[OperatingPoint | None, bool]:
-        """The point that is found from a state, some of whose components are kept, and whether it is isolated."""
+        """The point found from an initial state with some components fixed, and whether it is isolated."""
         equations = _Equations(self, start, kept, about, bounded)
         try:
             y = equations.solve()
@@ -209,7 +215,7 @@ class OperatingPoints:
 
 
 class _Equations:
-    """f(x) + g(x)u = 0 in the free components y of (x, u), in their units."""
+    """The equations f(x) + g(x)u = 0 in the scaled free components y of (x, u)."""
 
     def __init__(self, search: OperatingPoints, start: State, kept: Sequence[int], about: State, bounded: bool):
         n, m = search.system.n, search.system.m
@@ -224,10 +230,10 @@ class _Equations:
         self.units, self.low, self.high = units.numpy(), (low / units).numpy(), (high / units).numpy()
         self.center = torch.cat([about[self.free], torch.zeros(m, dtype=torch.float64)]).numpy() / self.units
         self.center = self.center.clip(self.low, self.high)
-        self.weight = np.concatenate([np.ones(len(self.free)), np.full(m, OF_CONTROLS)])
+        self.weight = np.concatenate([np.ones(len(self.free)), np.full(m, CONTROL_WEIGHT)])
 
     def parts(self, y: np.ndarray) -> tuple[State, Control]:
-        """x and u; at a limit it is exactly there."""
+        """x and u from y; components at a limit are set to it exactly."""
         low, high = self.limits
         values = torch.from_numpy(y * self.units)
         values = low.where(torch.from_numpy(y <= self.low), high.where(torch.from_numpy(y >= self.high), values))
@@ -236,18 +242,18 @@ class _Equations:
         return x, values[len(self.free) :]
 
     def rates(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """ẋ, and its slope by y."""
+        """ẋ and its Jacobian in y."""
         rate, by_x, by_u = self.search._rates(*self.parts(y))
         return rate, np.concatenate([by_x[:, self.free], by_u], 1)
 
     def solve(self) -> np.ndarray:
-        """The solution nearest to the centre, from the start on; whether it is one is for others to see."""
+        """Search for the solution nearest to the centre; the result need not be a solution."""
         from scipy.optimize import least_squares
 
         search = self.search
         u = search.system.holding_control(self.start)[0].nan_to_num(0, 0, 0)
         y = np.concatenate([self.start[self.free].numpy(), u.numpy()]) / self.units
-        pull = np.diag(PULL * self.weight)
+        pull = np.diag(CENTRE_WEIGHT * self.weight)
 
         def residual(y: np.ndarray) -> np.ndarray:
             return np.concatenate([self.rates(y)[0], pull @ (y - self.center)])
@@ -255,33 +261,33 @@ class _Equations:
         def slope(y: np.ndarray) -> np.ndarray:
             return np.concatenate([self.rates(y)[1], pull])
 
-        bounds = (np.minimum(self.low, self.high - 1e-9), self.high)  # a control that is fixed needs some room
-        jac: Any = slope  # which its annotations do not know
-        y = least_squares(residual, y.clip(*bounds), jac, bounds, max_nfev=STEPS).x
-        return self._with_zeros(self._exact(self._nearest(self._exact(self._turned_back(y)))))
+        bounds = (np.minimum(self.low, self.high - 1e-9), self.high)  # least_squares requires lower < upper
+        jac: Any = slope  # missing in SciPy's annotations
+        y = least_squares(residual, y.clip(*bounds), jac, bounds, max_nfev=MAX_STEPS).x
+        return self._clear_rounding(self._newton(self._move_to_nearest(self._newton(self._unwind_angles(y)))))
 
-    def _turned_back(self, y: np.ndarray) -> np.ndarray:
-        """With free angles by the turn that is nearest to the centre, where limits admit that."""
+    def _unwind_angles(self, y: np.ndarray) -> np.ndarray:
+        """Move free angles by multiples of 2π to be nearest to the centre, if the limits admit it."""
         turn = np.array([2 * np.pi if i in self.search.system.angles else np.inf for i in self.free])
         turn = np.concatenate([turn, np.full(len(y) - len(turn), np.inf)]) / self.units
         turns = np.round((y - self.center) / turn)
         back = y - np.where(turns == 0, 0.0, turn) * turns
         return np.where((back >= self.low) & (back <= self.high), back, y)
 
-    def _with_zeros(self, y: np.ndarray) -> np.ndarray:
-        """With zeros in the place of what is zero but for rounding."""
-        zeros = np.where(np.abs(y) <= NOTHING, 0.0, y)
+    def _clear_rounding(self, y: np.ndarray) -> np.ndarray:
+        """Set components to zero that are zero up to rounding, unless that increases the rates."""
+        zeros = np.where(np.abs(y) <= ZERO_TOLERANCE, 0.0, y)
         before, after = (float(np.abs(self.rates(each)[0]).max()) for each in (y, zeros))
-        return zeros if after <= max(before, NOTHING) else y
+        return zeros if after <= max(before, ZERO_TOLERANCE) else y
 
-    def _inner(self, y: np.ndarray) -> np.ndarray:
-        """Which components are at no limit."""
+    def _is_free(self, y: np.ndarray) -> np.ndarray:
+        """Which components are not at a limit."""
         return (y > self.low + 1e-7) & (y < self.high - 1e-7)
 
-    def _exact(self, y: np.ndarray) -> np.ndarray:
-        """Newton's method, each step of least weighted norm, until rates fall no more."""
+    def _newton(self, y: np.ndarray) -> np.ndarray:
+        """Newton's method with steps of least weighted norm, until the rates stop decreasing."""
         rate, slope = self.rates(y)
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             after = self._step(y, slope, -rate, y)
             left, slope = self.rates(after)
             if not np.abs(left).max() < np.abs(rate).max():
@@ -289,10 +295,10 @@ class _Equations:
             y, rate = after, left
         return y
 
-    def _nearest(self, y: np.ndarray) -> np.ndarray:
-        """The solution nearest to the centre: the nearest of the tangent, over and over, as long as that settles."""
+    def _move_to_nearest(self, y: np.ndarray) -> np.ndarray:
+        """Iterate to the solution nearest to the centre, each time in the tangent space, while the steps shrink."""
         change = np.inf
-        for _ in range(STEPS):
+        for _ in range(MAX_STEPS):
             rate, slope = self.rates(y)
             after = self._step(y, slope, slope @ (y - self.center) - rate, self.center)
             now = float(np.abs(after - y).max())
@@ -302,8 +308,8 @@ class _Equations:
         return y
 
     def _step(self, y: np.ndarray, slope: np.ndarray, right: np.ndarray, about: np.ndarray) -> np.ndarray:
-        """about + Δ, Δ of least weighted norm with slope Δ = right, but for components at a limit, which stay."""
-        inner = self._inner(y)
+        """about + Δ with Δ of least weighted norm such that slope Δ = right; components at a limit remain there."""
+        inner = self._is_free(y)
         right = right - slope[:, ~inner] @ (y - about)[~inner]
         scaled = slope[:, inner] / self.weight[inner]
         after = y.copy()
@@ -311,18 +317,18 @@ class _Equations:
         return after.clip(self.low, self.high)
 
     def isolated(self, y: np.ndarray) -> bool:
-        """Whether there is no curve of solutions through y."""
+        """Whether the solution y is isolated, so that no curve of solutions passes through it."""
         return int(np.linalg.matrix_rank(self.rates(y)[1], 1e-9)) == len(y)
 
 
 def _digits(number: float) -> int:
-    """Significant digits that a number is written with, at most 9: 1 of 0.3 and 200, 4 of 0.4541."""
+    """The number of significant digits, at most 9: 1 for 0.3 and 200, 4 for 0.4541."""
     written = f"{abs(number):.9g}".partition("e")[0].replace(".", "").strip("0")
     return max(1, len(written))
 
 
 def _last_digit(number: float) -> float:
-    """The unit of the last of these digits: 0.0001 of 0.4541."""
+    """The unit of the last significant digit: 0.0001 for 0.4541."""
     if not number:
         return 1.0
     return 10.0 ** (np.floor(np.log10(abs(number))) + 1 - _digits(number))

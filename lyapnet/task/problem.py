@@ -1,4 +1,4 @@
-"""The problem: everything that an optimum, a rollout, a certificate or an environment is about."""
+"""The optimal control problem, the common argument of optima, rollouts, certificates and environments."""
 
 import math
 from collections.abc import Sequence
@@ -15,21 +15,21 @@ from lyapnet.base.linear_algebra import apply, convex_or
 from lyapnet.base.types import Control, PerState, State
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
-from lyapnet.task.domain import Border, Domain, DomainCost, as_written, found_borders, size_of, within
+from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
-LOOKED = 200  # steps, along which it is seen whether a task has a goal
-TRIED = 64  # states at which functions of others are tried
-LIMITS = {"lower limits": -1, "upper limits": 1}  # in a record, with the sign of the infinity where there is none
-ALIKE = 1e-4  # of what is largest in a component: numbers that differ by no more are those of the same function
+GOAL_TEST_STEPS = 200  # largest number of steps in the test whether a task has a goal
+TRIED = 64  # states at which users' functions are tested
+LIMITS = {"lower limits": -1, "upper limits": 1}  # keys in a record ↦ sign of the infinity that means no limit
+RECORD_TOLERANCE = 1e-4  # relative to a component's largest entry: difference below which recorded numbers agree
 
 
 class Response(NamedTuple):
-    """One step with u held: F to first order in u, and ℓ to second."""
+    """One step with u held: F to first order in u, and ℓ to second order."""
 
-    x: State  # F(x, u), where it leads
+    x: State  # F(x, u), the next state
     by_control: Tensor  # F_u/Δt (*batch, n, m); with Euler g(x)
     slope: Control  # ℓ_u of the mean ℓ over the step
     curvature: Tensor  # ℓ_uu (*batch, m, m), symmetric positive definite; with Euler 2R
@@ -43,11 +43,11 @@ class Problem(nn.Module):
         cost: ℓ and φ.
         controls: U.
         initial_states: X₀.
-        horizon: T, its steps, and the method by which each is taken with u held.
+        horizon: T, its steps, and their integrator with u held.
         constraints: h; None: there are none.
 
     Raises:
-        ValueError: X₀, or a goal or rest of the cost, has another dimension than the system.
+        ValueError: the dimension of X₀, or of the cost's goal or rest, differs from that of the system.
     """
 
     system: ControlAffineSystem
@@ -86,7 +86,7 @@ class Problem(nn.Module):
 
     @property
     def goal(self) -> State:
-        """The state (n,) at which q and φ vanish; where there is none, the centre of X₀, as a state that is typical."""
+        """The state (n,) at which q and φ vanish; without a goal the centre of X₀, as a typical state."""
         like = self.initial_states.lower
         if not self.has_goal:
             return self.initial_states.center
@@ -94,29 +94,29 @@ class Problem(nn.Module):
 
     @property
     def has_goal(self) -> bool:
-        """Whether q and φ vanish at a state, the cost's goal or else the origin, and are nowhere negative."""
+        """Whether q and φ vanish at the cost's goal, or else at the origin, and are nowhere negative."""
         return not self.no_goal
 
     @property
     def no_goal(self) -> str:
-        """Why there is no goal; empty where there is one."""
+        """The reason why there is no goal; empty if there is one."""
         if "no_goal" not in self.findings:
             try:
                 own = copied(self)
                 cost = as_written(own.cost)
                 goal = torch.zeros_like(own.initial_states.lower) if cost.goal is None else cost.goal
                 self.findings["no_goal"] = reason_for_no_goal(cost, goal, own._typical_states())
-            except Exception:  # of any kind: a cost of the user's that fails, which `check` tells better
+            except Exception:  # a user's cost fails; `check` reports that
                 return ""
         return self.findings["no_goal"]
 
     @torch.no_grad()
     def _typical_states(self) -> State:
-        """States (b, n) of X₀, and where random controls that do not change lead from there, within LOOKED steps."""
+        """States (b, n) of X₀, and states reached from there by random constant controls in GOAL_TEST_STEPS steps."""
         generator = torch.Generator().manual_seed(0)
         x = self.initial_states.sample(TRIED, generator)
         u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
-        states, N = [x], min(self.horizon.steps, LOOKED)
+        states, N = [x], min(self.horizon.steps, GOAL_TEST_STEPS)
         for n in range(1, N + 1):
             x = self.step(x, u)[0]
             if n in (N // 2, N):
@@ -127,18 +127,18 @@ class Problem(nn.Module):
 
     @property
     def domain(self) -> Domain | None:
-        """The states at which f, g, q and φ are defined; None where those are all that there are, or nobody asked."""
+        """The states at which f, g, q and φ are defined; None if all are, or if no domain was determined."""
         domain = getattr(self.system, "domain", None)
         return domain if isinstance(domain, Domain) else None
 
     @property
     def rest(self) -> Control:
-        """The control (m,) that costs nothing: u*, zero where there is no target."""
+        """The control at rest u* (m,), which costs nothing; zero without a target."""
         rest, like = self.cost.rest, self.initial_states.lower
         return like.new_zeros(self.system.m) if rest is None else rest.to(like)
 
     def rates(self, x: State, u: Control) -> tuple[State, PerState]:
-        """The means of ẋ and of ℓ over one step from x with u held, by the method of the horizon."""
+        """The means of ẋ and ℓ over one step from x with u held, by the integrator of the horizon."""
         tableau, slopes, costs = TABLEAUX[self.horizon.method], [], []
         for row in tableau.a:
             X = x + self.horizon.dt * weighted_sum(row, slopes) if any(row) else x
@@ -147,15 +147,15 @@ class Problem(nn.Module):
         return weighted_sum(tableau.b, slopes), weighted_sum(tableau.b, costs)
 
     def step(self, x: State, u: Control) -> tuple[State, PerState]:
-        """(F(x, u), ∫ℓ): where one step with u held leads, and what it costs; with Euler (x + Δt(f + gu), Δt ℓ)."""
+        """(F(x, u), ∫ℓ), the next state and the cost of one step with u held; with Euler (x + Δt(f + gu), Δt ℓ)."""
         rate, cost = self.rates(x, u)
         return x + self.horizon.dt * rate, self.horizon.dt * cost
 
     def response(self, x: State, u: Control | None = None) -> Response:
-        """How one step from x answers to u.
+        """The derivatives of one step from x by u.
 
         Args:
-            u: where; None: u*, the control that costs nothing.
+            u: the control at which they are taken; None: u*, the control at rest.
         """
         if self.horizon.method == "euler":
             return self._euler_response(x, u)
@@ -163,7 +163,7 @@ class Problem(nn.Module):
         u = self.rest.expand(*x.shape[:-1], -1) if u is None else u
         with torch.enable_grad():
             u = u if recording and u.requires_grad else u.detach().requires_grad_()
-            # one copy of u for each component of ẋ: all rows of the Jacobian in one sweep
+            # one copy of u for each component of ẋ: all rows of the Jacobian in one backward pass
             copies = u.expand(n, *u.shape)
             rate = self.rates(x.expand(n, *x.shape), copies)[0]
             rows = (
@@ -172,11 +172,16 @@ class Problem(nn.Module):
             (by_control,) = torch.autograd.grad(rate, copies, rows, create_graph=recording)
             (slope,) = torch.autograd.grad(self.rates(x, u)[1].sum(), u, create_graph=True)
             bends = [torch.autograd.grad(s.sum(), u, create_graph=True)[0] for s in slope.unbind(-1)]
-        parts = x + self.horizon.dt * rate[0], by_control.movedim(0, -2), slope, self._convex(torch.stack(bends, -2), x)
+        parts = (
+            x + self.horizon.dt * rate[0],
+            by_control.movedim(0, -2),
+            slope,
+            self._convex_curvature(torch.stack(bends, -2), x),
+        )
         return Response(*(part if recording else part.detach() for part in parts))
 
-    def _convex(self, curvature: Tensor, x: State) -> Tensor:
-        """ℓ_uu, or 2R in its place where it is not well above zero."""
+    def _convex_curvature(self, curvature: Tensor, x: State) -> Tensor:
+        """ℓ_uu, or 2R if ℓ_uu is not clearly positive definite."""
         least = 2 * self.cost.R(x)
         return convex_or((curvature + curvature.mT) / 2, least, least)
 
@@ -190,7 +195,7 @@ class Problem(nn.Module):
         return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2)
 
     def replaced(self, **parts: Any) -> "Problem":
-        """The problem with some of its parts exchanged."""
+        """The problem with some of its parts replaced."""
         names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
         other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
         if parts.keys().isdisjoint(("cost", "system")):
@@ -200,14 +205,14 @@ class Problem(nn.Module):
         return other
 
     def in_steps(self, **changes: Any) -> "Problem":
-        """The problem in other steps: its horizon with some of steps, dt and method exchanged."""
+        """The problem with some of its horizon's steps, dt and method replaced."""
         return self.replaced(horizon=replace(self.horizon, **changes))
 
     def relaxed(self, weight: float = 0.0) -> "Problem":
-        """The problem that training solves, whose cost keeps closed loops off the constraints; itself without any.
+        """The problem that training solves, with a penalty for the constraints; the problem itself without constraints.
 
         Args:
-            weight: of the penalty, in cost per second at h = 0; training from a config finds its own.
+            weight: penalty weight, in cost per second at h = 0; training from a config chooses it.
         """
         if self.constraints is None:
             return self
@@ -215,19 +220,21 @@ class Problem(nn.Module):
         return self.replaced(cost=cost.to(self.initial_states.lower))
 
     def borders(self) -> list[Border]:
-        """Where f, g, q and φ end, each state by itself; none where they are finite everywhere."""
+        """The borders of each state beyond which f, g, q or φ are undefined; empty if they are finite everywhere."""
         own = copied(self)
         system, cost = own.system, own.cost
         functions = {"f": system.f, "g": system.g, "q": cost.state, "φ": cost.terminal}
         try:
-            return found_borders(functions, own.initial_states, system.state_names)
-        except Exception:  # of any kind: a function of the user's that refuses such states
+            return find_borders(functions, own.initial_states, system.state_names)
+        except Exception:  # a user's function may raise an error at such states
             return []
 
     @torch.no_grad()
     def within(self, borders: Sequence[Border]) -> "Problem":
-        """The problem in the domain between some borders: beyond them its functions are those of the nearest state just
-        within, and each step that is spent there costs about as much as a closed loop, in units of a state's size.
+        """The problem with the domain between some borders.
+
+        Beyond them functions are evaluated at the nearest state just inside, and a step at a distance of a state's size
+        costs about as much as a whole closed loop.
         """
         if not borders:
             return self
@@ -240,10 +247,10 @@ class Problem(nn.Module):
         return self.replaced(system=within(self.system, domain), cost=cost.to(box.lower))
 
     def check(self) -> None:
-        """Hold f, g, the cost and the controls against their contracts on states of X₀, in float64.
+        """Check the contracts of f, g, the cost and the controls on states of X₀, in float64.
 
         Raises:
-            UsageError: naming what is wrong, and where.
+            UsageError: a contract is broken; says which one, and where.
         """
         own = copied(self)
         system, cost, n, m = own.system, own.cost, own.system.n, own.system.m
@@ -278,12 +285,12 @@ class Problem(nn.Module):
 
     @property
     def parts(self) -> dict[str, nn.Module]:
-        """The parts that others may have written, by what messages call them."""
+        """The parts that users may have written, by their names in messages."""
         parts = (self.system, self.cost, self.controls, self.constraints)
         return {type(part).__name__: part for part in parts if part is not None}
 
     def call(self, x: State) -> None:
-        """Compute all that its parts have to say of some states, for what that leaves behind."""
+        """Call all functions of the parts at some states, to detect side effects."""
         system, cost = self.system, self.cost
         R, u = cost.R(x), torch.ones_like(x[..., :1]).expand(*x.shape[:-1], system.m)
         u = self.controls.project(self.controls.minimise(R, u))
@@ -292,7 +299,7 @@ class Problem(nn.Module):
             self.constraints(x)
 
     def _check_constraints(self, x: State) -> None:
-        """Hold h against its contract, and some states of X₀ against h."""
+        """Check the contract of h, and that states of X₀ satisfy h ≤ 0."""
         if self.constraints is None:
             return
         constraints, name = self.constraints, type(self.constraints).__name__
@@ -310,10 +317,10 @@ class Problem(nn.Module):
             )
 
     def check_value_function(self, V: nn.Module) -> None:
-        """Hold V and its V_x against their contracts at times and states of the problem, in float64.
+        """Check the contracts of V and V_x at times and states of the problem, in float64.
 
         Raises:
-            UsageError: naming what is wrong, and where.
+            UsageError: a contract is broken; says which one, and where.
         """
         name, generator = type(V).__name__, torch.Generator().manual_seed(0)
         own: Any = copied(V).eval()
@@ -340,19 +347,19 @@ class Problem(nn.Module):
             )
 
     def record(self) -> dict[str, list[Any]]:
-        """What a checkpoint keeps of its problem, as plain data: state names; f, g, the cost and U in numbers.
+        """Plain data that identifies the problem in a checkpoint: state names, and values of f, g, the cost and U.
 
-        They are evaluated in float64 at 3 fixed states of X₀. Where X₀ is thin they are apart nevertheless: friction
-        counts for those who start at rest too.
+        They are evaluated in float64 at 3 fixed states of X₀. Components that are fixed in X₀ are varied too, so that,
+        for example, friction is recorded even if all initial velocities are zero.
         """
         own = copied(self)
         box, m = own.initial_states, own.system.m
-        cost = as_written(own.cost)  # what keeps closed loops off constraints, and in a domain, is lyapnet's own
+        cost = as_written(own.cost)  # without the penalties that lyapnet adds
         generator = torch.Generator().manual_seed(0)
         x = box.sample(3, generator)
         thin = torch.where(box.widths > 0, 0.0, torch.where(box.center == 0, 1.0, box.center.abs()))
         x = x + 0.1 * thin * torch.rand(x.shape, generator=generator, dtype=x.dtype)
-        b = torch.tensor([[1e4], [-1e4], [1.0]], dtype=x.dtype).expand(-1, m)  # which a bounded set clips at its bounds
+        b = torch.tensor([[1e4], [-1e4], [1.0]], dtype=x.dtype).expand(-1, m)  # beyond the limits of bounded sets
         with torch.no_grad():
             numbers = {
                 "x": x, "f": own.system.f(x), "g": own.system.g(x), "q": cost.state(x), "R": cost.R(x),
@@ -368,9 +375,9 @@ class Problem(nn.Module):
         return {"state names": list(own.system.state_names)} | {name: v.tolist() for name, v in numbers.items()}
 
     def differences(self, record: Any) -> list[str]:
-        """The parts in which the problem of a record is another one; none where there is no record for this X₀."""
+        """The parts in which the problem differs from a record; empty if there is no record for this X₀."""
         own = self.record()
-        if not isinstance(record, dict) or not _alike(record.get("x"), own.pop("x")):
+        if not isinstance(record, dict) or not _agree(record.get("x"), own.pop("x")):
             return []
         m = self.system.m
         unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
@@ -378,19 +385,19 @@ class Problem(nn.Module):
             own = {"u*": unsaid["u*"], **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}
-        return [name for name, value in own.items() if not _alike(record.get(name, unsaid.get(name)), value)]
+        return [name for name, value in own.items() if not _agree(record.get(name, unsaid.get(name)), value)]
 
 
-def _alike(recorded: Any, own: list[Any]) -> bool:
-    """Whether two records of the same hold equal names, or equal numbers up to rounding."""
+def _agree(recorded: Any, own: list[Any]) -> bool:
+    """Whether two recorded entries have equal names, or equal numbers up to rounding."""
     if isinstance(own[0], str):
         return recorded == own
     try:
         one, other = (torch.tensor(numbers, dtype=torch.float64) for numbers in (recorded, own))
-    except Exception:  # of any kind: what was recorded comes from a file
+    except Exception:  # the record comes from a file
         return False
     if one.shape != other.shape:
         return False
     size = other.nan_to_num(0.0, 0.0, 0.0).abs()
-    tolerance = ALIKE * size.amax(0) + 1e-7 * size.max()  # a component that cancels has the rounding of its terms
+    tolerance = RECORD_TOLERANCE * size.amax(0) + 1e-7 * size.max()  # the rounding of terms that cancel
     return bool(((one == other) | (one.isnan() & other.isnan()) | ((one - other).abs() <= tolerance)).all())

@@ -74,7 +74,7 @@ class Box(nn.Module):
         return torch.maximum((self.lower - point).abs(), (self.upper - point).abs())
 
     def corners(self, axes: int = 12) -> State:
-        """The corners; those along so many of its axes, the others at the centre, where it has more."""
+        """The corners along the first `axes` free axes; further components are at the centre."""
         free = torch.nonzero(self.widths > 0).flatten()[:axes]
         found = self.center.repeat(2 ** len(free), 1)
         for k, i in enumerate(free):
@@ -83,7 +83,7 @@ class Box(nn.Module):
         return found
 
     def ends(self, count: int) -> State:
-        """`count` of its corners, over and over where it has fewer."""
+        """`count` corners, repeated if the box has fewer."""
         corners = self.corners(max(1, count.bit_length() - 1))
         return corners[torch.arange(count) % len(corners)]
 
@@ -91,11 +91,10 @@ class Box(nn.Module):
         return f"{self.lower.tolist()}, {self.upper.tolist()}"
 
     def sample(self, count: int, generator: torch.Generator | None = None) -> State:
-        """`count` states drawn uniformly and independently; on a CPU generator whatever the box's device,
-        so that a seed names the same states everywhere."""
+        """`count` independent uniform states, drawn on the CPU so that a seed gives the same states on every device."""
         unit = torch.rand(count, self.dimension, generator=generator, dtype=torch.float64)
         x = self.lower + self.widths * unit.to(self.lower)
-        return torch.minimum(x, self.upper)  # rounding may pass the upper bound, never the lower one
+        return torch.minimum(x, self.upper)  # rounding may exceed the upper bound, never the lower one
 
     def contains(self, x: State) -> Bool[Tensor, "*batch"]:
         """Whether each state lies in the closed box."""
@@ -103,20 +102,20 @@ class Box(nn.Module):
 
 
 class ControlSet(nn.Module, ABC):
-    """U ⊂ ℝᵐ, the controls that a problem admits: closed and convex.
+    """U ⊂ ℝᵐ, the admissible controls, a closed convex set.
 
-    A subclass writes its three methods with torch operations on tensors of any leading shape. What it is made of are
-    buffers: they follow the problem's precision and device, and tell its controls apart from those of other problems.
+    A subclass implements three methods with torch operations on tensors of any leading shape. Its parameters are
+    buffers, so that they follow the problem's precision and device, and identify the set in caches.
     """
 
     @property
     def limited(self) -> bool:
-        """Whether some control of ℝᵐ is left out."""
+        """Whether U is smaller than ℝᵐ."""
         return True
 
     @property
     def limits(self) -> tuple[Tensor, Tensor] | None:
-        """(lower, upper), each () or (m,), where U is a box: what oracles and starts need to know; else None."""
+        """(lower, upper), each () or (m,), if U is a box, as oracles and the initial V need it; else None."""
         return None
 
     @abstractmethod
@@ -142,7 +141,7 @@ class Unbounded(ControlSet):
 
     @property
     def limited(self) -> bool:
-        return type(self) is not Unbounded  # a set derived from it may leave something out
+        return type(self) is not Unbounded  # a subclass may be smaller
 
     @property
     def limits(self) -> tuple[Tensor, Tensor] | None:
@@ -161,14 +160,17 @@ class Unbounded(ControlSet):
 class ControlBox(ControlSet):
     """U = {u : lower ≤ u ≤ upper}, componentwise: limits of actuators.
 
-    The minimiser of uᵀRu + bᵀu is exact for every R: with one control it is −b/(2R), clipped; with two, clipped
-    twice; with three or four, each way to hold some of them at a limit leaves a linear system for the others, and all
-    3ᵐ are solved as one batch; with more, by an active-set method, which is one operator where a reader of traces has
-    it. Of numbers, from which no gradient is asked, with three and more by rounds that a trace could not have, as it
-    may not look at them.
+    The minimiser of uᵀRu + bᵀu is exact for every R:
+
+    * 1 control: −b/(2R), clipped. 2 controls: clipped twice.
+    * 3 or 4 controls: each combination of controls at a limit leaves a linear system for the others; all 3ᵐ systems
+      are solved as one batch.
+    * More controls: an active-set method, a single operator in traces.
+    * From 3 controls on, outside of traces and gradients: a primal-dual active-set method whose number of rounds
+      depends on the values.
 
     Args:
-        lower, upper: in the units of the controls; a number is the limit of each, ∓∞ is none on that side.
+        lower, upper: in the units of the controls; a single number is the limit of every control, ∓∞ means no limit.
 
     Raises:
         ValueError: limits of different lengths, equal, reversed, or not numbers.
@@ -195,7 +197,7 @@ class ControlBox(ControlSet):
         self._limited = bool(low.isfinite().any() | high.isfinite().any())
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "ControlBox":
-        """In another precision, limits are rounded inwards, so that no control exceeds those that were given."""
+        """In another precision limits are rounded inwards, so that no control exceeds the given limits."""
         given = self.lower, self.upper
         super()._apply(fn, recurse)
         nearest, far = (self.lower, self.upper), self.lower.new_tensor(math.inf)
@@ -203,7 +205,7 @@ class ControlBox(ControlSet):
             torch.where((side * (old - new.to(old)) > 0).to(new.device), new.nextafter(side * far), new)
             for side, old, new in zip((1, -1), given, nearest, strict=True)
         )
-        crossed = low > high  # limits that this precision does not tell apart
+        crossed = low > high  # limits that are equal in this precision
         self.lower, self.upper = torch.where(crossed, nearest[0], low), torch.where(crossed, nearest[1], high)
         return self
 
@@ -221,32 +223,39 @@ class ControlBox(ControlSet):
             raise ValueError(f"Expected limits of {m} controls, got {self.lower.numel()}; give one for each.")
         if m == 1:
             return self.project(-b / (2 * R[..., 0]))
-        # in double precision: costs of single precision do not tell the ways apart
+        # in double precision, because the cost differences may be too small for single precision
         given, low, high = b, self.lower.double().expand(m), self.upper.double().expand(m)
         R, b = R.double(), b.double()
         if m == 2:
-            return self._of_two(R, b, low, high).to(given)
-        few = m <= FEW and not are_operators()
-        way = self._of_numbers if _are_numbers(R, b) else self._of_few if few else self._of_many
-        u = way(R, b, low, high).clamp(low, high)
+            return self._minimise_two(R, b, low, high).to(given)
+        few = m <= ENUMERATED_CONTROLS and not are_operators()
+        minimise = (
+            self._minimise_values
+            if _have_values(R, b)
+            else self._minimise_by_enumeration
+            if few
+            else self._minimise_by_active_set
+        )
+        u = minimise(R, b, low, high).clamp(low, high)
         known = R.isfinite().all((-2, -1)) & b.isfinite().all(-1)
-        return torch.where(known[..., None], u, torch.nan).to(given)  # what is no number stays none
+        return torch.where(known[..., None], u, torch.nan).to(given)  # NaN remains NaN
 
-    def _of_numbers(self, R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
-        """By rounds each of which holds those that the last one drives outwards; what is not settled so, if anything,
-        by the active-set method."""
+    def _minimise_values(self, R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """Minimise by rounds, and by the active-set method where these have not converged."""
         m, shape = b.shape[-1], b.shape
         R, b = R.expand(*shape, m).reshape(-1, m, m), b.reshape(-1, m)
-        u, settled = _by_rounds(R, b, low, high)
+        u, settled = _minimise_by_rounds(R, b, low, high)
         if not bool(settled.all()):
-            u[~settled] = self._of_many(R[~settled], b[~settled], low, high)
+            u[~settled] = self._minimise_by_active_set(R[~settled], b[~settled], low, high)
         return u.reshape(shape)
 
     @staticmethod
-    def _of_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
-        """u₂ where the slope in it of min over u₁ vanishes, which is the middle one of three lines; then u₁."""
-        finite = (side.clamp(-HUGE, HUGE) for side in (low, high))
-        roots = [-(b[..., 1] + 2 * R[..., 0, 1] * side[0]) / (2 * R[..., 1, 1]) for side in finite]  # u₁ held
+    def _minimise_two(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """u₂ is where the slope of min over u₁ vanishes, the middle of three roots; then u₁ follows."""
+        finite = (side.clamp(-FINITE_LIMIT, FINITE_LIMIT) for side in (low, high))
+        roots = [
+            -(b[..., 1] + 2 * R[..., 0, 1] * side[0]) / (2 * R[..., 1, 1]) for side in finite
+        ]  # with u₁ at a limit
         determinant = R[..., 0, 0] * R[..., 1, 1] - R[..., 0, 1] * R[..., 0, 1]
         free = (R[..., 0, 1] * b[..., 0] - R[..., 0, 0] * b[..., 1]) / (2 * determinant)
         middle = free.clamp(torch.minimum(*roots), torch.maximum(*roots))
@@ -255,14 +264,14 @@ class ControlBox(ControlSet):
         return torch.stack([first, second], -1)
 
     @staticmethod
-    def _of_few(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
-        """Of all ways to hold some of them at a limit, the one of least cost among those that end within the limits."""
+    def _minimise_by_enumeration(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """The cheapest feasible solution over all combinations of controls at a limit."""
         m = b.shape[-1]
         held = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), repeat=m))).to(b)  # at lower, free, at upper
         sides = torch.where(held < 0, low, torch.where(held > 0, high, 0.0))
         exists = sides.isfinite().all(-1)
         u_held, free = sides.where(sides.isfinite(), 0), (held == 0).to(b)
-        each = (slice(None), *(None,) * (b.ndim - 1))  # the ways come first
+        each = (slice(None), *(None,) * (b.ndim - 1))  # the first axis has the combinations
         u_held, free = u_held[each], free[each]
         A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
         rest = free * (-b / 2 - apply(R, u_held)) + u_held
@@ -273,8 +282,8 @@ class ControlBox(ControlSet):
         return u.gather(0, best[None, ..., None].expand(1, *b.shape))[0]
 
     @staticmethod
-    def _of_many(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
-        """The minimum over the controls that no limit holds at it, the others at theirs."""
+    def _minimise_by_active_set(R: Tensor, b: Control, low: Tensor, high: Tensor) -> Control:
+        """The minimum over the controls that are free at it, with the others at their limits."""
         shape = torch.broadcast_shapes(R.shape[:-1], b.shape)
         side = active_set(b.detach().expand(shape), R.detach(), low, high)
         held = torch.where(side < 0, low, torch.where(side > 0, high, 0.0))  # finite, where side is not 0
@@ -288,18 +297,17 @@ class ControlBox(ControlSet):
 
 
 def _minimum_beside(R: Tensor, b: Control, held: Control, side: Control) -> Control:
-    """argmin of uᵀRu + bᵀu over the controls with side 0; the others are held, and come back as zero or less."""
+    """argmin of uᵀRu + bᵀu over the controls with side 0, with the others held; only the former are valid."""
     free = (side == 0).to(b)
     A = free[..., :, None] * R * free[..., None, :] + torch.diag_embed(1 - free)
     return solve(A, (free * (-b / 2 - apply(R, held)))[..., None])[..., 0]
 
 
-def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Control, Tensor]:
-    """The minimum of each of a batch (k, m), and which are settled: those whose controls at limits are those of the
-    last round, where the slope vanishes for the others and points outwards for these.
+def _minimise_by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Control, Tensor]:
+    """The minima of a batch (k, m), and which rows have converged: their set of controls at limits has not changed.
 
-    All controls change sides at once; after SETTLING rounds, as few batches may go round in circles so, only the first
-    of those that would, which comes to an end.
+    In each round all controls change sides at once that the slope demands. This may cycle in rare cases; after
+    SIMULTANEOUS_ROUNDS rounds only the control with the least index changes, which terminates.
 
     Source: Bergounioux, Ito, Kunisch, "Primal-dual strategy for constrained optimal control problems", SIAM Journal on
     Control and Optimization 1999; Murty, "Note on a Bard-type scheme for solving the complementarity problem", Opsearch
@@ -309,7 +317,7 @@ def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Contro
     diagonal = 2 * R.diagonal(dim1=-2, dim2=-1)
     u, before = (-b / diagonal).clamp(low, high), torch.full_like(b, 2.0)
     rows, minimum = torch.arange(len(b)), u.clone()
-    for k in range(SETTLING * (1 + m)):
+    for k in range(SIMULTANEOUS_ROUNDS * (1 + m)):
         towards = u - (2 * (R @ u[..., None])[..., 0] + b) / diagonal
         side = (towards >= high).to(b) - (towards <= low).to(b)
         changes = side != before
@@ -320,7 +328,7 @@ def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Contro
             rows, R, b, diagonal, side, before, changes = (part[going] for part in parts)
             if not len(rows):
                 break
-        if k >= SETTLING:
+        if k >= SIMULTANEOUS_ROUNDS:
             first = changes.to(torch.uint8).argmax(-1, keepdim=True)
             side = torch.where(each == first, torch.where(before == 0, side, 0.0), before)
         free = (side == 0).to(b)
@@ -337,16 +345,16 @@ def _by_rounds(R: Tensor, b: Control, low: Tensor, high: Tensor) -> tuple[Contro
 def active_set(b: Control, R: ControlMatrix, low: Tensor, high: Tensor) -> Control:
     """Which controls are at a limit at the minimum: −1 at the lower, 1 at the upper, 0 at none.
 
-    From a control in the box, towards the minimum over those that no limit holds: up to the first limit on the way,
-    which holds from there; or all the way, and then of the held ones that is let go which gains most. The cost falls in
-    each round, and the minimum is reached where none gains. On random R and b of up to 8 controls, R of condition up to
-    1e6, that took 2.3m rounds at most; ROUNDS m are made.
+    Each round moves from a control in the box towards the minimum over the free controls. If a limit is reached first,
+    that control is held from there on. Otherwise the held control is released whose release lowers the cost most. The
+    cost falls in each round; at the minimum no release gains. On random R and b with up to 8 controls and a condition
+    of R up to 1e6 this took at most 2.3m rounds; ACTIVE_SET_ROUNDS · m are made.
     """
     m, scale = b.shape[-1], R.diagonal(dim1=-2, dim2=-1).sqrt()
     each = torch.arange(m, device=b.device)
     u = (-b / (2 * scale**2)).clamp(low, high)
     side = (u >= high).to(b) - (u <= low).to(b)
-    for _ in range(ROUNDS * m):
+    for _ in range(ACTIVE_SET_ROUNDS * m):
         step = torch.where(side == 0, _minimum_beside(R, b, torch.where(side == 0, 0.0, u), side) - u, 0.0)
         room = torch.where(step > 0, high - u, low - u) / torch.where(step == 0, 1.0, step)
         share, first = torch.where(step == 0, torch.inf, room).min(-1, keepdim=True)
@@ -358,14 +366,16 @@ def active_set(b: Control, R: ControlMatrix, low: Tensor, high: Tensor) -> Contr
     return side
 
 
-def _are_numbers(*tensors: Tensor) -> bool:
-    """Whether values may be looked at, and nothing asks for a gradient."""
+def _have_values(*tensors: Tensor) -> bool:
+    """Whether tensors have values, so that control flow may depend on them, and need no gradient."""
     return all(has_values(each) and not (torch.is_grad_enabled() and each.requires_grad) for each in tensors)
 
 
-FEW = 4  # controls of which all ways are tried: 3⁴ = 81 systems, less code to compile than that many rounds
-ROUNDS = 4
-SETTLING = 8  # rounds in which all controls may change sides at once; as many for each control follow
-HUGE = 1e150  # in the place of a limit that is none, where it is multiplied
+ENUMERATED_CONTROLS = 4  # up to this number all combinations are tried: 3⁴ = 81 systems compile faster than many rounds
+ACTIVE_SET_ROUNDS = 4  # rounds of the active-set method for each control
+SIMULTANEOUS_ROUNDS = 8  # rounds in which all controls may change at once; as many for each control follow
+FINITE_LIMIT = 1e150  # replaces an infinite limit in products
 
-CONTROL_SETS: dict[str, type[ControlSet]] = {"unbounded": Unbounded}  # limits are controls.lower and upper
+CONTROL_SETS: dict[str, type[ControlSet]] = {
+    "unbounded": Unbounded
+}  # a ControlBox is chosen by controls.lower and upper

@@ -1,4 +1,4 @@
-"""From a config to what Lightning trains: modules, data, and the user's own callbacks."""
+"""Builds the LightningModule, the data module and the user's callbacks from a config."""
 
 import lightning as L
 
@@ -13,19 +13,21 @@ from lyapnet.training.optimizer import OptimizerOptions
 
 
 def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
-    """What trains a config: one V, or an ensemble of seeds.
+    """The LightningModule of a config: for one V, or for an ensemble of seeds.
 
     Args:
-        parts: taken instead of those that the config names.
+        parts: objects that replace those named in the config.
 
     Raises:
-        UsageError: as build_problem and its like.
+        UsageError: as build_problem, build_value_function and build_program.
     """
     parts = parts_of(config) if parts is None else parts
     problem, options = build_problem_to_train(config, parts), _optimizer_options(config.training)
     if config.seeds == 1:
-        one = build_learner(config, problem, parts)
-        module = ValueModule(problem, one.V, one.program, one.rollout, one.pointwise, options, config.seed)
+        learner = build_learner(config, problem, parts)
+        module = ValueModule(
+            problem, learner.V, learner.program, learner.rollout, learner.pointwise, options, config.seed
+        )
     else:
         members = [build_learner(each, problem, parts, label_of(each)) for each in configs_of_seeds(config)]
         module = EnsembleModule(members, options)
@@ -41,7 +43,7 @@ def _optimizer_options(training: TrainingConfig) -> OptimizerOptions:
 
 
 def build_data(config: Config, problem: Problem) -> InitialStateDataModule:
-    """The batches that a config trains and validates on."""
+    """The data module with the training and validation batches of a config."""
     training = config.training
     options = (problem, training.batch_size, config.evaluation.validation_states, config.seed)
     if config.seeds > 1:
@@ -50,18 +52,18 @@ def build_data(config: Config, problem: Problem) -> InitialStateDataModule:
 
 
 def build_callbacks(config: Config) -> list[L.Callback]:
-    """The user's own callbacks.
+    """The user's callbacks.
 
     Raises:
-        UsageError: one that cannot be imported, is no Lightning callback, or needs arguments.
+        UsageError: a callback cannot be imported, is no Lightning callback, or needs arguments.
     """
-    found = []
+    callbacks = []
     for name in config.callbacks:
         cls = resolve(name, {}, "callbacks", L.Callback)
         try:
-            found.append(cls())
+            callbacks.append(cls())
         except TypeError as error:
             raise UsageError(
                 f"Expected callbacks without arguments, got {name} ({error}); give its arguments defaults."
             ) from error
-    return found
+    return callbacks

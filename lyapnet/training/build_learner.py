@@ -1,4 +1,4 @@
-"""From a config to what one seed trains. Nothing here imports Lightning, which takes two seconds."""
+"""Builds the learner of one seed from a config. Does not import Lightning, which takes two seconds."""
 
 import csv
 import io
@@ -27,8 +27,7 @@ from lyapnet.value.linearisation import rounded
 
 
 def build_problem_to_train(config: Config, parts: Parts) -> Problem:
-    """The problem that training solves in the place of a config's: without kinks at the goal, with a penalty for
-    constraints.
+    """The problem that is trained: kinks of the cost at the goal are smoothed, constraints become a penalty.
 
     Raises:
         UsageError: as build_problem.
@@ -37,7 +36,7 @@ def build_problem_to_train(config: Config, parts: Parts) -> Problem:
 
 
 def build_learner(config: Config, problem: Problem, parts: Parts | None = None, label: str = "") -> Learner:
-    """What one seed of a config trains."""
+    """The learner of one seed of a config."""
     parts = parts or Parts()
     V = build_value_function(config, problem, parts.network)
     rollout, program = build_rollout(config, problem, V), parts.program or build_program(config)
@@ -47,15 +46,15 @@ def build_learner(config: Config, problem: Problem, parts: Parts | None = None, 
 
 
 def build_pointwise(config: Config, rollout: Rollout, program: Program) -> PointwiseCondition | None:
-    """The program's condition off the closed loops; None without weight.
+    """The program's condition at points off the closed loops; None if its weight is zero.
 
     Raises:
-        UsageError: a region or a file of counterexamples that does not fit the system.
+        UsageError: the region or the file of counterexamples does not fit the system.
     """
     options, problem = config.pointwise, rollout.problem
     weight = program.pointwise if options.weight is None else options.weight
-    made = RegionCondition if isinstance(program, RegionProgram) else PointwiseCondition
-    if made is RegionCondition and not (problem.horizon.stationary and weight):
+    cls = RegionCondition if isinstance(program, RegionProgram) else PointwiseCondition
+    if cls is RegionCondition and not (problem.horizon.stationary and weight):
         raise UsageError(
             "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got none; its V has "
             "no time, and points of D are what it is about."
@@ -63,18 +62,18 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
     if not weight:
         return None
     n, goal, initial_states = problem.system.n, problem.goal, problem.initial_states
-    furthest = initial_states.reach_from(goal)
-    extent = entry_per_state("pointwise.region", options.region, problem.system) or (1.5 * furthest).tolist()
+    default = 1.5 * initial_states.reach_from(goal)
+    extent = entry_per_state("pointwise.region", options.region, problem.system) or default.tolist()
     if min(extent) <= 0:
         raise UsageError("Expected pointwise.region, got none, and X₀ is thin; give a bound of each |x_i|.")
     reach = torch.tensor(extent, dtype=torch.float64).to(goal)
     region = Box(goal - reach, goal + reach)
-    further = None if options.counterexamples is None else _points_of(Path(options.counterexamples), n).to(goal)
-    return made(rollout, program, region, weight, options.points, further, options.floor)
+    further = None if options.counterexamples is None else _read_points(Path(options.counterexamples), n).to(goal)
+    return cls(rollout, program, region, weight, options.points, further, options.floor)
 
 
-def _points_of(path: Path, n: int) -> Tensor:
-    """The points (t, x) of a CSV file with a header, (k, 1 + n)."""
+def _read_points(path: Path, n: int) -> Tensor:
+    """Read the points (t, x) of a CSV file with a header line; shape (k, 1 + n)."""
     try:
         heading, *lines = csv.reader(io.StringIO(read_file(path).decode(), newline=""))
         if heading[:1] != ["t"]:

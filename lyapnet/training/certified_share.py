@@ -1,4 +1,4 @@
-"""How much of X₀ is certified, as a curve over the training."""
+"""The curve of the certified share of X₀ during training."""
 
 from lightning.pytorch import LightningModule, Trainer
 
@@ -10,16 +10,17 @@ from lyapnet.training.recurring import Recurring
 
 
 class CertifiedShare(Recurring):
-    """Logs the statistical bound of each member: a share of X₀ that succeeds, at a confidence, and one for each event.
+    """Logs for each member a lower bound of the share of X₀ that succeeds, and one for each event, at a confidence.
 
-    Its states are drawn by a stream of (seed, step) of their own: nothing was trained, validated or chosen on them, and
-    a resumed run draws what it would have drawn. Each bound holds at its confidence by itself. Not all of K at once
-    (that at 1 − K(1 − confidence)), and not the best of them, nor that of a checkpoint chosen because of it: what
-    training leaves behind is certified by `lyapnet certify`, on states that it has not seen.
+    The states come from a separate random stream of (seed, step): training, validation and the choice of the best
+    checkpoint never use them, and a resumed run draws the same ones. Each bound holds at its confidence by itself. The
+    confidence does not cover all K bounds at once (that needs 1 − K(1 − confidence)), nor the largest of them, nor a
+    checkpoint that was chosen by its bound. Certify the final controller with `lyapnet certify`, on new states.
 
     Args:
         every: steps between bounds; the last validation always has one.
-        states: drawn for each.
+        states: number of states drawn for each bound.
+        confidence: confidence of each bound.
         confidence: of each.
     """
 
@@ -35,7 +36,7 @@ class CertifiedShare(Recurring):
             log_scalars(trainer, loggers, {f"{name}/val": bound for name, bound in bounds.items()})
 
     def claim_of(self, member: Learner, step: int) -> BoundedShare:
-        """The claim about a member as it is at a step; without a radius, as `lyapnet certify` by default."""
+        """The claim about a member at a step, with the defaults of `lyapnet certify statistical`: no radius."""
         return bound_share(
             member.rollout, member.problem, member.program.tolerances(), self.states, self.confidence,
             generator=stream(member.seed, CERTIFICATION, step),

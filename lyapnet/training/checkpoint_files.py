@@ -1,4 +1,4 @@
-"""Lightning's door to checkpoint files."""
+"""Lightning's interface to checkpoint files."""
 
 from typing import Any
 
@@ -6,17 +6,17 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 
-ALONE = "weights_alone"  # of a file that a forked process leaves for the one that started it
+WEIGHTS_ONLY_KEY = "weights_alone"  # marks the file of bare weights that a forked process hands to its parent
 
 
 class CheckpointFiles(TorchCheckpointIO):
-    """Writes all or nothing, and with a digest; verifies it on reading, and executes nothing."""
+    """Writes files atomically with a digest; reading verifies the digest and executes no code."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         if "state_dict" not in checkpoint:
-            checkpoint = {KEY: {ALONE: True}, "state_dict": checkpoint}
+            checkpoint = {KEY: {WEIGHTS_ONLY_KEY: True}, "state_dict": checkpoint}
         write_checkpoint(checkpoint, path)
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         content = read_checkpoint(path, map_location or "cpu")
-        return content["state_dict"] if content[KEY].get(ALONE) else content
+        return content["state_dict"] if content[KEY].get(WEIGHTS_ONLY_KEY) else content

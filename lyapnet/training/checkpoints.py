@@ -1,4 +1,4 @@
-"""The callback that saves a run: its last state, and the best one so far."""
+"""The callbacks that save the last and the best checkpoint of a run."""
 
 import math
 import signal
@@ -18,7 +18,7 @@ from lyapnet.training.runs import Run
 
 
 class KeptStart(Callback):
-    """best.ckpt as soon as training has its start: what compiling and optima take from there may be broken off.
+    """Saves best.ckpt as soon as the initial V is known, so that an interrupted compilation does not lose it.
 
     Args:
         best: label ↦ each member's best checkpoint.
@@ -35,15 +35,15 @@ class KeptStart(Callback):
 
 
 class Checkpoints(Checkpoint):
-    """last.ckpt after every validation, best.ckpt where its loss is least, and last.ckpt on Ctrl-C and SIGTERM.
+    """Saves last.ckpt after every validation and on Ctrl-C or SIGTERM, and best.ckpt when the loss is the least so far.
 
-    What was logged is written first, so that it is never behind the checkpoint. (Lightning's ModelCheckpoint writes
-    its last checkpoint only together with a best one, remembers absolute paths, and its position within an interval.)
+    Logs are written before the checkpoint, so that they are never older than it. (Lightning's ModelCheckpoint writes
+    the last checkpoint only together with a best one, and stores absolute paths and its position in an interval.)
 
     Args:
-        last: the checkpoint of the whole run.
+        last: path of the last checkpoint.
         best: label ↦ each member's best checkpoint.
-        every: steps between validations; the last step is validated and saved whether a multiple or not.
+        every: steps between validations; the last step is always validated and saved.
         saved: called when the last checkpoint is written for the first time in this process.
     """
 
@@ -53,7 +53,7 @@ class Checkpoints(Checkpoint):
         self._saved: Callable[[], None] | None = saved
         self.best_loss = dict.fromkeys(best, math.inf)
         self._signal: int | None = None
-        self._begun = False  # whether a step has been
+        self._begun = False  # whether the first step has begun
         self._previous: dict[int, Any] = {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -66,8 +66,8 @@ class Checkpoints(Checkpoint):
         self._install_handlers()  # before the first validation and figures, which take seconds
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._install_handlers()  # again: Lightning sets one for SIGTERM in between
-        if trainer.global_step == 0:  # what training starts from may stay the best
+        self._install_handlers()  # again: Lightning has replaced that of SIGTERM
+        if trainer.global_step == 0:  # the initial V may remain the best one
             self._save_best(trainer, pl_module)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -77,12 +77,12 @@ class Checkpoints(Checkpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
-        if not Run(self.last.parents[1]).exists:  # writing would make another folder
+        if not Run(self.last.parents[1]).exists:  # writing would create the removed folder again
             raise FileNotFoundError(self.last.parents[1])
         if step % self.every == 0 or step == trainer.max_epochs:
             self._save_best(trainer, pl_module)
             self._save_last(trainer)
-        # every process stops if one of them was told to
+        # all processes stop if one of them has received a signal
         if trainer.strategy.reduce_boolean_decision(self._signal is not None, all=False):
             self._save_last(trainer)
             name = signal.Signals(self._signal).name if self._signal else "Stop"
@@ -95,7 +95,7 @@ class Checkpoints(Checkpoint):
         self._restore_handlers()
 
     def _save_best(self, trainer: Trainer, module: Any) -> None:
-        _flush(trainer)
+        _save_logs(trainer)
         for member in module.members:
             own = torch.tensor(member.validation_loss, dtype=torch.float64, device=module.device)
             loss = float(mean_over_processes(own))
@@ -104,22 +104,23 @@ class Checkpoints(Checkpoint):
                 module.save_member(member, self.best[member.label])
 
     def _save_last(self, trainer: Trainer) -> None:
-        _flush(trainer)
+        _save_logs(trainer)
         trainer.save_checkpoint(self.last)
         if trainer.is_global_zero and self._saved is not None:
             self._saved()
             self._saved = None
 
-    def _remember(self, number: int, frame: FrameType | None) -> None:
-        if not self._begun:  # while it compiles, or seeks an optimum: there is nothing yet to be saved
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        """Stop after the current step, so that it can be saved; at once before the first step or a second time."""
+        if not self._begun:
             raise Interrupted(f"{signal.Signals(number).name} before the first step.", 130)
-        if self._signal is not None:  # the second time, the user means now
+        if self._signal is not None:
             raise Interrupted("Stopped at once; the last checkpoint is from before this step.", exit_status=130)
         self._signal = number
 
     def _install_handlers(self) -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
-            previous = signal.signal(number, self._remember)
+            previous = signal.signal(number, self._handle)
             self._previous.setdefault(number, previous)
 
     def _restore_handlers(self) -> None:
@@ -128,7 +129,7 @@ class Checkpoints(Checkpoint):
         self._previous.clear()
 
 
-def _flush(trainer: Trainer) -> None:
+def _save_logs(trainer: Trainer) -> None:
     if trainer.is_global_zero:
         for logger in trainer.loggers:
             logger.save()

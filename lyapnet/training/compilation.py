@@ -1,4 +1,4 @@
-"""The callback that has a closed loop and its gradient run as machine code."""
+"""The callback that compiles the closed loop and its gradient to machine code."""
 
 import time
 from collections.abc import Callable
@@ -13,20 +13,20 @@ from lyapnet.training.stages import Stages
 
 
 class Compilation(Callback):
-    """Has the closed loop and its gradient run as machine code, and says where they cannot.
+    """Compiles the closed loop and its gradient to machine code, and reports if that is not possible.
 
     Args:
-        stages: where it is said.
+        stages: shows progress and messages.
         batch_size: initial states in a training batch.
-        record: takes down that the run is compiled where it trains, and in how many seconds.
+        record: called with the facts that the run is compiled and how many seconds it took.
     """
 
     def __init__(self, stages: Stages, batch_size: int, record: Callable[..., None]):
         self.stages, self.batch_size, self.record = stages, batch_size, record
-        self._compiled_on: str | None = None  # the type of the device
+        self._compiled_on: str | None = None  # type of the device, such as "cpu"
 
     def before_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """For the search of a start, which rolls out closed loops on the CPU, wherever the training runs then."""
+        """Compile for the search of the initial V, which always runs on the CPU."""
         self._compile(trainer, pl_module)
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -44,7 +44,7 @@ class Compilation(Callback):
             self.stages(f"tracing the closed loop and its gradient{fresh}")
         try:
             module.compile_for(self.batch_size)
-        except UntraceableError:  # which says so itself, where it runs as it is written
+        except UntraceableError:  # compile_for has logged the reason; the loop runs uncompiled
             return
         except CompilationError as error:
             if trainer.is_global_zero:

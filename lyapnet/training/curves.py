@@ -1,4 +1,4 @@
-"""The curves of a training: what each step and each validation measured, through Lightning's loggers."""
+"""The curves of a training: the measures of each step and validation, sent to Lightning's loggers."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,11 +11,11 @@ from lyapnet.training.learner import Learner
 
 
 class Stopwatch(Callback):
-    """Tells each member how many rollout steps per second the last training step made, gradient included.
+    """Measures the rollout steps per second of the last training step, gradient included, for each member.
 
-    `seconds` is what all training steps took so far, before an interruption too, in CPU time of the process: on a core
-    of its own that is wall-clock time, and it does not depend on what else the machine does. Neither compilation nor
-    validations, figures and checkpoints count.
+    `seconds` is the CPU time of all training steps so far, including those before an interruption. On a core of its own
+    it equals wall-clock time; it does not depend on other processes. Compilation, validations, figures and checkpoints
+    do not count.
     """
 
     def __init__(self) -> None:
@@ -41,10 +41,10 @@ class Stopwatch(Callback):
 
 
 class ScalarLogger(Callback):
-    """Logs the curves: every training step, every validation, and one validation before the first step.
+    """Logs the curves at every training step, every validation, and one validation before the first step.
 
     Args:
-        stopwatch: tells how long the training steps took.
+        stopwatch: measures the time of the training steps.
     """
 
     def __init__(self, stopwatch: Stopwatch):
@@ -75,7 +75,7 @@ class ScalarLogger(Callback):
 
 
 def log_scalars(trainer: Trainer, loggers: Sequence[Logger], scalars: Mapping[str, Any]) -> None:
-    """Add a point to each curve, in the first process."""
+    """Add a point to each curve; only the first process logs."""
     if trainer.is_global_zero:
         values = {name: float(value) for name, value in scalars.items()}
         for logger in loggers:
@@ -83,7 +83,7 @@ def log_scalars(trainer: Trainer, loggers: Sequence[Logger], scalars: Mapping[st
 
 
 def loggers_of_each(trainer: Trainer, pl_module: LightningModule) -> list[list[Logger]]:
-    """The loggers of each member's curves: the trainer has as many for each, member by member."""
+    """The loggers of each member. The trainer lists them member by member, the same number for each."""
     members = len(members_of(pl_module))
     each = len(trainer.loggers) // members
     return [trainer.loggers[k * each : (k + 1) * each] for k in range(members)]
@@ -95,12 +95,12 @@ def with_loggers(trainer: Trainer, pl_module: LightningModule) -> Iterator[tuple
 
 
 def members_of(pl_module: LightningModule) -> Sequence[Learner]:
-    """What a TrainingModule trains."""
+    """The learners of a TrainingModule."""
     module: Any = pl_module
     return list(module.members)
 
 
 def data_of(trainer: Trainer) -> Any:
-    """The InitialStateDataModule of a training; None where it was given loaders."""
+    """The InitialStateDataModule of a training; None if the user passed data loaders."""
     untyped: Any = trainer
     return untyped.datamodule

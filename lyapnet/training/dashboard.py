@@ -1,4 +1,4 @@
-"""What loggers show besides curves and figures: the layout of TensorBoard, and the config."""
+"""The layout of TensorBoard's curves, and the config as text."""
 
 import textwrap
 from typing import Any
@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lyapnet.experiment.config import Config, to_plain, to_yaml
 from lyapnet.training.curves import loggers_of_each, members_of
 
-# a panel for each measure, a chart for each curve in it: TensorBoard gives all curves of a run one colour
+# A panel for each measure with a chart for each curve: TensorBoard draws all curves of a run in one colour.
 PANELS = {
     "constraint loss": ("constraint_loss/train", "constraint_loss/val"),
     "trajectory cost": ("trajectory_cost/train", "trajectory_cost/val"),
@@ -21,16 +21,16 @@ del WITHOUT_GOAL["condition"]
 
 
 def layout(has_goal: bool) -> dict[str, dict[str, list[Any]]]:
-    """TensorBoard's panels of curves, those that a task with or without a goal has."""
+    """TensorBoard's panels of curves for a task with or without a goal."""
     panels = PANELS if has_goal else WITHOUT_GOAL
     return {panel: {curve: ["Multiline", [curve]] for curve in curves} for panel, curves in panels.items()}
 
 
 class Dashboard(Callback):
-    """Shows each member's config before the first step: TensorBoard as text, beside the layout of its curves.
+    """Logs each member's config before the first step; in TensorBoard also the layout of the curves.
 
     Args:
-        configs: one for each member.
+        configs: one config for each member.
     """
 
     def __init__(self, configs: list[Config]):

@@ -1,4 +1,4 @@
-"""Initial states: a fresh batch of X₀ for every training step, a fixed draw for validation."""
+"""Initial states: a new batch of X₀ for every training step, a fixed batch for validation."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,20 +15,19 @@ from lyapnet.task.problem import Problem
 
 
 class InitialStateDataModule(L.LightningDataModule):
-    """Batches (b, n) from X₀.
+    """Batches (b, n) of initial states from X₀.
 
-    The batch of a step is a function of (seed, process, step) alone: a run that resumes at a step draws what it
-    would have drawn, whatever was prefetched or lost, and processes never share a batch.
+    The batch of a step depends only on (seed, process, step) and the lost states: a resumed run draws the same batches,
+    and processes never share one.
 
     Args:
-        problem: whose X₀ is meant.
+        problem: the problem with X₀.
         batch_size: initial states in each training batch, per process.
-        validation_states: size of the one validation batch, the same at every validation.
-        seed: of all streams.
-        steps_per_epoch: training steps that Lightning calls an epoch, after which it validates. No state is seen twice,
-            but those that are lost.
-        lost_share: share of a batch, at the most, that is drawn from `lost` instead: states that need more training
-            than others, found by LostStates.
+        validation_states: size of the validation batch, which is the same at every validation.
+        seed: seed of all random streams.
+        steps_per_epoch: training steps that Lightning calls an epoch; a validation follows each.
+        lost_share: largest share of a batch that is drawn from `lost` instead of X₀. LostStates finds these states,
+            which need more training than others.
     """
 
     problem: Problem
@@ -61,30 +60,30 @@ class InitialStateDataModule(L.LightningDataModule):
         return torch.cat([x0[len(lost) :], lost.to(x0)])
 
     def further(self, count: int, step: int) -> State:
-        """States of X₀ that are in no batch, another draw at each step: (count, n), or (E, count, n)."""
+        """States of X₀ that are in no batch, drawn anew at each step; shape (count, n), or (E, count, n)."""
         return self.problem.initial_states.sample(count, stream(self.seed, LOST, step))
 
     def train_dataloader(self) -> DataLoader[Tensor]:
         return DataLoader(_Epoch(self), batch_size=None)
 
     def validation_batch(self) -> State:
-        """The states of every validation."""
+        """The validation states."""
         return self.problem.initial_states.sample(self.validation_states, stream(self.seed, VALIDATION))
 
     def val_dataloader(self) -> DataLoader[Tensor]:
         return DataLoader([self.validation_batch()], batch_size=None)  # pyright: ignore[reportArgumentType]
 
     def position(self) -> int:
-        """The step whose batch comes next."""
+        """The step of the next batch."""
         return self.trainer.global_step if self.trainer else 0
 
     @property
     def of_each(self) -> Sequence["InitialStateDataModule"]:
-        """What draws for each of the seeds."""
+        """The data module of each seed."""
         return [self]
 
     def state_dict(self) -> dict[str, Any]:
-        """The position of the training stream, its seed and the step whose batch comes next, and each seed's `lost`."""
+        """The seed, the step of the next batch, and the lost states of each seed."""
         return {"seed": self.seed, "step": self.position(), "lost": [each.lost for each in self.of_each]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -99,10 +98,10 @@ class InitialStateDataModule(L.LightningDataModule):
 
 
 class EnsembleDataModule(InitialStateDataModule):
-    """Batches (E, b, n): for each of the seeds seed, seed + 1, … what its run alone would draw.
+    """Batches (E, b, n): for each of the seeds seed, seed + 1, … the batch of a run with that seed alone.
 
     Args:
-        seeds: E.
+        seeds: E, the number of seeds.
     """
 
     def __init__(
@@ -135,7 +134,7 @@ class EnsembleDataModule(InitialStateDataModule):
 
 
 class _Epoch(Dataset[Tensor]):
-    """The batches of the steps of an epoch, from the one that comes next."""
+    """The batches of the current epoch."""
 
     def __init__(self, states: InitialStateDataModule):
         self.states = states

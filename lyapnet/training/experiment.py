@@ -1,4 +1,4 @@
-"""One experiment, from its config to the evaluation of what it trained."""
+"""Runs one experiment, from its config to the evaluation of the trained controller."""
 
 import statistics
 import time
@@ -26,18 +26,20 @@ from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
 from lyapnet.training.facts import jump_facts, kink_facts
-from lyapnet.training.loggers import log_result, quiet_writers, take_back_after
+from lyapnet.training.loggers import drop_logs_after, log_result, without_writer_tracebacks
 from lyapnet.training.plan import Plan, plan_run, under_policy
 from lyapnet.training.recovery import Returns
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.runs import CONFIG, EVALUATION, Run
 from lyapnet.training.stages import PATIENCE, Stages, silent
-from lyapnet.training.start import REMEDY, has_place_for_start
-from lyapnet.training.start_cache import kept_or_chosen
+from lyapnet.training.start import STEP_ERROR_REMEDY, has_place_for_start
+from lyapnet.training.start_cache import load_or_choose_start
 from lyapnet.training.trainer import build_trainer
 from lyapnet.value.networks import WithPenalty
 
-DRAWN = "start: V as it is drawn, in which nothing is known yet; the first steps cost far more than the optimum"
+NO_START_MESSAGE = (
+    "start: a random V, without anything known of the task; the first steps cost far more than the optimum"
+)
 
 
 def train(
@@ -49,15 +51,15 @@ def train(
     console: Console | None = None,
     parts: Parts | None = None,
 ) -> Run:
-    """Train one experiment, as `lyapnet train` does; its run, with `folder`, `best` and `evaluation`.
+    """Train one experiment, as `lyapnet train` does, and return its run, with `folder`, `best` and `evaluation`.
 
     Args:
         config: a YAML file, its content as nested dictionaries, or a Config.
-        overrides: changes to it, as key.sub=value.
-        resume: "last", or the path of a checkpoint: go on with that run. One that is finished is left as it is.
-        finetune: a checkpoint whose weights a new run starts from.
-        console: where the progress is shown; None: the terminal.
-        parts: of the user's own, taken instead of those that the config names, none of which is then imported.
+        overrides: changes to the config, as key.sub=value.
+        resume: "last", or the path of a checkpoint: continue that run. A finished run is left as it is.
+        finetune: a checkpoint with the initial weights of a new run.
+        console: shows the progress; None: the terminal.
+        parts: the user's objects, used instead of those that the config names; these are then not imported.
 
     Raises:
         LyapnetError: as plan_run and fit.
@@ -77,17 +79,17 @@ def train(
 
 
 def fit(plan: Plan, console: Console, again: str) -> dict[str, Any]:
-    """Train to the end of the config's iterations; the evaluation of the best checkpoint.
+    """Train all iterations of the config and return the evaluation of the best checkpoint.
 
     Args:
-        again: the command that resumes the run.
+        again: the command that resumes the run, for messages.
 
     Raises:
-        Interrupted: Ctrl-C or SIGTERM, after saving; says how to go on.
-        DivergenceError: a rollout, term or gradient is not finite; names the checkpoint that is kept.
+        Interrupted: Ctrl-C or SIGTERM, after saving; says how to continue.
+        DivergenceError: a rollout, term or gradient is not finite; names the last good checkpoint.
         LyapnetError: a file of the run cannot be read or written.
     """
-    with plan.lock or nullcontext(), quiet_writers():
+    with plan.lock or nullcontext(), without_writer_tracebacks():
         try:
             return _fit(plan, console)
         except Interrupted as stop:
@@ -120,10 +122,10 @@ def _fit(plan: Plan, console: Console) -> dict[str, Any]:
     started = time.perf_counter()
     try:
         if plan.module.penalty is not None and plan.resume_from is None:
-            _relax(plan, console, trainer.is_global_zero)
-        start = _choose_start(plan, trainer, console) if _seeks_start(plan) else None
+            _set_constraint_penalty(plan, console, trainer.is_global_zero)
+        start = _choose_start(plan, trainer, console) if _needs_start(plan) else None
         if start is not None and start.should_look_ahead and config.rollout.choose_policy:
-            plan = _looking_ahead(plan, console, trainer.is_global_zero)
+            plan = _switch_to_lookahead(plan, console, trainer.is_global_zero)
             trainer = build_trainer(plan, console)
         trainer = _train(plan, trainer, console, start)
     except DivergenceError as error:
@@ -131,15 +133,15 @@ def _fit(plan: Plan, console: Console) -> dict[str, Any]:
         raise DivergenceError(f"{error}{kept}") from error
     finally:
         if trainer.is_global_zero and run.exists:
-            _note_what_it_took(run, time.perf_counter() - started)
+            _record_resources(run, time.perf_counter() - started)
     return _finish(trainer, plan, console) if trainer.is_global_zero else {}
 
 
 def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None) -> L.Trainer:
-    """All iterations, going back where they diverge; the trainer that came to their end."""
+    """Train all iterations, going back to a checkpoint after a divergence; returns the trainer that finished."""
     returns, module = Returns(plan, console, start), plan.module
     while True:
-        torch.manual_seed(plan.config.seed)  # lyapnet's own draws have their streams; a user's network may use this one
+        torch.manual_seed(plan.config.seed)  # for users' networks; lyapnet draws from streams of its own
         data = build_data(plan.config, module.members[0].problem)
         try:
             trainer.fit(module, data, ckpt_path=plan.resume_from, weights_only=True)
@@ -149,71 +151,73 @@ def _train(plan: Plan, trainer: L.Trainer, console: Console, start: Start | None
             trainer = build_trainer(plan, console)
 
 
-def _seeks_start(plan: Plan) -> bool:
+def _needs_start(plan: Plan) -> bool:
     return plan.resume_from is None and plan.run.finetuned_from is None
 
 
-def _relax(plan: Plan, console: Console, told: bool) -> None:
-    """Set the penalty that stands for constraints, and say what it keeps."""
-    with Stages(console, "constraints") if told else nullcontext(silent) as report:
+def _set_constraint_penalty(plan: Plan, console: Console, is_first_process: bool) -> None:
+    """Choose the weight of the constraint penalty and report how many optima then keep the constraints."""
+    with Stages(console, "constraints") if is_first_process else nullcontext(silent) as report:
         relaxation = find_relaxation(plan.module.members[0].problem, report)
     assert plan.module.penalty is not None
     plan.module.penalty.weight.fill_(relaxation.weight)
     for member in plan.module.members:
         if isinstance(member.V, WithPenalty):
             member.V.weight.fill_(relaxation.weight)
-    if told:
+    if is_first_process:
         plan.run.note(relaxation=relaxation.as_json())
         console.print(str(relaxation), soft_wrap=True)
 
 
 def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | None:
-    """Put what is known of V into the networks that have a place for it, and say what was chosen."""
-    told, callbacks = trainer.is_global_zero, trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
+    """Initialise the networks with the best known V, where they can represent it, and report the choice."""
+    is_first_process, callbacks = trainer.is_global_zero, trainer.callbacks  # pyright: ignore[reportAttributeAccessIssue]
     if has_place_for_start(list(plan.module.members)):
         for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
             compilation.before_start(trainer, plan.module)
-    with Stages(console, "start") if told else nullcontext(silent) as report:
-        start = kept_or_chosen(list(plan.module.members), report, may_look_ahead=plan.config.rollout.choose_policy)
-    if told and start is not None:
+    with Stages(console, "start") if is_first_process else nullcontext(silent) as report:
+        start = load_or_choose_start(
+            list(plan.module.members), report, may_look_ahead=plan.config.rollout.choose_policy
+        )
+    if is_first_process and start is not None:
         plan.run.note(start=start.as_json())
         console.print(str(start), soft_wrap=True)
         if start.steps_miss:
-            console.print(f"steps: {start.steps_miss}; {REMEDY}", soft_wrap=True)
+            console.print(f"steps: {start.steps_miss}; {STEP_ERROR_REMEDY}", soft_wrap=True)
         if start.should_look_ahead:
             console.print(f"law: {start.about_law}", soft_wrap=True)
-    if told and start is None:
-        console.print(DRAWN, soft_wrap=True)
+    if is_first_process and start is None:
+        console.print(NO_START_MESSAGE, soft_wrap=True)
     return start
 
 
-def _looking_ahead(plan: Plan, console: Console, told: bool) -> Plan:
-    """The plan under the law that looks ahead, which its run's folder then names."""
+def _switch_to_lookahead(plan: Plan, console: Console, is_first_process: bool) -> Plan:
+    """The plan with the lookahead law, which is also written into the config of the run's folder."""
     plan = under_policy(plan, "lookahead")
-    if told:
+    if is_first_process:
         write_atomically(plan.run.folder / CONFIG, to_yaml(plan.config).encode())
         console.print("law: lookahead is trained from here on; rollout.policy=sampled keeps the other", soft_wrap=True)
     return plan
 
 
 def _prepare_folder(plan: Plan) -> None:
-    """Write what the run is; take back what it logged after the point from which it goes on."""
+    """Write the config; remove logs and results later than the step from which the run continues."""
     folder = plan.run.folder
     (folder / EVALUATION).unlink(missing_ok=True)
     write_atomically(folder / CONFIG, to_yaml(plan.config).encode())
     for run in plan.run.members(plan.config):
-        take_back_after(run, plan.step if plan.resume_from else None)
+        drop_logs_after(run, plan.step if plan.resume_from else None)
 
 
-def _note_what_it_took(run: Run, seconds: float) -> None:
-    """Add this process's share to the run's record."""
+def _record_resources(run: Run, seconds: float) -> None:
+    """Add the seconds and the peak memory of this process to the run's record."""
     record = run.record()
     total = record["training_seconds"] + seconds
     run.note(training_seconds=round(total, 2), peak_bytes=max(record["peak_bytes"], peak_memory()))
 
 
 def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
-    """Evaluate each best checkpoint, log it as its run's final metrics, and mark the run as finished."""
+    """Evaluate each best checkpoint, log the result as final metrics, and mark the run as finished."""
     config, options = plan.config, plan.config.evaluation
     results = []
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
@@ -233,7 +237,7 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
 
 
 def over_seeds(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The evaluations of several seeds, and mean and standard deviation of each measure that all of them have."""
+    """The evaluations of several seeds, with mean and standard deviation of each measure that all seeds have."""
     measures = [key for key in results[0] if all(isinstance(result[key], float) for result in results)]
     columns = {key: [result[key] for result in results] for key in measures}
     return {

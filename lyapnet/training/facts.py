@@ -1,4 +1,4 @@
-"""What can be said of a problem before training: its goal, its linearisation there, how stiff it is, where to start."""
+"""Facts about a problem before training: its goal, its linearisation there, its stiffness, the initial V."""
 
 import math
 from collections import Counter
@@ -16,13 +16,13 @@ from lyapnet.task.domain import as_written
 from lyapnet.task.horizon import TABLEAUX
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
-from lyapnet.training.candidates import CALM, Candidate, Start
-from lyapnet.training.fact import Fact, listed
+from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
+from lyapnet.training.fact import Fact, format_numbers
 from lyapnet.training.learner import Learner
 from lyapnet.training.relaxation import find_relaxation
 from lyapnet.training.stages import Report, silent
-from lyapnet.training.start import REMEDY, SMALLER, STATES
-from lyapnet.training.start_cache import kept_or_chosen
+from lyapnet.training.start import NOT_FINITE_REMEDY, STEP_ERROR_REMEDY, TRIAL_STATES
+from lyapnet.training.start_cache import load_or_choose_start
 from lyapnet.value.expansions import in_float64, path_under
 from lyapnet.value.linearisation import (
     NAME_A_GOAL,
@@ -35,11 +35,11 @@ from lyapnet.value.linearisation import (
     smoothed_part,
 )
 
-STABLE = 2.0  # a gain of the HJB law above which Euler steps of it oscillate and grow
-REACHED = 1e-10  # of A, with states and controls in units of their own, above which one state acts on another
-ROUNDED = 1e-8  # of the largest eigenvalue or of A, below which a part of an eigenvalue is zero
-LOOPS = 64  # from as many states it is seen whether closed loops leave the domain
-ROUNDINGS = 100  # of the task's precision, for a rate that sums several terms
+STABLE_GAIN = 2.0  # largest gain Δt λ of the HJB law for which Euler steps do not oscillate and grow
+REACHABILITY_TOLERANCE = 1e-10  # relative to A in scaled units: larger entries count as coupling of two states
+EIGENVALUE_TOLERANCE = 1e-8  # relative to the largest eigenvalue or A: smaller real and imaginary parts count as zero
+DOMAIN_TEST_STATES = 64  # states of X₀ whose closed loops are checked against the domain
+ROUNDING_UNITS = 100  # rounding error of a rate that sums several terms, in units of the machine precision
 
 
 def facts_of(
@@ -48,12 +48,12 @@ def facts_of(
     known: Callable[[Fact], None] = lambda fact: None,
     may_look_ahead: bool = False,
 ) -> list[Fact]:
-    """The facts of a learner's problem; V and the penalty of constraints are left where training begins.
+    """The facts about a learner's problem. Also initialises V and the constraint penalty as training would.
 
     Args:
-        report: is told what is being done.
-        known: is told each fact as soon as it is.
-        may_look_ahead: whether training may take the law that looks ahead in the place of the sampled one.
+        report: called with each stage of the work.
+        known: called with each fact as soon as it is known.
+        may_look_ahead: whether training may replace the sampled law by the lookahead law.
     """
     problem, facts = learner.problem, list[Fact]()
 
@@ -62,9 +62,9 @@ def facts_of(
             facts.append(fact)
             known(fact)
 
-    with float64_defaults():  # as the problem is built, so that f computes with the same constants
+    with float64_defaults():  # as when the problem is built, so that f has the same constants
         exact = in_float64(problem)
-        tell(_task(exact), *jump_facts(exact), *kink_facts(exact))
+        tell(_system_fact(exact), *jump_facts(exact), *kink_facts(exact))
         if exact.domain is not None:
             tell(Fact("domain", str(exact.domain)))
         if not exact.has_goal:
@@ -72,7 +72,7 @@ def facts_of(
         elif (around := linearised(exact)).missing_values is not None:
             tell(Fact("goal", f"none: {around.missing_values.reason}", around.missing_values.remedy))
         else:
-            tell(_goal(exact, around, problem.goal.dtype), *_modes(exact, around))
+            tell(_goal_fact(exact, around, problem.goal.dtype), *_mode_facts(exact, around))
             stiff = stiffness(exact, learner.rollout)
             if around.missing is not None and around.missing.reason in stiff.found:
                 stiff = Fact("stiffness", "unknown, for the reason above")
@@ -82,31 +82,33 @@ def facts_of(
             relaxation = find_relaxation(problem, report)
             problem.cost.weight.fill_(relaxation.weight)
             tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
-        start = kept_or_chosen([learner], report, lambda candidate: tell(_tried(candidate, facts)), may_look_ahead)
+        start = load_or_choose_start(
+            [learner], report, lambda candidate: tell(_candidate_fact(candidate, facts)), may_look_ahead
+        )
     except LinAlgError as error:
         reason, remedy = singular(error)
         tell(Fact("start", f"not found: {reason}", remedy))
         return facts
-    tell(*_chosen(start), *_leaving(learner))
+    tell(*_start_facts(start), *_domain_facts(learner))
     return facts
 
 
-def _leaving(learner: Learner) -> Iterator[Fact]:
-    """From how many of LOOPS states of X₀ closed loops leave the domain, and what keeps them in it."""
+def _domain_facts(learner: Learner) -> Iterator[Fact]:
+    """From how many states of X₀ closed loops leave the domain, and which constraints prevent it."""
     domain = learner.problem.domain
     if domain is None:
         return
-    x0 = learner.problem.initial_states.sample(LOOPS, stream(0, START))
+    x0 = learner.problem.initial_states.sample(DOMAIN_TEST_STATES, stream(0, START))
     law = learner.rollout.closed_loop.policy
     left = domain.left(path_under(learner.problem, lambda n, x: law(learner.problem.horizon.times(x)[n], x), x0).x)
     if left.any():
         limits = " ".join(f"constraints.{each.side}.{each.state}={each.value:g}" for each in domain.borders)
-        found = f"closed loops of the start leave it from {int(left.sum())} of {LOOPS} states of X₀"
+        found = f"closed loops of the start leave it from {int(left.sum())} of {DOMAIN_TEST_STATES} states of X₀"
         yield Fact("domain", found, f"{limits}, which training then keeps, or a smaller horizon.dt")
 
 
 def jump_facts(problem: Problem) -> list[Fact]:
-    """Where f, g and the cost jump, on X₀ and beside it as far as the goal; optima take them as smooth."""
+    """The jumps of f, g and the cost on a box around X₀ and the goal; the optima assume smooth functions."""
     problem, box = in_float64(problem), problem.initial_states
     cost = as_written(problem.cost)
     low, high = (end(getattr(box, side).double(), problem.goal) for side, end in
@@ -126,7 +128,7 @@ def jump_facts(problem: Problem) -> list[Fact]:
 
 
 def kink_facts(problem: Problem) -> list[Fact]:
-    """Which kinks of the cost at the goal are rounded, and how."""
+    """The kinks of the cost at the goal, and how training smooths them."""
     part = smoothed_part(problem.cost)
     if part is None:
         return []
@@ -135,114 +137,118 @@ def kink_facts(problem: Problem) -> list[Fact]:
     return [Fact("kink", f"{' and '.join(kinked)} {has} a kink at the goal: training rounds {it}, {part.words}")]
 
 
-def _chosen(start: Start | None) -> Iterator[Fact]:
-    """Where training starts from, and what its steps miss."""
+def _start_facts(start: Start | None) -> Iterator[Fact]:
+    """The initial V of training, and the error of the rollout's steps."""
     if start is None:
         yield Fact("start", "the network as it is drawn", "network.name=expansion tries what is known of V")
         return
     if start.steps_miss:
-        yield Fact("steps", start.steps_miss, REMEDY)
+        yield Fact("steps", start.steps_miss, STEP_ERROR_REMEDY)
     if start.should_look_ahead:
         yield Fact("law", start.about_law)
     advice = ""
     if start.chosen.finite < 1:
-        advice = f"no candidate is finite on all of X₀: {SMALLER}"
-    elif start.chosen.name == CALM:
+        advice = f"no candidate is finite on all of X₀: {NOT_FINITE_REMEDY}"
+    elif start.chosen.name == ZERO_VALUE:
         advice = "nothing known is better than no control: expect a longer training"
     yield Fact("start", f"training starts from {start.chosen.name}", advice)
 
 
-def _tried(candidate: Candidate, told: Sequence[Fact]) -> Fact:
-    """What came of a candidate; why there is none is said once."""
+def _candidate_fact(candidate: Candidate, told: Sequence[Fact]) -> Fact:
+    """The result of a candidate; a reason that was already given is not repeated."""
     if candidate.missing is not None:
         found, (reason, remedy) = f"no {candidate.name.removeprefix('the ')}", candidate.missing
         if any(reason in fact.found for fact in told):
             return Fact("start", f"{found}, for the reason above")
         return Fact("start", f"{found}: {reason}", remedy)
-    mean = f"mean cost from {STATES} states of X₀ {candidate.cost:.5g}"
+    mean = f"mean cost from {TRIAL_STATES} states of X₀ {candidate.cost:.5g}"
     cost = mean if candidate.finite == 1 else f"finite on {candidate.finite:.0%} of X₀"
     earlier = " of an earlier search" if candidate.kept else ""
-    return Fact("start", f"from {candidate.name}: {cost}, known after {_seconds(candidate.seconds)} s{earlier}")
+    return Fact("start", f"from {candidate.name}: {cost}, known after {_format_seconds(candidate.seconds)} s{earlier}")
 
 
-def _task(problem: Problem) -> Fact:
+def _system_fact(problem: Problem) -> Fact:
     system, controls = problem.system, problem.controls
     limits = ""
     if controls.limited:
-        sides = None if controls.limits is None else [_listed(side.expand(system.m)) for side in controls.limits]
+        sides = None if controls.limits is None else [_format_vector(side.expand(system.m)) for side in controls.limits]
         limits = f" in {type(controls).__name__}" if sides is None else f" between {sides[0]} and {sides[1]}"
     return Fact(
         "system",
-        f"{system.title}: {_counted(system.n, 'state')}, {_counted(system.m, 'control')}{limits}",
+        f"{system.title}: {_format_count(system.n, 'state')}, {_format_count(system.m, 'control')}{limits}",
     )
 
 
-def _goal(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:
-    """Whether the goal is an equilibrium, up to rounding in the precision of the task, or which control holds it."""
-    rounding = max(HELD, ROUNDINGS * torch.finfo(precision).eps)
+def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:
+    """Whether the goal is an equilibrium up to rounding, or which control holds it."""
+    rounding = max(HELD, ROUNDING_UNITS * torch.finfo(precision).eps)
     goal, system = problem.goal, problem.system
     f, rest = around.f, system.dynamics(goal, problem.rest)
-    where = f"{_listed(goal)}, " if goal.any() else ""
+    where = f"{_format_vector(goal)}, " if goal.any() else ""
     if not bool(problem.controls.contains(problem.rest)):
-        return Fact("goal", f"{where}u = {_listed(problem.rest)} is beyond its limits", "the cost has no rest there")
+        return Fact(
+            "goal", f"{where}u = {_format_vector(problem.rest)} is beyond its limits", "the cost has no rest there"
+        )
     if float(rest.abs().max()) <= rounding * max(1.0, float(f.abs().max())):
-        control = f"at u = {_listed(problem.rest)}" if problem.rest.any() else "without control"
+        control = f"at u = {_format_vector(problem.rest)}" if problem.rest.any() else "without control"
         return Fact("goal", f"{where}an equilibrium {control}")
     u, left = system.holding_control(goal)
     if float(left.abs().max()) <= rounding * float(f.abs().max()):
         remedy = f"target: {goal.tolist()} has the cost count u from there, so that staying costs nothing"
         if problem.cost.rest is not None:  # target_control says from where
             remedy = ""
-        return Fact("goal", f"{where}held by u = {_listed(u)}, which the cost charges", remedy)
+        return Fact("goal", f"{where}held by u = {_format_vector(u)}, which the cost charges", remedy)
     return Fact(
-        "goal", f"{where}no equilibrium: f(x*) = {_listed(f)}, and no control holds it", "the cost has no rest there"
+        "goal",
+        f"{where}no equilibrium: f(x*) = {_format_vector(f)}, and no control holds it",
+        "the cost has no rest there",
     )
 
 
-def _modes(problem: Problem, around: Linearisation) -> list[Fact]:
-    """The eigenvalues of ẋ = Ax + Bu around the goal, and whether u reaches them."""
+def _mode_facts(problem: Problem, around: Linearisation) -> list[Fact]:
+    """The eigenvalues of ẋ = Ax + Bu at the goal, and whether the pair (A, B) is controllable."""
     if around.missing is not None:
         return [Fact("modes", f"unknown: {around.missing.reason}", around.missing.remedy)]
     moving = [i for i in range(problem.system.n) if i not in problem.system.constants]
     A, B, dt = around.A[moving][:, moving], around.g[moving], problem.horizon.dt
     extent = problem.initial_states.reach_from(problem.goal)[moving]
     values = torch.linalg.eigvals(A)
-    facts = [Fact("modes", f"{_modes_in_words(values)} 1/s at the goal")]
+    facts = [Fact("modes", f"{_format_modes(values)} 1/s at the goal")]
     unreached = unreached_modes(A, B, extent.where(extent > 0, 1))
     if not len(unreached):
         facts.append(Fact("controllable", "yes, linearised at the goal"))
     else:
-        grows = bool((unreached.real > REACHED * float(A.abs().max())).any())
+        grows = bool((unreached.real > REACHABILITY_TOLERANCE * float(A.abs().max())).any())
         facts.append(Fact(
-            "controllable", f"not linearised at the goal: u does not reach {_modes_in_words(unreached)}",
+            "controllable", f"not linearised at the goal: u does not reach {_format_modes(unreached)}",
             "what grows there cannot be held near the goal" if grows else "",
         ))  # fmt: skip
     method, z = problem.horizon.method, dt * values
-    order = len(TABLEAUX[method].b)  # of each of these methods, as of its stability polynomial
+    order = len(TABLEAUX[method].b)  # of these methods' stability polynomials: their number of stages
     growth = sum((z**k / math.factorial(k) for k in range(1, order + 1)), start=torch.ones_like(z)).abs()
     if bool(((growth > 1 + 1e-9) & (values.real < -1e-9)).any()):
         by = "Euler" if method == "euler" else method
-        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under {by} steps", REMEDY))
+        facts.append(Fact("Δt", f"{dt:g} s makes a decaying mode grow under {by} steps", STEP_ERROR_REMEDY))
     return facts
 
 
 def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
-    """The eigenvalues of the part of ẋ = Ax + Bu that u does not reach: by rotations, the states that B moves are split
-    off, then those that these move, and so on, until nothing moves what is left.
+    """The eigenvalues of the uncontrollable part of ẋ = Ax + Bu.
 
-    States are in units of their extents, balanced, so that what one does to another is as large as what that does to it
-    where both act, and each control in that in which it moves them by one.
+    The staircase algorithm splits off the states that B moves, then the states that these move, and so on, until the
+    remaining part is not moved. States are scaled by their extents and balanced, so that the couplings of two states
+    have the same size in both directions; each column of B is scaled to norm 1.
 
     Source: Van Dooren, "The generalized eigenstructure problem in linear system theory", IEEE Transactions on Automatic
     Control 1981 (the staircase form).
     """
-    from scipy.linalg import matrix_balance  # loaded where it is asked for: it takes a tenth of a second
+    from scipy.linalg import matrix_balance  # imported here because it takes 0.1 s
 
     _, (units, _) = matrix_balance((A * extent / extent[:, None]).numpy(), permute=False, separate=True)
     extent = extent * torch.from_numpy(units)
     A, B = A * extent / extent[:, None], B / extent[:, None]
     B = B / B.norm(dim=0).clamp_min(torch.finfo(B.dtype).tiny)
-    weakest = REACHED
+    weakest = REACHABILITY_TOLERANCE
     size = float(A.norm()) or 1.0
     while len(A):
         rotation, moved, _ = torch.linalg.svd(B)
@@ -250,12 +256,12 @@ def unreached_modes(A: Tensor, B: Tensor, extent: Tensor) -> Tensor:
         if not rank:
             break
         A = rotation.mT @ A @ rotation
-        A, B, weakest = A[rank:, rank:], A[rank:, :rank], REACHED * size
-    return _rounded(torch.linalg.eigvals(A), size)
+        A, B, weakest = A[rank:, rank:], A[rank:, :rank], REACHABILITY_TOLERANCE * size
+    return _drop_rounding(torch.linalg.eigvals(A), size)
 
 
 def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
-    """Δt λ_max(R⁻¹gᵀHg)/2 at the goal, H from the Riccati solution: the gain of the HJB law over one step."""
+    """The gain of the HJB law over one step, Δt λ_max(R⁻¹gᵀHg)/2 at the goal, with H from the Riccati solution."""
     at_goal = riccati_or_reason(problem)
     if isinstance(at_goal, Missing):
         return Fact("stiffness", f"unknown: {at_goal.reason}; {at_goal.remedy}")
@@ -265,43 +271,45 @@ def stiffness(problem: Problem, rollout: Rollout | None = None) -> Fact:
         return Fact("stiffness", "unknown: R⁻¹gᵀV_xx g is not finite at the goal; give every control a weight in R")
     gain = problem.horizon.dt / 2 * float(torch.linalg.eigvals(weighted).real.max())
     found = f"Δt λ(R⁻¹gᵀV_xx g)/2 = {gain:.3g}"
-    if gain <= STABLE:
+    if gain <= STABLE_GAIN:
         return Fact("stiffness", f"{found}: every control law is stable at this Δt")
-    found = f"{found} > {STABLE:g}: rollout.policy=hjb is unstable at this Δt"
+    found = f"{found} > {STABLE_GAIN:g}: rollout.policy=hjb is unstable at this Δt"
     if rollout is not None and rollout.closed_loop.policy.held:
         return Fact("stiffness", f"{found}; the law that this config has is made to be held for Δt, and is stable")
-    return Fact("stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE / gain:.2g}")
+    return Fact(
+        "stiffness", found, f"rollout.policy=sampled, or horizon.dt ≤ {problem.horizon.dt * STABLE_GAIN / gain:.2g}"
+    )
 
 
-def _counted(number: int, what: str) -> str:
+def _format_count(number: int, what: str) -> str:
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
-def _listed(values: Tensor) -> str:
-    return listed(values.tolist())
+def _format_vector(values: Tensor) -> str:
+    return format_numbers(values.tolist())
 
 
-def _seconds(seconds: float) -> str:
+def _format_seconds(seconds: float) -> str:
     return f"{seconds:.0f}" if seconds >= 10 else f"{seconds:.2g}"
 
 
-def _modes_in_words(values: Tensor) -> str:
-    """Eigenvalues in decreasing order of their real parts, those that look alike once: "2, 0 (3 times), -1 ± 3i"."""
-    size = ROUNDED * float(values.abs().max())
+def _format_modes(values: Tensor) -> str:
+    """Format eigenvalues by decreasing real part, equal ones once: "2, 0 (3 times), -1 ± 3i"."""
+    size = EIGENVALUE_TOLERANCE * float(values.abs().max())
     values = torch.complex(
         values.real.where(values.real.abs() > size, 0), values.imag.where(values.imag.abs() > size, 0)
     )
     ordered = sorted(values.tolist(), key=lambda value: (-value.real, abs(value.imag)))
-    counts = Counter(_complex(value) for value in ordered if value.imag >= 0)
+    counts = Counter(_format_complex(value) for value in ordered if value.imag >= 0)
     return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in counts.items())
 
 
-def _rounded(values: Tensor, size: float) -> Tensor:
-    """Complex numbers without parts that are only rounding, against a size."""
+def _drop_rounding(values: Tensor, size: float) -> Tensor:
+    """Set real and imaginary parts to zero that are only rounding relative to a size."""
     parts = torch.view_as_real(values)
-    return torch.view_as_complex(parts.where(parts.abs() > ROUNDED * size, 0))
+    return torch.view_as_complex(parts.where(parts.abs() > EIGENVALUE_TOLERANCE * size, 0))
 
 
-def _complex(value: complex) -> str:
-    """A real number, or a conjugate pair."""
+def _format_complex(value: complex) -> str:
+    """Format a real number, or a conjugate pair."""
     return f"{value.real + 0.0:.3g}" if not value.imag else f"{value.real + 0.0:.3g} ± {value.imag:.3g}i"

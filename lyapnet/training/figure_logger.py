@@ -1,4 +1,4 @@
-"""Figures during a training, wherever its loggers can show them."""
+"""Figures during a training, for all loggers that accept images."""
 
 import warnings
 from collections.abc import Sequence
@@ -21,11 +21,11 @@ from lyapnet.training.recurring import Recurring
 
 
 class FigureLogger(Recurring):
-    """Draws the certified region, some trajectories and slices of V during training: the first member's.
+    """Draws the certified region, some trajectories and slices of V of the first member during training.
 
     Args:
-        every: steps between drawings; the last validation always draws.
-        animate: whether that one shows closed loops in motion too.
+        every: steps between figures; the last validation always draws.
+        animate: whether the last validation also logs an animation of closed loops.
     """
 
     def __init__(self, every: int, animate: bool = True):
@@ -34,14 +34,14 @@ class FigureLogger(Recurring):
 
     def act(self, trainer: Trainer, pl_module: LightningModule) -> None:
         member, loggers = next(with_loggers(trainer, pl_module))
-        if not trainer.is_global_zero or not any(map(_shows_figures, loggers)):
+        if not trainer.is_global_zero or not any(map(_accepts_figures, loggers)):
             return
         last = self.animate and trainer.global_step == trainer.max_epochs
         in_motion = [logger for logger in loggers if last and isinstance(logger, TensorBoardLogger)]
         try:
             drawn = figures_of(member)
             film = film_of(member).gif() if in_motion else b""
-        except DivergenceError as error:  # from a corner of X₀ that no batch has met yet: no reason to stop training
+        except DivergenceError as error:  # a rare state of X₀ diverges: no reason to stop training
             warnings.warn(f"No figures at step {trainer.global_step}: {error}", stacklevel=1)
             return
         for name, figure in drawn.items():
@@ -53,7 +53,7 @@ class FigureLogger(Recurring):
 
 
 def figures_of(learner: Learner) -> dict[str, Figure]:
-    """Name ↦ figure of what a learner has reached."""
+    """Name ↦ figure of a learner's closed loops and V."""
     problem = learner.problem
     x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
     with torch.no_grad():
@@ -70,23 +70,23 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
 
 
 def film_of(learner: Learner) -> Film:
-    """Closed loops from five states of X₀."""
+    """The animation of closed loops from five states of X₀."""
     x0 = learner.problem.initial_states.sample(5, stream(learner.seed, FIGURES))
     with torch.no_grad():
         return Film(learner.rollout(x0), learner.problem, learner.V, rate=15)
 
 
 def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:
-    """Show a figure in TensorBoard, MLflow, and every logger that takes images as Lightning's WandbLogger does."""
+    """Log a figure to TensorBoard, MLflow, and every logger with a method `log_image` like Lightning's WandbLogger."""
     image = pixels(figure)
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
             logger.experiment.add_image(name, image, step, dataformats="HWC")
         elif isinstance(logger, MLFlowLogger):
             logger.experiment.log_figure(logger.run_id, figure, f"{name}/{step:06d}.png")
-        elif _shows_figures(logger):
+        elif _accepts_figures(logger):
             logger.log_image(key=name, images=[image], step=step)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _shows_figures(logger: Logger) -> bool:
+def _accepts_figures(logger: Logger) -> bool:
     return isinstance(logger, TensorBoardLogger | MLFlowLogger) or hasattr(logger, "log_image")

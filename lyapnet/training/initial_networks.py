@@ -1,4 +1,4 @@
-"""What is known of V, put into a network before the first step."""
+"""Initialises networks from what is known of V before the first step."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from lyapnet.base.types import State
 from lyapnet.task.cost import is_quadratic_about_target
 from lyapnet.training.learner import Learner
-from lyapnet.training.pretraining import typical
+from lyapnet.training.pretraining import typical_cost
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Expansion, Optimum, sizes, without_penalty
 from lyapnet.value.networks import (
@@ -21,68 +21,72 @@ from lyapnet.value.networks import (
 )
 from lyapnet.value.networks.near_borders import SPREAD
 
-AROUND = 0.25  # of how far optima go: how far beside them a goal may be that they begin or end at
+GOAL_MARGIN = 0.25  # share of the optima's range, by which the goal may lie outside and still be the centre
 
 
 def network_of(V: ValueFunction) -> Any:
-    """The network that an expansion can be put into, if there is one."""
+    """The network that can be initialised from an expansion; None if V has none."""
     V = learned_part(V)
     inner = V.network if isinstance(V, IgnoringStates) else V
     return inner if isinstance(inner, ExpansionNetwork | StationaryNetwork) else None
 
 
-def kept_of(learner: Learner) -> list[int]:
-    """The states on which the V of a learner depends."""
+def states_of_value(learner: Learner) -> list[int]:
+    """The indices of the states on which a learner's V depends."""
     return kept_states(learner.V, learner.problem.system.n)
 
 
-def take(learner: Learner, expansion: Expansion, x0: State, level: float = 1.0) -> None:
-    """Start the network of a learner from an expansion.
+def start_from(learner: Learner, expansion: Expansion, x0: State, level: float = 1.0) -> None:
+    """Initialise the network of a learner from an expansion.
 
     Args:
-        level: up to which share of its mean value on X₀ a stationary V takes the regulator for right.
+        level: a stationary V uses the regulator's value up to this share of its mean on X₀.
     """
-    network, problem, kept = network_of(learner.V), learner.problem, kept_of(learner)
-    expansion, x0 = _of_network(learner, expansion).restricted_to(kept), x0[..., kept].double().cpu()
+    network, problem, kept = network_of(learner.V), learner.problem, states_of_value(learner)
+    expansion, x0 = _remove_known_penalty(learner, expansion).restricted_to(kept), x0[..., kept].double().cpu()
     if isinstance(network, StationaryNetwork):
-        mean = float(expansion.initially(x0).mean()) or 1.0  # of an X₀ that is the goal alone
-        network.take(*(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean)
+        mean = float(expansion.initially(x0).mean()) or 1.0  # zero if X₀ is the goal alone
+        network.start_from_regulator(
+            *(part[0].to(network.scale) for part in (expansion.x, expansion.hessian)), scale=level * mean
+        )
         return
-    curvature = _curvature(network, expansion.hessian)
+    curvature = _positive_curvature(network, expansion.hessian)
     parts = (problem.horizon.times(expansion.x), *expansion, curvature, x0 - expansion.x[0])
-    network.take(*(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost))
+    network.start_from_expansion(
+        *(part.to(network.scale) for part in parts), exact_end=is_quadratic_about_target(problem.cost)
+    )
     if network.near_borders is not None:
-        network.near_borders.take(torch.cat([expansion.x, x0]))
+        network.near_borders.fit(torch.cat([expansion.x, x0]))
 
 
-def take_nothing(learner: Learner, optimum: Optimum) -> None:
-    """Start the network of a learner from V = 0, in units of where optima lead, what they cost, and how V curves there.
+def start_from_zero(learner: Learner, optimum: Optimum) -> None:
+    """Initialise the network of a learner at V = 0, with the scales of the optima: states, cost and curvature of V.
 
-    The centre is the goal, in those states in which optima begin, end or pass there, and else the mean of the optima.
+    The centre is the goal in those states whose range along the optima contains it, else the mean of the optima.
     """
-    network, problem, kept = network_of(learner.V), learner.problem, kept_of(learner)
-    expansion = _of_network(learner, optimum.expansion).restricted_to(kept)
+    network, problem, kept = network_of(learner.V), learner.problem, states_of_value(learner)
+    expansion = _remove_known_penalty(learner, optimum.expansion).restricted_to(kept)
     goal, (least, most) = problem.goal.double().cpu()[kept], expansion.x.flatten(0, 1).aminmax(dim=0)
-    reach = AROUND * (most - least)
+    reach = GOAL_MARGIN * (most - least)
     at_goal = (network.moves.cpu() > 0) & (least - reach <= goal) & (goal <= most + reach)
     centre = goal.where(at_goal, expansion.x.mean((0, 1)))
     spread = SPREAD * ((expansion.x - centre) ** 2).mean((0, 1)).sqrt()
     size = expansion.hessian.abs().amax((0, -2, -1))
-    curvature = _curvature(network, expansion.hessian[:, size <= size.median()].mean(1))
-    cost, like = typical(sizes(problem, optimum.path.cost)) or 1.0, network.scale
+    curvature = _positive_curvature(network, expansion.hessian[:, size <= size.median()].mean(1))
+    cost, like = typical_cost(sizes(problem, optimum.path.cost)) or 1.0, network.scale
     t = problem.horizon.times(expansion.x)
-    network.take_nothing(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
+    network.start_from_zero(t.to(like), centre.to(like), curvature.to(like), spread.to(like), cost)
     if network.near_borders is not None:
-        network.near_borders.take(expansion.x.flatten(0, 1))
+        network.near_borders.fit(expansion.x.flatten(0, 1))
 
 
-def _of_network(learner: Learner, expansion: Expansion) -> Expansion:
-    """What an expansion of V leaves for the network, which knows the penalty of one step."""
+def _remove_known_penalty(learner: Learner, expansion: Expansion) -> Expansion:
+    """The expansion without the penalty of one step, if the network adds that penalty itself."""
     return without_penalty(learner.problem, expansion) if isinstance(learner.V, WithPenalty) else expansion
 
 
-def _curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:
-    """The positive part of V_xx in the states that move; of the others, no law asks how V curves in them."""
+def _positive_curvature(network: ExpansionNetwork, hessian: Tensor) -> Tensor:
+    """The positive part of V_xx in the states that move; the control law does not depend on the other entries."""
     moves = network.moves.double().cpu()
     values, vectors = torch.linalg.eigh(hessian * moves[:, None] * moves)
     return (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT

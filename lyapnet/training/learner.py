@@ -1,4 +1,4 @@
-"""What one seed trains: V in the closed loop of its own policy, and what was last measured of it."""
+"""The learner of one seed: V in the closed loop of its policy, with its last measures."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -22,19 +22,19 @@ from lyapnet.value.policy import LookaheadPolicy
 
 
 class Learner(nn.Module):
-    """A V, the closed loop of its policy, and the program that it minimises.
+    """V, the closed loop of its policy, and the program that is minimised.
 
     Args:
-        problem: what is to be solved.
-        V: what is trained.
-        rollout: the closed loop of a policy that V defines.
-        program: what is minimised.
-        pointwise: the program's condition off the closed loops, if that is a term too.
-        seed: of the points at which that condition is asked for.
-        label: tells it apart in messages and names of files; "" for the only one.
+        problem: the optimal control problem.
+        V: the network that is trained.
+        rollout: the closed loop of the policy that V defines.
+        program: the loss.
+        pointwise: the program's condition at points off the closed loops, if it is a term of the loss.
+        seed: seed of these points.
+        label: name of this learner in messages and file names; "" for a single one.
 
     Raises:
-        UsageError: constraints without what keeps closed loops off them.
+        UsageError: the problem has constraints but no penalty for them.
     """
 
     problem: Problem
@@ -67,30 +67,30 @@ class Learner(nn.Module):
         V.made_for = type(rollout.closed_loop.policy)
         self.program: Program = program if problem.has_goal else program.without_goal(problem.no_goal)
         self.pointwise, self.seed, self.label = pointwise, seed, label
-        self.validation_optimum: PerState | None = None  # J* of the validation states, once someone has asked for it
-        # of the last training step and the last validation, for whoever shows them
+        self.validation_optimum: PerState | None = None  # J* of the validation states, once it is known
+        # measures of the last training step and the last validation
         self.gradient_norm = self.steps_per_second = math.nan
         self.output: ProgramOutput | None = None
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
-        self.cooling: tuple[int, int] | None = None  # steps between which its learning rate falls to its end
-        self.region_share: Tensor | None = None  # of D, with the region program
-        self.metadata: dict[str, Any] = {}  # plain data that a checkpoint of this one alone carries
+        self.cooling: tuple[int, int] | None = None  # first and last step of the final decay of its learning rate
+        self.region_share: Tensor | None = None  # share of D that is in the region, with the region program
+        self.metadata: dict[str, Any] = {}  # plain data for a checkpoint of this member alone
 
     def looking_ahead(self) -> "Learner":
-        """Another learner of the same V, under the law that looks ahead."""
+        """A learner of the same V with the lookahead law."""
         rollout, law = self.rollout, LookaheadPolicy(self.problem, self.V)
         ahead = Rollout(self.problem, law, rollout.method, rollout.gradient)
         if rollout.discrete is not None and ahead.discrete is not None:
-            with suppress(UntraceableError, CompilationError):  # it runs as it is written then
+            with suppress(UntraceableError, CompilationError):  # otherwise it runs uncompiled
                 ahead.discrete.compile_like(rollout.discrete)
         return Learner(self.problem, self.V, ahead, self.program, seed=self.seed, label=self.label)
 
     @torch.no_grad()
     def path_from(self, x0: State) -> Path:
-        """Where the law leads from x₀ (b, n), each control held for Δt, whatever becomes of it, in float64.
+        """The closed loop from x₀ (b, n) in float64, each control held for Δt; it may be non-finite.
 
-        By the compiled closed loop, where that takes the same steps.
+        Uses the compiled closed loop if it takes the same steps.
         """
         goal, loop = self.problem.goal, self.rollout.discrete
         exact, policy = in_float64(self.problem), self.rollout.closed_loop.policy
@@ -101,13 +101,13 @@ class Learner(nn.Module):
         return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
 
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
-        """The loss of a training batch; its parts are kept in `output`.
+        """The loss of a training batch; its terms are stored in `output`.
 
         Args:
-            draw: names the stream of the points off the closed loops.
+            draw: identifies the random stream of the points off the closed loops.
         """
         size = None if self.problem.has_goal else mean_over_processes(spread(trajectory.cost.detach()))
-        output = self._evaluated(trajectory, draw, size, mean_over_processes)
+        output = self._evaluate_program(trajectory, draw, size, mean_over_processes)
         terms = {name: term.detach() for name, term in output.terms.items()}
         self.output = ProgramOutput(
             output.loss.detach(), terms, output.constraint_loss.detach(), output.trajectory_cost.detach()
@@ -115,37 +115,40 @@ class Learner(nn.Module):
         return output.loss
 
     def measure_on(self, trajectory: Trajectory) -> Tensor:
-        """The loss of the validation states and points, kept in `validation_loss`, and their table in `validation`.
+        """The validation loss; stored in `validation_loss`, with the table of states in `validation`.
 
-        With the region program it is the share of D that is not in the region yet, as far as samples tell, kept in
-        `region_share`.
+        With the region program it is the sampled share of D outside the region, 1 − `region_share`.
         """
         self.validation = measure(self.problem, self.program, trajectory, self.validation_optimum)
         if isinstance(self.pointwise, RegionCondition):
             self.region_share = self.pointwise.sampled_share(stream(self.seed, VALIDATION, POINTS))
             loss = 1 - self.region_share
         else:
-            loss = self._evaluated(trajectory, (VALIDATION, POINTS), self._lasting_spread(trajectory.cost)).loss
+            loss = self._evaluate_program(
+                trajectory, (VALIDATION, POINTS), self._spread_of_optima(trajectory.cost)
+            ).loss
         self.validation_loss = float(loss)
         return loss
 
-    def _lasting_spread(self, cost: PerState) -> Tensor | None:
-        """Of a task without a goal, the spread of the optima, with which losses of one step compare with those of
-        another; of the costs themselves, where no optimum is known."""
+    def _spread_of_optima(self, cost: PerState) -> Tensor | None:
+        """The spread of the optima, which makes losses of different steps comparable; None for a task with a goal.
+
+        Where no optimum is known it is the spread of the costs.
+        """
         if self.problem.has_goal:
             return None
         known = cost if self.validation_optimum is None else self.validation_optimum.to(cost)
         known = known[known.isfinite()]
         return spread(known if len(known) > 1 else cost)
 
-    def _evaluated(
+    def _evaluate_program(
         self,
         trajectory: Trajectory,
         draw: Sequence[int],
         spread_of_costs: Tensor | None,
         over_processes: Callable[[Tensor], Tensor] = lambda value: value,
     ) -> ProgramOutput:
-        """The program, with its condition off the closed loops where that has a weight."""
+        """Evaluate the program, with its pointwise condition if there is one."""
         output = self.program(trajectory, over_processes, spread_of_costs)
         if self.pointwise is None:
             return output
@@ -157,7 +160,7 @@ class Learner(nn.Module):
         return output._replace(loss=loss, terms={**output.terms, "pointwise": term})
 
     def training_scalars(self) -> dict[str, float | Tensor]:
-        """What the curves show of the last training step, by name."""
+        """The curves' values of the last training step, by name."""
         assert self.output is not None
         return {
             "loss/train": self.output.loss,
@@ -169,7 +172,7 @@ class Learner(nn.Module):
         }
 
     def validation_scalars(self) -> dict[str, float]:
-        """What the curves show of the last validation, by name; without what is not known."""
+        """The curves' values of the last validation, by name; unknown ones are left out."""
         assert self.validation is not None
         summary = self.validation.summary()
         ratio, violated = summary["cost_ratio"], self.validation.violated
@@ -191,7 +194,7 @@ class Learner(nn.Module):
 
 
 def mean_over_processes(value: Tensor) -> Tensor:
-    """The mean of a number over the processes that train together; itself where there is one."""
+    """The mean of a number over the processes that train together; the number itself for a single process."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return value
     total = value.clone()

@@ -1,4 +1,4 @@
-"""The loggers of a run: metrics.csv always, and what the config names."""
+"""The loggers of a run: always metrics.csv, and those that the config names."""
 
 import importlib
 import os
@@ -17,10 +17,10 @@ from lyapnet.training.runs import Run
 
 
 def require_libraries(names: Sequence[str]) -> None:
-    """Refuse loggers whose library is missing.
+    """Check that the libraries of the loggers are installed.
 
     Raises:
-        UsageError: naming it.
+        UsageError: a library is missing.
     """
     for name in names:
         try:
@@ -31,8 +31,8 @@ def require_libraries(names: Sequence[str]) -> None:
 
 
 @contextmanager
-def quiet_writers() -> Iterator[None]:
-    """No traceback of TensorBoard's thread where its file cannot be written: the next step meets the same error."""
+def without_writer_tracebacks() -> Iterator[None]:
+    """Suppress the traceback of TensorBoard's thread if its file cannot be written; the next step raises that error."""
     before = threading.excepthook
 
     def without_writers(raised: Any) -> None:
@@ -50,8 +50,8 @@ def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Log
     """The loggers of one seed's curves.
 
     Args:
-        run: of that seed.
-        resumed_at: the step from which the run goes on, if it does.
+        run: the run of that seed.
+        resumed_at: the step at which the run is resumed; None for a new run.
     """
     return [
         MetricsFile(run.folder),
@@ -59,12 +59,14 @@ def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Log
     ]
 
 
-def take_back_after(run: Run, step: int | None) -> None:
-    """Remove from a run's folder what it logged after a step, everything if it stands where it began, and hparams.yaml.
+def drop_logs_after(run: Run, step: int | None) -> None:
+    """Remove logs after a step from a run's folder, or all logs if the step is None; and hparams.yaml.
 
-    TensorBoard keeps all event files of a resumed run: the next one tells it what to purge.
+    TensorBoard keeps all event files of a resumed run; its next file says from which step earlier values are dropped.
     """
-    (run.folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(missing_ok=True)  # written anew, with what was changed
+    (run.folder / TensorBoardLogger.NAME_HPARAMS_FILE).unlink(
+        missing_ok=True
+    )  # is written again from the current config
     if step is not None:
         MetricsFile(run.folder).drop_after(step)
         return
@@ -73,16 +75,15 @@ def take_back_after(run: Run, step: int | None) -> None:
 
 
 def log_result(loggers: Sequence[Logger], config: Config, result: dict[str, Any], step: int) -> None:
-    """Show the evaluation at the end of a training, beside the config where a logger compares runs, and close.
+    """Log the evaluation at the end of a training, with the config where a logger compares runs, and close the logger.
 
-    It counts as logged one step after the last: with whatever else is later than its checkpoint, a run that goes on
-    takes it back.
+    It is logged one step after the last one, so that a resumed run removes it together with other later values.
     """
     metrics = {f"hp/{key}": value for key, value in result.items() if isinstance(value, float)}
     for logger in loggers:
         if isinstance(logger, TensorBoardLogger):
             logger.log_hyperparams(to_plain(config), metrics, step=step + 1)
-        elif not isinstance(logger, MetricsFile):  # evaluation.json lies beside that one
+        elif not isinstance(logger, MetricsFile):  # evaluation.json has these numbers
             logger.log_metrics(metrics, step + 1)
         logger.finalize("success")
         if isinstance(logger, WandbLogger):
@@ -90,29 +91,29 @@ def log_result(loggers: Sequence[Logger], config: Config, result: dict[str, Any]
 
 
 def _tensorboard(config: Config, run: Run, resumed_at: int | None) -> Logger:
-    # Each process opens an event file with a mark of its first step, at which TensorBoard drops what the files before
-    # have of it and of later ones; the mark of the first process makes the second one's count as a restart.
+    # Each process writes its first step into its event file. TensorBoard then drops this step and later ones from
+    # earlier files. It treats the second file as a restart only if the first one has such a mark too.
     first = 0 if resumed_at is None else resumed_at + 1
     folder = run.folder
     logger = TensorBoardLogger(folder.parent, name="", version=folder.name, default_hp_metric=False, purge_step=first)
-    logger.hparams = to_plain(config)  # what its first `save` writes to hparams.yaml
+    logger.hparams = to_plain(config)  # written to hparams.yaml by its first `save`
     return logger
 
 
 def _wandb(config: Config, run: Run, resumed_at: int | None) -> Logger:
-    # a new record, although other seeds or earlier trainings of this process have one
+    # a new record, even if this process already has records of other seeds or trainings
     options = {"project": config.experiment, "save_dir": run.folder, "reinit": "create_new"}
     return WandbLogger(name=_name(config, run, resumed_at), **options)
 
 
 def _mlflow(config: Config, run: Run, resumed_at: int | None) -> Logger:
     logs, name = Path(config.logs).resolve(), _name(config, run, resumed_at)
-    where = os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{logs / 'mlflow.db'}")
-    return MLFlowLogger(config.experiment, name, tracking_uri=where, artifact_location=str(logs / "mlruns"))
+    tracking_uri = os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{logs / 'mlflow.db'}")
+    return MLFlowLogger(config.experiment, name, tracking_uri=tracking_uri, artifact_location=str(logs / "mlruns"))
 
 
 def _name(config: Config, run: Run, resumed_at: int | None) -> str:
-    """What a run is called where each process leaves a record of its own."""
+    """The name of a run in loggers that make one record for each process."""
     folder = run.folder
     name = folder.name if config.seeds == 1 else f"{folder.parent.name}/{folder.name}"
     return name if resumed_at is None else f"{name} from step {resumed_at}"

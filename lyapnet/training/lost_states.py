@@ -1,4 +1,4 @@
-"""Initial states from which the closed loop costs more than V says: a training sees them again."""
+"""Lost states: initial states from which the closed loop costs more than V predicts. Training uses them again."""
 
 from typing import Any, cast
 
@@ -13,17 +13,18 @@ from lyapnet.task.cost import spread
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
 
-SOUGHT, KEPT = 512, 256  # states of X₀ that are tried at each validation; lost ones, those found last
-EXCESS = 0.05  # of V(0, x₀), by which a closed loop that is lost costs more
+SEARCHED_STATES = 512  # random states of X₀ that are tested at each validation
+MAX_LOST_STATES = 256  # most recent lost states kept
+MIN_EXCESS = 0.05  # relative excess of the cost over V(0, x₀) above which a state counts as lost
 
 
 class LostStates(Callback):
-    """Seeks lost states at the start and at each validation, for the batches of the data module; logs their share.
+    """Searches for lost states at the start and at each validation, adds them to the training data, logs their share.
 
-    Beside a kink of V, and where limits just admit what the goal takes, a closed loop may cost a hundred times its
-    optimum from one state in a thousand: X₀'s mean cost then depends on states that its batches seldom meet. Those of
-    the search are validated and tested on nowhere. The mildly lost are among them: trained on the worst alone, V gets
-    worse elsewhere.
+    Near a kink of V, or where the control limits are hardly sufficient, a closed loop may cost a hundred times the
+    optimum from one state in a thousand. The mean cost on X₀ then depends on states that are rare in the batches. The
+    searched states are used neither for validation nor for tests. Mildly lost states are included, because training on
+    the worst ones alone makes V worse elsewhere.
     """
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -32,23 +33,21 @@ class LostStates(Callback):
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         data, module = data_of(trainer), cast(Any, pl_module)
-        x0 = data.further(SOUGHT, trainer.global_step)
+        x0 = data.further(SEARCHED_STATES, trainer.global_step)
         try:
-            found = module.without_gradient(x0.to(module.device), _excess_of)
-        except DivergenceError:  # of which a batch that meets it makes more: the training goes back
+            excesses = module.without_gradient(x0.to(module.device), _excess_of)
+        except DivergenceError:  # a training batch that diverges is handled by the training itself
             return
-        each = zip(with_loggers(trainer, pl_module), data.of_each, x0.reshape(-1, *x0.shape[-2:]), found, strict=True)
-        for (_, loggers), its, states, by in each:
-            lost = (by > EXCESS).cpu()
-            its.lost = torch.cat([states.cpu()[lost], its.lost])[:KEPT]  # batches are drawn on the CPU
+        states_of_each = x0.reshape(-1, *x0.shape[-2:])
+        each = zip(with_loggers(trainer, pl_module), data.of_each, states_of_each, excesses, strict=True)
+        for (_, loggers), member_data, states, by in each:
+            lost = (by > MIN_EXCESS).cpu()
+            member_data.lost = torch.cat([states.cpu()[lost], member_data.lost])[:MAX_LOST_STATES]
             log_scalars(trainer, loggers, {"lost_fraction/val": lost.double().mean()})
 
 
 def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
-    """(J_N − V(0, x₀)) / V(0, x₀): above zero where V promises what its law does not keep.
-
-    Without a goal it is in units of the spread of costs.
-    """
+    """The excess (J_N − V(0, x₀)) / V(0, x₀) of the cost over V; without a goal, relative to the spread of J_N."""
     return (cost - value) / (promised(value, cost) if has_goal else spread(cost))
 
 

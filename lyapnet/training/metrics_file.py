@@ -1,4 +1,4 @@
-"""metrics.csv: the curves of a run as a table, whatever other loggers it has."""
+"""metrics.csv: the curves of a run as a table, written for every run."""
 
 import csv
 import io
@@ -17,13 +17,12 @@ STEP, WALL_TIME = "step", "wall_time"  # wall_time: seconds since the Epoch
 
 
 class MetricsFile(Logger):
-    """A row for each step and a column for each metric; empty where a step has no value.
+    """A CSV table with a row for each step and a column for each metric; empty where a step has no value.
 
-    Rows are appended where the training saves, before each checkpoint: what a killed process loses of them, the
-    resumed one logs again.
+    Rows are appended before each checkpoint is saved. Rows that a killed process loses are logged again on resuming.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
     """
 
     def __init__(self, folder: Path):
@@ -41,18 +40,18 @@ class MetricsFile(Logger):
 
     @rank_zero_only
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
-        """The config lies beside the file."""
+        """Do nothing: the config has a file of its own."""
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        step = step or 0  # a callback of the user's own may leave it out
+        step = step or 0  # a user's callback may omit it
         if not self._pending or self._pending[-1][STEP] != step:
             self._pending.append({STEP: step, WALL_TIME: time.time()})
         self._pending[-1].update(metrics)
 
     @rank_zero_only
     def save(self) -> None:
-        """Append what came since the last time; a metric that is new rewrites the file with one more column."""
+        """Append the rows since the last call; a new metric rewrites the file with one more column."""
         if not self._pending:
             return
         known = _columns(self.path)
@@ -71,22 +70,21 @@ class MetricsFile(Logger):
 
     @rank_zero_only
     def drop_after(self, step: int) -> None:
-        """Remove what was logged after a step, so that going on from that step logs nothing twice."""
+        """Remove the rows after a step, so that a run resumed at that step logs nothing twice."""
         columns, rows = _read(self.path)
         if columns:
             _write(self.path, columns, [row for row in rows if int(row[STEP]) <= step])
 
 
 def read_curves(folder: Path, *names: str) -> list[tuple[Any, ...]]:
-    """The values of some columns of a run's metrics.csv, for each row in which the first has one; None where another
-    has none."""
+    """The values of some columns of metrics.csv, for each row with a value in the first; None for other empty cells."""
     _, rows = _read(folder / METRICS)
     chosen = [row for row in rows if row.get(names[0])]
     return [tuple(float(row[name]) if row.get(name) else None for name in names) for row in chosen]
 
 
 def _columns(path: Path) -> list[str]:
-    """The columns of the file; none without a file."""
+    """The names of the columns; empty if there is no file."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8") as file:
@@ -94,8 +92,7 @@ def _columns(path: Path) -> list[str]:
 
 
 def _read(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """The columns and rows of the file, without a last line that a killed process left unfinished; none without a
-    file."""
+    """The columns and rows of the file, without an unfinished last line of a killed process; empty without a file."""
     if not path.is_file():
         return [], []
     whole, newline, _ = read_file(path).decode().rpartition("\n")

@@ -1,6 +1,6 @@
-"""The LightningModules: what they compute stands in programs/; what is shown, logged and saved, in callbacks.
+"""The LightningModules: ValueModule trains one V, EnsembleModule several seeds.
 
-One V is trained by a ValueModule; several seeds, by an EnsembleModule.
+The losses are in programs/; progress, logs and checkpoints are in callbacks.
 """
 
 import math
@@ -32,29 +32,29 @@ from lyapnet.value.policy import HJBPolicy, known_law
 
 
 class TrainingModule(L.LightningModule):
-    """Minimises the sum of its members' losses, each over weights and on initial states of its own."""
+    """Minimises the sum of its members' losses; each member has its own weights and initial states."""
 
     def __init__(self, members: Sequence[Learner], optimizer: OptimizerOptions):
         super().__init__()
         self.members: Sequence[Learner] = nn.ModuleList(members)  # pyright: ignore
         self.optimizer_options = optimizer
-        self.rate_share: float = 1.0  # of the scheduled learning rate; less, once a training had to go back
-        self.metadata: dict[str, Any] = {}  # plain data that checkpoints carry: the config, where there is one
+        self.rate_share: float = 1.0  # factor of the scheduled learning rate; below 1 after a divergence
+        self.metadata: dict[str, Any] = {}  # plain data for checkpoints, such as the config
 
     @abstractmethod
     def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
-        """The members' closed loops from their initial states.
+        """The members' closed loops from their initial states, one after the other.
 
         Raises:
-            DivergenceError: when it is the turn of one that is not finite.
+            DivergenceError: on reaching a closed loop that is not finite.
         """
 
     @abstractmethod
     def save_member(self, member: Learner, path: Path) -> None:
-        """Write a checkpoint that `lyapnet.load` takes for that of the member's own run."""
+        """Write a checkpoint that `lyapnet.load` reads like one of a run of this member alone."""
 
     def compile_for(self, batch_size: int) -> None:
-        """Have training batches of this size run as machine code, which members share; see DiscreteAdjoint.compile."""
+        """Compile the closed loop for batches of this size; members share the code. See DiscreteAdjoint.compile."""
         first, *others = [member.rollout.discrete for member in self.members]
         if first is None:
             return
@@ -65,27 +65,27 @@ class TrainingModule(L.LightningModule):
                 loop.compile_like(first)
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
-        """One evaluation of each member's program on its initial states."""
+        """The sum of the members' losses on their initial states."""
         draw = (POINTS, self.global_rank, self.global_step)
         losses = self._for_each(x0, lambda member, trajectory: member.train_on(trajectory, draw))
         return {"loss": torch.stack(losses).sum()}
 
     def validation_step(self, x0: Tensor, batch_idx: int) -> None:
-        """The tables of the fixed validation states, and the losses that pick the best checkpoints."""
+        """Fill the tables of the validation states and log the losses that choose the best checkpoints."""
         for member, loss in zip(self.members, self.validate_on(x0), strict=True):
             self.log(labelled("loss/val", member.label), loss, logger=False, sync_dist=True)
 
     def validate_on(self, x0: Tensor) -> list[Tensor]:
-        """Fill each member's `validation` with the table of its states; the programs' losses on them."""
+        """Fill each member's table `validation` and return the validation losses."""
         return self.without_gradient(x0, Learner.measure_on)
 
     def without_gradient(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
-        """What `evaluate` makes of each member's trajectories."""
+        """Evaluate each member's trajectories without recording a gradient."""
         with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
             return self._for_each(x0.clone(), evaluate)
 
     def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
-        """What `evaluate` makes of each member's trajectories; a divergence names iteration and member."""
+        """Evaluate each member's trajectories; adds iteration and member to the message of a divergence."""
         trajectories, results = self.trajectories(x0), []
         for member in self.members:
             try:
@@ -95,11 +95,11 @@ class TrainingModule(L.LightningModule):
         return results
 
     def place(self, label: str) -> str:
-        """Where a member's training is, for messages."""
+        """Iteration and member, for messages."""
         return f"Iteration {self.global_step}" + (f", {label.replace('_', ' ')}" if label else "")
 
     def backward(self, loss: Tensor, *args: Any, **kwargs: Any) -> None:
-        """Lightning's, which also meets an adaptive adjoint that gives up."""
+        """Lightning's backward pass; reports an adaptive solver that does not reach t = 0 as a divergence."""
         try:
             super().backward(loss, *args, **kwargs)
         except AssertionError as error:
@@ -111,7 +111,7 @@ class TrainingModule(L.LightningModule):
             ) from error
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Record the norm of each member's gradient; refuse to step along one that is not finite."""
+        """Record the norm of each member's gradient; raise DivergenceError if it is not finite."""
         for member in self.members:
             norms = [p.grad.norm() for p in member.V.parameters() if p.grad is not None]
             member.gradient_norm = float(torch.stack(norms).norm())
@@ -122,7 +122,7 @@ class TrainingModule(L.LightningModule):
                 )
 
     def configure_optimizers(self) -> dict[str, Any]:
-        """One optimizer for all members, each with a learning rate of its own."""
+        """One optimizer with a parameter group, and so a learning rate, for each member."""
         options = self.optimizer_options
         optimizer = options.optimizer([{"params": [*member.V.parameters()]} for member in self.members])
         iterations = options.iterations or self.trainer.estimated_stepping_batches
@@ -134,30 +134,30 @@ class TrainingModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """The curves, for any trainer; one that has these callbacks keeps its own."""
+        """Add the callbacks for curves, unless the trainer already has them."""
         present = {type(callback) for callback in self.trainer.callbacks}  # pyright: ignore
         stopwatch = Stopwatch()
         return [c for c in (stopwatch, ScalarLogger(stopwatch)) if type(c) not in present]
 
     def setup(self, stage: str) -> None:
-        """Have any trainer write checkpoints with a digest, and verify it; one with files of its own keeps them."""
+        """Make the trainer write checkpoints with a digest, unless it has its own checkpoint plugin."""
         if type(self.trainer.strategy.checkpoint_io) is TorchCheckpointIO:
             self.trainer.strategy.checkpoint_io = CheckpointFiles()
 
     @property
     def penalty(self) -> PenaltyCost | None:
-        """What keeps closed loops off the constraints, where the problem has some."""
+        """The cost with the constraint penalty; None if the problem has no constraints."""
         cost = self.members[0].problem.cost
         return cost if isinstance(cost, PenaltyCost) else None
 
     def _state(self) -> dict[str, Any]:
-        """What a checkpoint says of the training besides weights."""
+        """The state of the training in a checkpoint besides the weights."""
         state = {"version": __version__, "rate_share": self.rate_share}
         return state if self.penalty is None else {**state, "penalty": float(self.penalty.weight)}
 
     @classmethod
     def load_from_checkpoint(cls, checkpoint_path: str | Path, *args: Any, **kwargs: Any) -> Any:
-        """Lightning's, of a file whose digest holds and in which nothing is executed.
+        """Lightning's method; verifies the digest first and executes no code of the file.
 
         Raises:
             LyapnetError: as read_checkpoint.
@@ -166,15 +166,12 @@ class TrainingModule(L.LightningModule):
         return super().load_from_checkpoint(checkpoint_path, *args, **{"weights_only": True, **kwargs})
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add what `lyapnet.load` needs, as plain data, and the share of the learning rate."""
+        """Add the plain data that `lyapnet.load` needs, and the factor of the learning rate."""
         checkpoint[KEY] = {**self.metadata, **self._state()}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on no faster than the checkpoint's training did, and where this one had to go back, more slowly.
-
-        Constraints have the penalty that they had.
-        """
-        self._tell_members_apart(checkpoint)
+        """Restore the penalty weight and the smaller of both learning rate factors, the stored and the current one."""
+        self._split_parameter_groups(checkpoint)
         if self.penalty is not None:
             self.penalty.weight.fill_(checkpoint.get(KEY, {}).get("penalty", 0.0))
         stored = checkpoint.get(KEY, {}).get("rate_share", 1.0)
@@ -183,8 +180,8 @@ class TrainingModule(L.LightningModule):
             for group in state["param_groups"]:
                 group["lr"] *= self.rate_share / stored
 
-    def _tell_members_apart(self, checkpoint: dict[str, Any]) -> None:
-        """Give each member a learning rate of its own where they have one for all, as in checkpoints of version 0.3."""
+    def _split_parameter_groups(self, checkpoint: dict[str, Any]) -> None:
+        """Split the common parameter group of version 0.3 into one group for each member."""
         counts = [len([*member.V.parameters()]) for member in self.members]
         for state in checkpoint.get("optimizer_states", []):
             if len(state["param_groups"]) == 1:
@@ -196,7 +193,7 @@ class TrainingModule(L.LightningModule):
                 if len(state.get(key, ())) == 1:
                     state[key] = state[key] * len(counts)
 
-    # A checkpoint holds each weight once, under the name that it has had since version 0.1.
+    # A checkpoint holds each weight once, under its name since version 0.1.
 
     def state_dict(self, *args: Any, **kwargs: Any) -> dict[str, Any]:
         own = super().state_dict(*args, **kwargs)
@@ -214,12 +211,12 @@ class TrainingModule(L.LightningModule):
         return super().load_state_dict(known, strict=False, assign=assign)
 
     def _stored_name(self, key: str) -> str:
-        """What a weight is called in checkpoints."""
+        """The name of a weight in checkpoints."""
         return key
 
 
 def _is_alias(key: str) -> bool:
-    """Whether it names a weight of V by its place in the closed loop."""
+    """Whether the key is a second name of a weight of V, by way of the closed loop."""
     return re.match(r"members\.\d+\.rollout\.", key) is not None
 
 
@@ -229,15 +226,15 @@ class ValueModule(TrainingModule):
         lightning.Trainer(max_epochs=300).fit(ValueModule(problem, V, ValueProgram()), InitialStateDataModule(problem))
 
     Args:
-        problem: what is to be solved.
-        V: what is trained.
-        program: what is minimised: a ValueProgram makes V the cost-to-go of its greedy policy, a LyapunovProgram makes
-            V fall along the closed loop at least as fast as the cost accrues.
-        rollout: the closed loop of a policy that V defines; None: that of the law that V is made for, the HJB law where
-            nobody knows, with its exact gradient. V is made for that law from then on.
-        pointwise: the program's condition off the closed loops, if that is a term too.
-        optimizer: how the weights move.
-        seed: of the points at which that condition is asked for.
+        problem: the optimal control problem.
+        V: the network that is trained.
+        program: the loss: a ValueProgram makes V the cost-to-go of its greedy policy, a LyapunovProgram makes V
+            decrease along the closed loop at least as fast as the cost accrues.
+        rollout: the closed loop of a policy that V defines; None: the closed loop of the law that V was made for, or of
+            the HJB law if that is unknown, with its exact gradient. V remembers this law.
+        pointwise: the program's condition at points off the closed loops, if it is a term of the loss.
+        optimizer: the options of the optimizer.
+        seed: seed of these points.
 
     Raises:
         UsageError: f, g, the cost or V break their contracts.
@@ -264,12 +261,12 @@ class ValueModule(TrainingModule):
 
     @property
     def problem(self) -> Problem:
-        """What is to be solved."""
+        """The optimal control problem."""
         return self.members[0].problem
 
     @property
     def V(self) -> ValueFunction:
-        """What is trained."""
+        """The network that is trained."""
         return self.members[0].V
 
     @property
@@ -279,7 +276,7 @@ class ValueModule(TrainingModule):
 
     @property
     def program(self) -> Program:
-        """What is minimised."""
+        """The loss."""
         return self.members[0].program
 
     def trajectories(self, x0: Tensor) -> Iterator[Trajectory]:
@@ -293,11 +290,11 @@ class ValueModule(TrainingModule):
 
 
 class EnsembleModule(TrainingModule):
-    """Several seeds' runs side by side, each as the run of its seed alone.
+    """Trains several seeds side by side, each exactly as in a run of that seed alone.
 
     Args:
-        members: of one problem, with networks of one shape.
-        optimizer: how the weights move.
+        members: learners of one problem, with networks of one shape.
+        optimizer: the options of the optimizer.
     """
 
     def __init__(self, members: Sequence[Learner], optimizer: OptimizerOptions | None = None):
@@ -318,8 +315,8 @@ class EnsembleModule(TrainingModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Each member's gradient by itself, as in a run of its own."""
-        by_value = gradient_clip_algorithm == "value"  # Lightning's enumeration is of strings
+        """Clip the gradient of each member separately, as in a run of its own."""
+        by_value = gradient_clip_algorithm == "value"  # Lightning's GradClipAlgorithmType is a string enumeration
         clip = nn.utils.clip_grad_value_ if by_value else nn.utils.clip_grad_norm_
         if gradient_clip_val and gradient_clip_val > 0:
             for member in self.members:
@@ -327,5 +324,5 @@ class EnsembleModule(TrainingModule):
 
 
 def labelled(name: str, label: str) -> str:
-    """The name of one member's share of something; the name itself where there is but one."""
+    """The name of a quantity of one member: name/label, or the name alone without a label."""
     return f"{name}/{label}" if label else name

@@ -1,4 +1,4 @@
-"""How the weights move."""
+"""Optimizers and the learning rate schedule."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,19 +8,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-MOMENTUM = 0.95  # of Muon
-QUINTIC = (3.4445, -4.7750, 2.0315)  # takes singular values in (0, 1] to about 1 in five rounds
+MOMENTUM = 0.95  # momentum coefficient of Muon
+QUINTIC = (3.4445, -4.7750, 2.0315)  # a, b, c of the iteration in `orthogonal`
 
 
 class Muon(torch.optim.AdamW):
-    """Muon for the matrices of a network, AdamW for its other parameters, such as biases and the last layer.
+    """Muon for the weight matrices of a network, AdamW for its other parameters, such as biases and the last layer.
 
-    With M the momentum of a gradient, a step along a matrix W is −0.2 √max(rows, columns) η U, where U is about the
-    orthogonal matrix closest to M: all singular directions move by as much, and the entries by as much as by Adam. It
-    is computed in the precision of W: torch.optim.Muon rounds M to 16 bits, after which two computations of one seed
-    that differ by rounding drift apart.
+    With M the momentum of the gradient and η the learning rate, the step of a matrix W is −0.2 √max(rows, columns) η U,
+    where U approximates the orthogonal matrix closest to M. All singular directions then move by the same amount, and
+    the entries of W by as much as with Adam. U is computed in the precision of W, because torch.optim.Muon rounds M to
+    16 bits, which amplifies rounding differences between two runs of the same seed.
 
-    Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks", 2024; the length of a step: Liu et
+    Source: Jordan et al., "Muon: An optimizer for hidden layers in neural networks", 2024; for the step length: Liu et
     al., "Muon is scalable for LLM training", arXiv 2502.16982.
     """
 
@@ -36,7 +36,7 @@ class Muon(torch.optim.AdamW):
                 if p.grad is not None and p.ndim == 2 and min(p.shape) > 1:
                     gradients[p] = p.grad
                     self._step_along(p, p.grad, group)
-                    p.grad = None  # which has AdamW pass it over
+                    p.grad = None  # AdamW skips parameters without gradient
         super().step()
         for p, gradient in gradients.items():
             p.grad = gradient
@@ -45,7 +45,7 @@ class Muon(torch.optim.AdamW):
     def _step_along(self, p: nn.Parameter, gradient: Tensor, group: dict[str, Any]) -> None:
         state = self.state[p]
         if not state:
-            state.update(step=torch.tensor(0.0), momentum=torch.zeros_like(p))  # AdamW counts every parameter's steps
+            state.update(step=torch.tensor(0.0), momentum=torch.zeros_like(p))  # AdamW expects `step`
         state["step"] += 1
         momentum = state["momentum"]
         momentum.lerp_(gradient, 1 - MOMENTUM)
@@ -55,8 +55,9 @@ class Muon(torch.optim.AdamW):
 
 
 def orthogonal(M: Tensor) -> Tensor:
-    """A matrix with the singular vectors of M, whose singular values are between 0.6 and 1.25 where those of M are not
-    small: UVᵀ of M = USVᵀ, by five rounds of X ↦ aX + bXXᵀX + c(XXᵀ)²X.
+    """Approximately UVᵀ for M = USVᵀ, by five iterations X ↦ aX + bXXᵀX + c(XXᵀ)²X.
+
+    Singular values of M that are not small become values between 0.6 and 1.25.
 
     Source: Jordan et al., 2024, for a, b, c.
     """
@@ -78,31 +79,30 @@ OPTIMIZERS: dict[str, Callable[..., torch.optim.Optimizer]] = {
 
 @dataclass(frozen=True)
 class OptimizerOptions:
-    """How weights move; the learning rate rises, if asked to, and falls along half a cosine.
+    """The optimizer and its learning rate: a linear warmup, then half a cosine.
 
-    The first steps have the full length along every weight, however small the gradient: from a good start they lead
-    away, unless they are short.
+    The warmup protects a good initial V: the first steps of Adam have full length even if the gradient is small.
     """
 
     name: str = "adam"  # a key of OPTIMIZERS
-    learning_rate: float = 1e-2  # the greatest
-    final_learning_rate: float = 1e-4  # at the last step, and after it
+    learning_rate: float = 1e-2  # largest rate, at the end of the warmup
+    final_learning_rate: float = 1e-4  # rate at the last step and after it
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 0.0
-    warmup: int = 0  # steps in which it rises to that first
-    iterations: int | None = None  # steps of the schedule; None: those of the trainer
+    warmup: int = 0  # steps of the warmup
+    iterations: int | None = None  # steps of the schedule; None: as many as the trainer makes
 
     def optimizer(self, parameters: Sequence[nn.Parameter | dict[str, Any]]) -> torch.optim.Optimizer:
-        """The optimizer of some parameters, or groups of them."""
+        """The optimizer for some parameters or parameter groups."""
         cls = OPTIMIZERS[self.name]
         return cls(parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay)
 
     def rate(self, step: int, iterations: float, cooling: tuple[int, int] | None = None) -> float:
-        """The learning rate at a step, as a share of the greatest.
+        """The learning rate at a step, relative to the largest.
 
         Args:
-            iterations: of the whole schedule.
-            cooling: steps between which it falls to its end, and then is zero; None: there are none.
+            iterations: steps of the whole schedule.
+            cooling: first and last step of the final decay, after which the rate is zero; None: no such decay.
         """
         final = self.final_learning_rate / self.learning_rate
         if cooling is not None and step > cooling[0]:

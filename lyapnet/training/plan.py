@@ -1,4 +1,4 @@
-"""What a training is to do: start a run, resume one, or start one from the weights of another."""
+"""Plans a training: a new run, a resumed run, or a new run with the weights of another."""
 
 import copy
 import logging
@@ -36,18 +36,18 @@ CHANGEABLE_ON_RESUME = (
 
 @dataclass(frozen=True)
 class Plan:
-    """Which module to train, with which callbacks of the user's own, in which run's folder, and from which step."""
+    """The module to train, the user's callbacks, the run's folder, and the first step."""
 
     config: Config
-    parts: Parts  # of the user's own
+    parts: Parts  # the user's objects
     module: TrainingModule
     callbacks: list[L.Callback]
     run: Run
-    resume_from: Path | None = None  # a checkpoint
-    step: int = 0  # at which that was written
-    end: float = math.inf  # of a training that has settled, its last step
-    anew: bool = False  # whether a run goes on that was stopped before its first checkpoint
-    lock: RunLock | None = None  # on the folder, held until `fit` is over; of the first process alone
+    resume_from: Path | None = None  # checkpoint to resume
+    step: int = 0  # step of this checkpoint
+    end: float = math.inf  # last step of a training that has settled
+    anew: bool = False  # whether the run was stopped before its first checkpoint and starts again
+    lock: RunLock | None = None  # lock of the folder, held until `fit` returns; only the first process has one
 
     def __post_init__(self) -> None:
         if self.resume_from is not None and self.config.training.iterations < self.step:
@@ -58,24 +58,24 @@ class Plan:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has its end behind it: there is nothing to train."""
+        """Whether the run is already finished, so that there is nothing to train."""
         last = min(self.config.training.iterations, self.end)
         return self.resume_from is not None and self.run.finished and self.step >= last
 
     @property
     def to_train_longer(self) -> str:
-        """What takes a finished run further, for messages."""
+        """The change with which a finished run can be trained longer, for messages."""
         return "Set training.least_gain=0" if math.isfinite(self.end) else "Raise training.iterations"
 
 
 def plan_run(
     config: Config, resume: str | None = None, finetune: Path | None = None, parts: Parts | None = None
 ) -> Plan:
-    """Build everything that a config names, and last of all, for a new run, its folder.
+    """Build everything that a config names and, for a new run, its folder.
 
     Args:
-        resume: "last", or the path of a checkpoint: go on with that run.
-        finetune: a checkpoint whose weights a new run starts from.
+        resume: "last", or the path of a checkpoint: continue that run.
+        finetune: a checkpoint with the initial weights of a new run.
         parts: as for `train`.
 
     Raises:
@@ -89,12 +89,12 @@ def plan_run(
     check_trainer_options(config)
     require_libraries(config.loggers)
     callbacks = build_callbacks(config)
-    torch.set_num_threads(config.training.threads)  # compiled functions are kept for a number of threads
+    torch.set_num_threads(config.training.threads)  # before compiling: code is cached by number of threads
     parts = parts_of(config) if parts is None else parts
     require_parts(config, parts, config.experiment)
     module = build_module(config, parts)
     if not resume:
-        _start_from(config, module, finetune)
+        _load_initial_weights(config, module, finetune)
         run, lock = new_run(config, finetune)
         return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
@@ -105,10 +105,10 @@ def plan_run(
     with ExitStack() as stack:
         lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
         if resume == LAST and not run.begun:
-            _start_as(run, config, module)
+            _restart(run, config, module)
             plan = Plan(config, parts, module, callbacks, run, anew=True, lock=lock)
         else:
-            content = _read(checkpoint, run)
+            content = _read_to_resume(checkpoint, run)
             stored = config_of(content, checkpoint)
             if config.rollout.choose_policy and stored.rollout.policy != config.rollout.policy:
                 config.rollout.policy = stored.rollout.policy
@@ -122,7 +122,7 @@ def plan_run(
 
 
 def under_policy(plan: Plan, policy: str) -> Plan:
-    """The same plan under another control law, with V as it is."""
+    """The same plan with another control law and the same V."""
     config = copy.deepcopy(plan.config)
     config.rollout.policy = policy
     module = build_module(config, plan.parts)
@@ -131,8 +131,8 @@ def under_policy(plan: Plan, policy: str) -> Plan:
     return replace(plan, config=config, module=module)
 
 
-def _note_another_target(target: Any, problem: Problem, checkpoint: Path) -> None:
-    """Say that V was made for another goal, which it then begins about."""
+def _warn_of_other_target(target: Any, problem: Problem, checkpoint: Path) -> None:
+    """Warn if V was trained for another goal."""
     goal = problem.goal.tolist()
     if target is None and problem.cost.rest is None:
         return
@@ -144,8 +144,8 @@ def _note_another_target(target: Any, problem: Problem, checkpoint: Path) -> Non
         )  # fmt: skip
 
 
-def _read(checkpoint: Path, run: Run) -> dict[str, Any]:
-    """A checkpoint to go on from; where the last one is lost, a refusal that names the best one."""
+def _read_to_resume(checkpoint: Path, run: Run) -> dict[str, Any]:
+    """Read a checkpoint to resume; if the last one is unreadable, the error message names the best one."""
     try:
         return read_checkpoint(checkpoint)
     except LyapnetError as error:
@@ -154,21 +154,21 @@ def _read(checkpoint: Path, run: Run) -> dict[str, Any]:
         raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
 
 
-def _start_as(run: Run, config: Config, module: TrainingModule) -> None:
-    """Begin a run again that was stopped before its first checkpoint: it stands where it began."""
+def _restart(run: Run, config: Config, module: TrainingModule) -> None:
+    """Start a run again that was stopped before its first checkpoint."""
     written = run.folder / CONFIG
     if written.exists():
         _require_same_experiment(config, load_config(written), written)
-    _start_from(config, module, run.finetuned_from)
+    _load_initial_weights(config, module, run.finetuned_from)
 
 
-def _start_from(config: Config, module: TrainingModule, checkpoint: Path | None) -> None:
-    """Put the weights of a checkpoint into every member, if there is one to fine-tune from."""
+def _load_initial_weights(config: Config, module: TrainingModule, checkpoint: Path | None) -> None:
+    """Load the weights of a checkpoint into every member, if one is given."""
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)
         if content[KEY].get("config") is not None:
-            given = config_of(content, checkpoint)  # refuses what this version does not understand
-            if [*given.family] != [*config.family]:  # V takes them by their places
+            given = config_of(content, checkpoint)  # raises if this version cannot read it
+            if [*given.family] != [*config.family]:  # V identifies parameters by their order
                 names, own = (", ".join(family) or "none" for family in (given.family, config.family))
                 raise UsageError(
                     f"Expected a family in {names}, as of {str(checkpoint)!r}, got one in {own}; give the same names "
@@ -181,7 +181,7 @@ def _start_from(config: Config, module: TrainingModule, checkpoint: Path | None)
                     "start anew without --finetune."
                 )
             if not config.family:
-                _note_another_target(given.target, module.members[0].problem, checkpoint)
+                _warn_of_other_target(given.target, module.members[0].problem, checkpoint)
         for member in module.members:
             load_value_function(member.V, content, checkpoint)
 

@@ -1,4 +1,4 @@
-"""Fitting V to optimal trajectories, before it trains in closed loop: supervised, and seconds long."""
+"""Supervised pretraining: fits V to optimal trajectories before the training in closed loop."""
 
 import copy
 import math
@@ -25,147 +25,154 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
 from lyapnet.value.policy import LookaheadPolicy
 
-BATCH = 512  # examples in a step
-BRIEF = 200  # steps that tell what a fit can begin with
-SECONDS = 60.0, 30.0  # of this thread's work, in which those steps are taken, or as many of them as there is time for
-GAIN = 2e-4  # of the cost of the optima, by which a further fit has to lower that of the law for another one
-NEWTON = 6  # steps to where a law that looks ahead looks at V
-SOME = 20_000  # examples that tell how wrong an expansion is before a fit
-ROUNDS, GOOD = 4, 1.001  # of fitting where the fitted law leads, at most; times the optimum, when that is enough
-IN_VAIN = 2  # rounds without a gain, one after the other, that are the last
-VALUE_WEIGHT = 10.0  # of the squared relative error of V, against the relative excess of the cost
-LEAST = 1e-4  # of the cost of its trajectory, against which an error of a stationary V counts where V is less
-TRUSTED, TRUSTED_NEAR = 0.01, 1.0  # ½ δᵀ|H|δ, as a share of J, up to which an expansion is believed
+BATCH_SIZE = 512  # examples in a step
+BRIEF_STEPS = 200  # steps of a brief fit, which compares initial values of V
+FIT_SECONDS = 60.0, 30.0  # CPU seconds of this thread for the first fit and for each further round, at most
+MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
+NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
+MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
+MAX_ROUNDS = 4  # rounds of fitting at the states that the fitted law visits
+SUFFICIENT_COST_RATIO = 1.001  # cost relative to the optima at which the rounds stop
+PATIENCE = 2  # consecutive rounds without gain after which the rounds stop
+VALUE_WEIGHT = 10.0  # weight of the squared relative error of V, against the relative excess cost
+MIN_VALUE_SHARE = 1e-4  # of the trajectory's cost: floor of V in the relative errors of a stationary V
+TRUST_LIMIT = 0.01  # largest ½ δᵀ|H|δ relative to J for which an expansion is used at a deviation δ
+NEIGHBOUR_TRUST_LIMIT = 1.0  # the same for deviations towards neighbours
 
 
 class Method(NamedTuple):
-    """How a fit moves the weights, before and after the fitted law shows where it leads."""
+    """The optimizer of a fit; pairs are for the first fit and for the further rounds."""
 
     optimizer: Callable[..., torch.optim.Optimizer]
     steps: tuple[int, int]
-    rate: tuple[float, float]  # the greatest
+    rate: tuple[float, float]  # largest learning rate
 
 
-# Where controls or states are at a limit V_x has kinks: a V that Muon fits is as right along optimal trajectories, and
-# wild beside them.
+# With limits of controls or states V_x has kinks. There a V fitted by Muon is accurate along optimal trajectories but
+# oscillates beside them, hence Adam.
 SMOOTH = Method(partial(Muon, weight_decay=0.0), (1000, 500), (0.02, 0.01))
 WITH_LIMITS = Method(torch.optim.Adam, (2000, 1000), (0.01, 0.005))
 
 
 def method_for(problem: Problem) -> Method:
-    """The method of a fit to optima of a problem."""
+    """The optimizer for the fit to optima of a problem."""
     return WITH_LIMITS if problem.controls.limited or problem.constraints is not None else SMOOTH
 
 
 class Examples(NamedTuple):
-    """What is known along optimal trajectories and near them."""
+    """Data of V on optimal trajectories and near them, one row for each of k states."""
 
     t: Tensor  # t_n (k,)
     x: State
     value: PerState  # V(t_n, x_n)
     after: Tensor  # t_{n+1}
-    about: Control  # c, where the law looks at V: the control that costs nothing, or the best one
-    led: State  # F(x_n, c)
+    about: Control  # c, the reference control: at F(x, c) the law evaluates V; the control at rest or the best one
+    led: State  # F(x_n, c), the next state under c
     by_control: Tensor  # B (k, n, m), F_u/Δt there
     slope: Control  # ℓ_u there
     weight: Tensor  # W (k, m, m), ℓ_uu + Δt BᵀHB
     best: Control  # the minimiser of ½ (u − c)ᵀW(u − c) + bᵀ(u − c) over U, b = BᵀV_x + ℓ_u
-    cost: PerState  # what errors of V are held against: J of the trajectory, or the median of all if that is more
-    rate: PerState  # what excess cost per second is held against: the same per second of T
+    cost: PerState  # scale of errors of V: J of the trajectory, at least the median J of all
+    rate: PerState  # scale of the excess cost per second: `cost` divided by T
 
-    def with_further(self, others: "Examples") -> "Examples":
-        """These and others of the same problem."""
+    def concatenated_with(self, others: "Examples") -> "Examples":
+        """Concatenation with other examples of the same problem."""
         return Examples(*(torch.cat(both) for both in zip(self, others, strict=True)))
 
     def each(self, change: Callable[[Tensor], Tensor]) -> "Examples":
-        """The same with every column changed alike."""
+        """Apply a function to every column."""
         return Examples(*map(change, self))
 
     def to(self, like: Tensor) -> "Examples":
-        """The same in the precision and on the device of a tensor."""
+        """Convert to the precision and device of a tensor."""
         return self.each(lambda column: column.to(like))
 
 
-def examples_of(problem: Problem, optimum: Optimum, generator: torch.Generator, ahead: bool = False) -> Examples:
-    """The examples of those trajectories that are finite, in float64: a row at each node, and one at a state near it.
+def draw_examples(problem: Problem, optimum: Optimum, generator: torch.Generator, ahead: bool = False) -> Examples:
+    """The examples of the finite trajectories, in float64: one row at each node, and one at a state near it.
 
-    The second is as far away, and in the direction, as a neighbour is at that time or before, halfway at most; V and
-    V_x there are those of the expansion. A fit that knows V on optimal trajectories alone need not keep to them.
+    The nearby state deviates towards a neighbouring trajectory, by at most half the distance to it at that time or
+    earlier; its V and V_x are those of the expansion. A law fitted on optimal trajectories alone may leave them.
 
     Args:
-        ahead: whether the law that is fitted looks at V where its own control leads.
+        ahead: whether the law to be fitted is the lookahead law.
     """
-    optimum = _finite(optimum)
-    near = _trusted(problem, optimum, _towards_neighbours(optimum.expansion.x, generator), TRUSTED_NEAR)
-    return _examples(problem, optimum, [torch.zeros_like(near), near], ahead)
+    optimum = _select_finite(optimum)
+    near = _limit_deviations(problem, optimum, _draw_deviations(optimum.expansion.x, generator), NEIGHBOUR_TRUST_LIMIT)
+    return _build_examples(problem, optimum, [torch.zeros_like(near), near], ahead)
 
 
 def examples_visited(problem: Problem, optimum: Optimum, path: Path, ahead: bool = False) -> Examples:
-    """A row at each state that a law led to from where the optimal trajectories begin, as their expansions say.
+    """Examples at the states that a law visits from the initial states of the optima, with V from their expansions.
 
-    A law that V defines leaves the states that V was fitted at, along directions in which V is then free; so the
-    states of that very law are examples too. Those too far from the optimum for its expansion are drawn nearer.
+    The law of the fitted V leaves the states of the fit, in directions in which V was not determined. Fitting also at
+    the states that this law visits closes the gap (dataset aggregation). States too far from the optimum for its
+    expansion are moved closer.
 
     Source: Ross, Gordon, Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
-    learning", AISTATS 2011, for the loop.
+    learning", AISTATS 2011.
     """
-    optimum = _finite(optimum)
+    optimum = _select_finite(optimum)
     deviation = path.x[:-1] - optimum.expansion.x[:-1]
-    return _examples(problem, optimum, [_trusted(problem, optimum, deviation, TRUSTED)], ahead)
+    return _build_examples(problem, optimum, [_limit_deviations(problem, optimum, deviation, TRUST_LIMIT)], ahead)
 
 
-def _trusted(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
-    """Deviations (N, b, n) from trajectories, drawn nearer where ½ δᵀ|H|δ is more than a share of the cost."""
+def _limit_deviations(problem: Problem, optimum: Optimum, deviation: StatePath, share: float) -> StatePath:
+    """Scale down deviations δ (N, b, n) for which ½ δᵀ|H|δ is more than a share of the cost."""
     values, vectors = torch.linalg.eigh(optimum.expansion.hessian[:-1])
     quadratic = ((apply(vectors.mT, deviation) ** 2 * values.abs()).sum(-1) / 2).nan_to_num(torch.inf)
-    ratio = share * _costs_of(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
+    ratio = share * _error_scale(problem, optimum) / quadratic.clamp_min(torch.finfo(quadratic.dtype).tiny)
     return ratio.sqrt().clamp_max(1)[..., None] * deviation
 
 
-def _examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
-    """The rows at some deviations (N, b, n) from the finite trajectories, where f, g and the cost are defined."""
-    problem, optimum = in_float64(problem), _finite(optimum)
-    columns = (_columns(problem, optimum, each, at) for each in deviations for at in _looked_at(problem, ahead))
+def _build_examples(problem: Problem, optimum: Optimum, deviations: Sequence[Tensor], ahead: bool) -> Examples:
+    """The rows at some deviations (N, b, n) from the finite trajectories; rows with non-finite entries are left out."""
+    problem, optimum = in_float64(problem), _select_finite(optimum)
+    columns = (
+        _example_columns(problem, optimum, each, at)
+        for each in deviations
+        for at in _reference_controls(problem, ahead)
+    )
     parts = zip(*columns, strict=True)
     examples = Examples(*(torch.cat(columns) for columns in parts))
     defined = torch.stack([column.reshape(len(column), -1).isfinite().all(1) for column in examples]).all(0)
     return examples.each(lambda column: column[defined])
 
 
-def _looked_at(problem: Problem, ahead: bool) -> Sequence[bool]:
-    """Whether rows are about the best control, or about the one that costs nothing, or there are rows about each.
+def _reference_controls(problem: Problem, ahead: bool) -> Sequence[bool]:
+    """The reference controls of the rows: False for the control at rest, True for the best control.
 
-    A law that looks ahead searches from the second to the first, so that V has to be right at both. With constraints
-    the control that costs nothing may lead across one, where V is steeper than a network can follow; as the law knows
-    the penalty of one step by itself, rows about the best control are enough.
+    The lookahead law searches from the control at rest to the best one, so V has to be accurate at both. With
+    constraints the control at rest may violate one, where V is too steep for a network. The law adds the penalty of one
+    step itself, so rows at the best control are sufficient.
     """
     if not ahead:
         return [False]
     return [True] if problem.constraints is not None else [False, True]
 
 
-def _finite(optimum: Optimum) -> Optimum:
+def _select_finite(optimum: Optimum) -> Optimum:
     return optimum.member(optimum.path.cost.isfinite())
 
 
-def _costs_of(problem: Problem, optimum: Optimum) -> Tensor:
-    """What errors of V at each node but the last are held against, (N, b).
+def _error_scale(problem: Problem, optimum: Optimum) -> Tensor:
+    """The scale of errors of V at each node but the last, (N, b).
 
-    It is the cost of the trajectory, or the median of all if that is more. A stationary V is to be right in relation to
-    what it is at that state, near the goal too, but for LEAST of the same.
+    It is the cost of the trajectory, at least the median of all. For a stationary V it is the value at that state, so
+    that V is accurate near the goal too, at least MIN_VALUE_SHARE of the cost.
     """
     size = sizes(problem, optimum.path.cost)
-    costs = size.clamp_min(typical(size)).expand(len(optimum.path.u), -1)
-    return optimum.expansion.value[:-1].maximum(LEAST * costs) if problem.horizon.stationary else costs
+    costs = size.clamp_min(typical_cost(size)).expand(len(optimum.path.u), -1)
+    return optimum.expansion.value[:-1].maximum(MIN_VALUE_SHARE * costs) if problem.horizon.stationary else costs
 
 
-def typical(cost: PerState) -> float:
-    """The median of some costs, or their mean where half of them are none."""
+def typical_cost(cost: PerState) -> float:
+    """The median of some costs, or their mean if the median is zero."""
     return float(cost.median()) or float(cost.mean())
 
 
-def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
-    """A deviation (N, b, n) at each node but the last: the difference from a neighbour, then or before, times ±½."""
+def _draw_deviations(x: StatePath, generator: torch.Generator) -> Tensor:
+    """Random deviations (N, b, n) at all nodes but the last, each up to half an earlier difference to a neighbour."""
     nodes, b = len(x) - 1, x.shape[1]
     if b == 1:
         return torch.zeros_like(x[:-1])
@@ -177,12 +184,11 @@ def _towards_neighbours(x: StatePath, generator: torch.Generator) -> Tensor:
     return share * (x[before, neighbour] - x[before, every])
 
 
-def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:
-    """The columns of the examples at the nodes of some optima, each a deviation away from them.
+def _example_columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: bool) -> list[Tensor]:
+    """The columns of the examples at given deviations from the nodes of some optima.
 
-    They are about the best control, or the one that costs nothing.
-
-    A penalty for constraints is no quadratic: of what V has of it in one step the known value is taken.
+    The reference control is the best control or the control at rest. The constraint penalty of one step is not
+    quadratic; its exact value is used.
     """
     (x, value, gradient, hessian), dt = without_penalty(problem, optimum.expansion), problem.horizon.dt
     now, H = x[:-1] + deviation, hessian[1:]
@@ -191,21 +197,21 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: 
     floor = 2 * FLOOR * torch.linalg.eigvalsh(problem.cost.R(now))[..., :1]
 
     def responses(about: Control) -> tuple[State, Tensor, Control, Tensor, Control]:
-        """(F, B, ℓ_u, W) about a control, and the best one as V is to second order there."""
+        """(F, B, ℓ_u, W) at a control, and the best control by the second order expansion there."""
         answer = problem.response(now, about)
         _, slope, bend = penalty_of_one_step(problem, answer.x)
         B = answer.by_control
         values, vectors = torch.linalg.eigh(answer.curvature + dt * B.mT @ (H + bend) @ B)
         W = (vectors * values.maximum(floor)[..., None, :]) @ vectors.mT
         b = apply(B.mT, gradient[1:] + apply(H, answer.x - x[1:]) + slope) + answer.slope
-        return answer.x, B, answer.slope, W, _compared(problem).minimise(W / 2, b - apply(W, about))
+        return answer.x, B, answer.slope, W, _control_set_of_fit(problem).minimise(W / 2, b - apply(W, about))
 
     about = problem.rest.to(now).expand(*now.shape[:-1], -1)
     led, B, slope, W, best = responses(about)
-    for _ in range(NEWTON if about_best else 0):
+    for _ in range(NEWTON_STEPS if about_best else 0):
         about = best
         led, B, slope, W, best = responses(about)
-    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _costs_of(problem, optimum)
+    t, cost = problem.horizon.times(now)[:, None].expand(value.shape), _error_scale(problem, optimum)
     rate = cost / problem.horizon.duration
     if problem.horizon.stationary:
         rate = rate.maximum(-value.diff(dim=0) / dt)
@@ -214,30 +220,30 @@ def _columns(problem: Problem, optimum: Optimum, deviation: Tensor, about_best: 
 
 
 def errors(V: ValueFunction, examples: Examples, problem: Problem) -> tuple[Tensor, Tensor]:
-    """The means of (V − V*)²/J², and of T/J (Q(u*) − min over u ∈ U of Q(u)).
+    """The mean squared value error (V − V*)²/J², and the mean excess cost T/J (Q(u*) − min over u ∈ U of Q(u)).
 
-    Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c) is what one second of u costs to second order as V has it, b = BᵀV_x + ℓ_u:
-    the second is zero where V asks for the optimal control u*, and convex in V_x, of slope B(u* − u). Without limits it
-    is ½ (b − b*)ᵀW⁻¹(b − b*), what the law of V costs beyond the optimum; a V_x that is wrong where u is at its limit
-    all the same costs nothing. Of a stationary V, J stands for V* and J/T for ℓ at each state, and limits are left out.
+    Q(u) = ½ (u − c)ᵀW(u − c) + bᵀ(u − c), b = BᵀV_x + ℓ_u, is the second order cost per second of a control u
+    predicted by V. The excess is zero if V yields the optimal control u*; it is convex in V_x with slope B(u* − u).
+    Without control limits it is ½ (b − b*)ᵀW⁻¹(b − b*), the excess cost of V's law. An error of V_x that leaves u at
+    its limit costs nothing. For a stationary V, V* replaces J, ℓ at each state replaces J/T, and limits are ignored.
 
     Source: Blondel, Martins, Niculae, "Learning with Fenchel-Young losses", JMLR 2020.
     """
     t, x, value, after, about, led, B, slope, W, best, cost, rate = examples
     b = apply(B.mT, V.value_and_state_gradient(after, led)[1]) + slope
     with torch.no_grad():
-        u = _compared(problem).minimise(W / 2, b - apply(W, about))
+        u = _control_set_of_fit(problem).minimise(W / 2, b - apply(W, about))
     excess = ((best - u) * (apply(W, (best + u) / 2 - about) + b)).sum(-1)  # Q(u*) − Q(u)
     return (((V(t, x) - value) / cost) ** 2).mean(), (excess / rate).mean()
 
 
 class _Misfit(nn.Module):
-    """Columns of examples ↦ what a fit lowers."""
+    """The loss of a fit: columns of examples ↦ VALUE_WEIGHT times the value error, plus the excess cost."""
 
     def __init__(self, V: ValueFunction, problem: Problem):
         super().__init__()
         self.V = V
-        self._problem = [problem]  # which has no part in what is trained
+        self._problem = [problem]  # in a list, so that it is no submodule with trained parameters
 
     def forward(self, *columns: Tensor) -> Tensor:
         (problem,) = self._problem
@@ -245,84 +251,84 @@ class _Misfit(nn.Module):
         return VALUE_WEIGHT * value_error + excess
 
 
-def _compared(problem: Problem) -> ControlSet:
-    """The controls among which those of V are compared with the best ones.
+def _control_set_of_fit(problem: Problem) -> ControlSet:
+    """The controls over which Q is minimised: U, or ℝᵐ for a stationary V.
 
-    A stationary V is asked whether it falls, wherever u is: its slopes are to be right at the limits of u too.
+    A stationary V has to decrease wherever u is; without limits its slope is fitted at the limits of u too.
     """
     return Unbounded() if problem.horizon.stationary else problem.controls
 
 
 def misfit(V: ValueFunction, examples: Examples, problem: Problem) -> float:
-    """What a fit lowers, at SOME of the examples."""
-    rows = torch.linspace(0, len(examples.t) - 1, min(SOME, len(examples.t))).long()
+    """The loss of a fit, at MISFIT_SAMPLES of the examples."""
+    rows = torch.linspace(0, len(examples.t) - 1, min(MISFIT_SAMPLES, len(examples.t))).long()
     some = examples.each(lambda column: column[rows])
     with torch.no_grad():
         return float(_Misfit(V, problem)(*some.to(next(V.parameters()))).nan_to_num(torch.inf))
 
 
 def relative_misfit(V: ValueFunction, examples: Examples) -> float:
-    """The mean of (log V − log V*)², of a V that is positive but at the goal."""
+    """The mean of (log V − log V*)², for a V that is positive except at the goal."""
     like = next(V.parameters())
     with torch.no_grad():
         own, known = V(examples.t.to(like), examples.x.to(like)), examples.value.to(like)
-        least = LEAST * examples.cost.to(like).min()
+        least = MIN_VALUE_SHARE * examples.cost.to(like).min()
         return float((own.maximum(least).log() - known.maximum(least).log()).square().mean().nan_to_num(torch.inf))
 
 
 def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report = silent) -> None:
-    """Lower both errors of V at examples from optimal trajectories, and then where its own law leads too.
+    """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
-    The second is repeated, ROUNDS times at most, until the law costs no more than GOOD times the optima, or a further
-    round gains nothing. The V whose law cost least stays.
+    The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, or after
+    PATIENCE rounds without gain. The V with the cheapest law is kept.
 
     Args:
-        report: is told what is being done.
+        report: called with each stage of the work.
     """
-    fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _finite(optimum)
+    fitting, optimum = _Fit(learner, examples, stream(learner.seed, START, 3)), _select_finite(optimum)
     method = fitting.method
-    best, least, in_vain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
+    best, least, rounds_without_gain = copy.deepcopy(learner.V.state_dict()), (0.0, math.inf), 0
     size = float(sizes(learner.problem, optimum.path.cost).mean())
-    enough, gain = float(optimum.path.cost.mean()) + (GOOD - 1) * size, GAIN * size
-    for k in range(ROUNDS + 1):
-        again = f" where its law leads ({k} of at most {ROUNDS})" if k else ""
+    enough, gain = float(optimum.path.cost.mean()) + (SUFFICIENT_COST_RATIO - 1) * size, MIN_GAIN * size
+    for k in range(MAX_ROUNDS + 1):
+        again = f" where its law leads ({k} of at most {MAX_ROUNDS})" if k else ""
         late = min(k, 1)
-        within = f"within {SECONDS[late]:.0f} s of work"
+        within = f"within {FIT_SECONDS[late]:.0f} s of work"
         progress = partial(report, f"fitting V to {len(optimum.path.cost)} optima{again} {within}")
-        fitting.lower(examples, method.steps[late], method.rate[late], SECONDS[late], progress)
+        fitting.lower(examples, method.steps[late], method.rate[late], FIT_SECONDS[late], progress)
         path = learner.path_from(optimum.path.x[0])
         now = -float(path.cost.isfinite().double().mean()), float(path.cost.mean())
-        in_vain = 0 if now < (least[0], least[1] - gain) else in_vain + 1
+        rounds_without_gain = 0 if now < (least[0], least[1] - gain) else rounds_without_gain + 1
         if now < least:
             best, least = copy.deepcopy(learner.V.state_dict()), now
-        if k == ROUNDS or now[1] <= enough or in_vain == IN_VAIN:
+        if k == MAX_ROUNDS or now[1] <= enough or rounds_without_gain == PATIENCE:
             break
-        examples = examples.with_further(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
+        examples = examples.concatenated_with(examples_visited(learner.problem, optimum, path, looks_ahead(learner)))
     learner.V.load_state_dict(best)
 
 
 def looks_ahead(learner: Learner) -> bool:
-    """Whether the law of a learner looks at V where its own control leads, and not the one that costs nothing."""
+    """Whether the learner's law is the lookahead law, which evaluates V at the state that its own control reaches."""
     return isinstance(learner.rollout.closed_loop.policy, LookaheadPolicy)
 
 
 def fit_briefly(learner: Learner, examples: Examples) -> None:
-    """Lower both errors of V at examples in a few steps."""
-    briefly = _Fit(learner, examples, stream(learner.seed, START, 6))
-    briefly.lower(examples, BRIEF, briefly.method.rate[0], SECONDS[0], lambda done, total: None)
+    """Fit V to examples in BRIEF_STEPS steps."""
+    fitting = _Fit(learner, examples, stream(learner.seed, START, 6))
+    fitting.lower(examples, BRIEF_STEPS, fitting.method.rate[0], FIT_SECONDS[0], lambda done, total: None)
 
 
 class _Fit:
-    """Lowers both errors of V at examples; their gradient is traced once.
+    """Minimises the loss of a fit; its gradient is traced once.
 
     Args:
-        examples: like all that V is fitted to.
+        examples: some examples, with which the gradient is traced.
         generator: draws the rows of each step.
     """
 
     def __init__(self, learner: Learner, examples: Examples, generator: torch.Generator):
         self._trained, self._generator = trained_of(learner.V), generator
-        some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH).long()])
+        some = examples.each(lambda column: column[torch.linspace(0, len(column) - 1, BATCH_SIZE).long()])
         loss = _Misfit(learner.V, learner.problem)
         self._differentiate = gradient_of_loss(loss, some.to(self._trained[0]))
         self.method = method_for(learner.problem)
@@ -330,7 +336,7 @@ class _Fit:
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
-        """The learning rate falls as a cosine over the steps, or the seconds of this thread's work."""
+        """Minimise the loss with a cosine learning rate, over a number of steps or CPU seconds of this thread."""
         trained, began = self._trained, time.thread_time()
         examples, optimizer = examples.to(trained[0]), self.method.optimizer(trained, rate)
         for k in range(steps):
@@ -340,7 +346,7 @@ class _Fit:
             for group in optimizer.param_groups:
                 group["lr"] = rate * (1e-3 + (1 - 1e-3) * (1 + math.cos(math.pi * share)) / 2)
             progress(k, steps)
-            rows = torch.randint(len(examples.t), (BATCH,), generator=self._generator).to(trained[0].device)
+            rows = torch.randint(len(examples.t), (BATCH_SIZE,), generator=self._generator).to(trained[0].device)
             self._differentiate(*(column[rows] for column in examples))
             torch.nn.utils.clip_grad_norm_(trained, 1.0)
             optimizer.step()

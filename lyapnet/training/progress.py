@@ -1,4 +1,4 @@
-"""The callback that shows in a terminal how far a training is."""
+"""The callback that shows the progress of a training."""
 
 from collections.abc import Mapping, Sequence
 from statistics import fmean
@@ -13,7 +13,7 @@ from lyapnet.evaluation.states import StateTable
 from lyapnet.training.curves import members_of
 from lyapnet.training.stages import Stages
 
-# the line of a validation: name, key of the summary, format
+# columns of a validation's line: name, key of the summary, format
 VALIDATED = (
     ("cost", "cost_mean", ".4g"),
     ("cost/optimum", "cost_ratio", ".4f"),
@@ -24,18 +24,18 @@ VALIDATED = (
 
 
 class TrainingProgress(ProgressBar):
-    """A line for each validation; below them in a terminal, and in a log now and then: step, loss, cost, speed.
+    """Prints a line for each validation, and shows step, loss, cost and speed: in a terminal as a bar, else as lines.
 
-    A terminal also has the time left.
+    The bar also shows the remaining time.
 
     Args:
-        stages: tells what is done before the first step, and in a log which step it is.
+        stages: shows what is done before the first step, and the steps where there is no terminal.
     """
 
     def __init__(self, stages: Stages):
         super().__init__()
         self._stages, self._console, self._progress, self._task = stages, stages.console, None, None
-        self._named = False  # whether it was said what validations are over
+        self._named = False  # whether the states of the validation means were described
 
     def disable(self) -> None:
         self._enabled = False
@@ -56,7 +56,7 @@ class TrainingProgress(ProgressBar):
             disable=not self._console.is_terminal,
         )
         self._task = self._progress.add_task("…", total=trainer.max_epochs, completed=trainer.global_step)
-        if self._console.is_terminal:  # the bar takes its place
+        if self._console.is_terminal:  # the bar replaces it
             self._stages.rest()
         self._progress.start()
         self._log(f"step {trainer.global_step} of {trainer.max_epochs}")
@@ -79,7 +79,7 @@ class TrainingProgress(ProgressBar):
         self._log(f"validation at step {trainer.global_step}")
 
     def _log(self, stage: str, detail: str = "") -> None:
-        """Tell a stage where there is no bar."""
+        """Show a stage if there is no bar."""
         if self._progress is not None and not self._console.is_terminal:
             self._stages(stage, detail=detail)
 
@@ -107,14 +107,14 @@ class TrainingProgress(ProgressBar):
         self._stop()
 
     def _stop(self) -> None:
-        if self._progress is not None:  # gives the cursor back to the terminal
+        if self._progress is not None:  # also shows the cursor again
             self._progress.stop()
             self._progress = None
         self._stages.__exit__()
 
 
 def about_means(tables: Sequence[StateTable]) -> str:
-    """Over which states the means of validations are."""
+    """Describe the states over which validations take means."""
     states = sum(len(table.cost) for table in tables)
     optima = [table.optimal_cost for table in tables if table.optimal_cost is not None]
     known = sum(int(optimum.isfinite().sum()) for optimum in optima)
@@ -124,7 +124,7 @@ def about_means(tables: Sequence[StateTable]) -> str:
 
 
 def mean_and_range(summaries: Sequence[Mapping[str, Any]], key: str, form: str) -> str:
-    """A measure's mean over the seeds and, of several, its range; nothing where it is not known."""
+    """Format a measure's mean over the seeds and, for several seeds, its range; empty if unknown."""
     values = [summary[key] for summary in summaries if summary.get(key) is not None]
     if len(values) < len(summaries):
         return ""

@@ -1,4 +1,4 @@
-"""What is done now and then during a training: at its start, every few steps, and at its end."""
+"""Base class of callbacks that act at the start of a training, every few steps, and at its end."""
 
 from abc import ABC, abstractmethod
 
@@ -8,7 +8,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 class Recurring(Callback, ABC):
     """Acts before the first step, at validations every `every` steps, and at the last validation.
 
-    A resumed training does not act again at the step from which it goes on.
+    A resumed training does not act again at the step where it is resumed.
     """
 
     def __init__(self, every: int):
@@ -16,7 +16,7 @@ class Recurring(Callback, ABC):
 
     @abstractmethod
     def act(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """What is done, on the weights as they are."""
+        """Act on the current weights."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.global_step == 0:

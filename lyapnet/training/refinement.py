@@ -1,4 +1,4 @@
-"""Counterexamples back into training, until a claim is certified: `lyapnet certify sound | region --refine`."""
+"""Trains on counterexamples until a claim is certified: `lyapnet certify sound | region --refine`."""
 
 import csv
 import io
@@ -22,9 +22,9 @@ from lyapnet.training.experiment import train
 from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
 
 POINTS_FILE = "points.csv"
-CALLBACKS = "callbacks="  # how an override that names them begins
+CALLBACKS_PREFIX = "callbacks="  # of an override that names callbacks
 Refinable = SoundCertificate | RegionCertificate
-FURTHER = 256  # counterexamples, and as many undecided points, of each round
+POINTS_PER_ROUND = 256  # counterexamples added in each round, and the same number of undecided points
 
 
 def refine(
@@ -35,20 +35,20 @@ def refine(
     console: Console,
     parts: Parts | None = None,
 ) -> tuple[Path, Refinable]:
-    """Certify; where that fails, train on with the points at which it failed, and certify again: the last of each.
+    """Alternate certification and training on the failing points; return the last checkpoint and certificate.
 
-    Round k lives in refine_k/ in the run's folder: the points (with those of the rounds before), the config (that of
-    the checkpoint with `pointwise.counterexamples`, a weight and a region if it had none, and a fifth of its learning
-    rate; then `overrides`) and a run that starts from the weights before. What is there already is taken as it is, so
-    the same command goes on after whatever stopped it.
+    Round k uses the folder refine_k/ in the run's folder. It holds the points of this and all earlier rounds, a config,
+    and a run that starts from the previous weights. The config is that of the checkpoint with
+    `pointwise.counterexamples`, a fifth of the learning rate, a weight and a region if it had none, and then
+    `overrides`. Existing files are used as they are, so the same command continues an interrupted refinement.
 
     Args:
-        certified: makes the certificate of the controller of a checkpoint, a funnel or a region.
-        parts: those of the user's own that it is made with; nothing else that a checkpoint names is imported.
+        certified: computes the certificate of a checkpoint's controller, a funnel or a region.
+        parts: the user's objects of which it is made; nothing else that a checkpoint names is imported.
 
     Raises:
-        UsageError: a checkpoint names a part that is missing there, or callbacks that the overrides do not name.
-        Interrupted: Ctrl-C or SIGTERM while it trains.
+        UsageError: a checkpoint names an object that `parts` lacks, or callbacks that the overrides do not name.
+        Interrupted: Ctrl-C or SIGTERM during training.
     """
     home, parts = checkpoint.resolve().parent.parent, parts or Parts()
     for k in range(1, rounds + 1):
@@ -66,35 +66,35 @@ def refine(
 
 
 def failing_points(certificate: Refinable) -> Tensor:
-    """Points (t, x) at which a condition fails or is undecided inside the set that is sought, (k, 1 + n)."""
+    """Points (t, x) of the claimed set at which a condition fails or is undecided, (k, 1 + n)."""
     claim, generator = certificate.claim, stream(certificate.controller.config.seed, CERTIFICATION, 1)
-    failing = violations(*certificate.sought(), FURTHER, generator)
-    chosen = torch.randperm(len(claim.undecided), generator=generator)[:FURTHER]
+    failing = violations(*certificate.sought(), POINTS_PER_ROUND, generator)
+    chosen = torch.randperm(len(claim.undecided), generator=generator)[:POINTS_PER_ROUND]
     return torch.cat([failing, claim.undecided[chosen]])
 
 
 def _extent(certificate: Refinable) -> list[float]:
-    """A bound of each |x_i − x*_i| in D; 1 for states that the claim leaves out."""
+    """A bound of each |x_i − x*_i| in D; 1 for states that do not occur in the claim."""
     states = certificate.claim.states
     reach = states.reach_from(certificate.controller.problem.goal.to(states.lower))
     return [bound if bound > 0 else 1.0 for bound in reach.tolist()]
 
 
 def _finished_run(folder: Path) -> Run | None:
-    """The training of a round, if it came to its end."""
+    """The run of a round if it is finished, else None."""
     runs = runs_of(load_config(folder / CONFIG)) if (folder / CONFIG).exists() else []
     return runs[-1] if runs and runs[-1].finished else None
 
 
 def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], parts: Parts) -> None:
-    """Write what a round trains on, and its config last."""
+    """Write the points of a round, and then its config."""
     controller = certificate.controller
     require_parts(controller.config, parts, folder.parent)
     _require_named_callbacks(controller.config, overrides)
     folder.mkdir(parents=True, exist_ok=True)
     config = to_plain(controller.config)
     for part, own in vars(parts).items():
-        if own is not None:  # whatever the checkpoint calls it; to be passed with each checkpoint of the round
+        if own is not None:  # replaces the name in the checkpoint; checkpoints of the round need this object too
             cls = own if isinstance(own, type) else type(own)
             config[part]["name"] = f"{cls.__module__}:{cls.__qualname__}"
             if part == "controls":
@@ -116,16 +116,19 @@ def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], par
 
 
 def _train(folder: Path, checkpoint: Path, overrides: Sequence[str], console: Console, parts: Parts) -> Run:
-    """Train a round to its end, from where it stands."""
-    named, config = [change for change in overrides if change.startswith(CALLBACKS)], load_config(folder / CONFIG)
+    """Start or continue the training of a round."""
+    named, config = (
+        [change for change in overrides if change.startswith(CALLBACKS_PREFIX)],
+        load_config(folder / CONFIG),
+    )
     _require_named_callbacks(config, named)
     resume, finetune = (LAST, None) if runs_of(config) else (None, checkpoint)
     return train(folder / CONFIG, named, resume=resume, finetune=finetune, console=console, parts=parts)
 
 
 def _require_named_callbacks(config: Config, overrides: Sequence[str]) -> None:
-    """Refuse callbacks that a file names and the user does not: they would be imported."""
-    if config.callbacks and not any(change.startswith(CALLBACKS) for change in overrides):
+    """Refuse callbacks that only the config file names, because they would be imported."""
+    if config.callbacks and not any(change.startswith(CALLBACKS_PREFIX) for change in overrides):
         listed = ",".join(config.callbacks)
         raise UsageError(
             f"Expected callbacks named by the command, got {listed} from a checkpoint's config; append "

@@ -1,4 +1,4 @@
-"""How dear training makes it to come close to what the constraints exclude: found on optima before the first step."""
+"""Chooses the constraint penalty weight from optimal trajectories, before the first training step."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -23,22 +23,25 @@ from lyapnet.value.expansions import (
     sizes,
 )
 
-STATES = 24  # of X₀, from which optima are sought
-FIRST, FACTOR, WEIGHTS = 1e-2, 10**0.25, 60  # the least weight, in units of the cost per second, and further ones
-STALLED, MOVED = 8, 1e-2  # weights in a row by which h, in units of the margin, does not move any more
-RESERVE = 0.5  # of the margin, which is left for a law that is not quite the optimum
+OPTIMA = 24  # number of optimal trajectories, from random states of X₀
+FIRST_WEIGHT = 1e-2  # smallest weight, in units of the mean cost per second
+WEIGHT_FACTOR = 10**0.25  # ratio of successive weights
+MAX_WEIGHTS = 60  # number of weights, at most
+STALL_WEIGHTS = 8  # larger weights that must not move h: a factor of 100
+STALL_TOLERANCE = 1e-2  # change of h, in units of the margin, that counts as no movement
+MARGIN_RESERVE = 0.5  # share of the margin that optima must leave free for the error of a trained law
 
 
 class Relaxation(NamedTuple):
-    """A penalty, and what it keeps."""
+    """A penalty weight, and how well the optima with this penalty keep the constraints."""
 
-    weight: float  # in cost per second
-    kept: int  # of the optima, how many stay within the constraints, with the reserve
-    cost_ratio: float | None  # their mean cost, penalty included, against that without constraints; None without a goal
-    states: int
-    price: float  # the difference of the two
-    largest: float  # the largest weight that was tried
-    worst: float  # the greatest h of the optima
+    weight: float  # cost per second at h = 0
+    kept: int  # number of optima that keep the constraints, with the reserve
+    cost_ratio: float | None  # mean cost with penalty, relative to that without constraints; None without a goal
+    states: int  # number of optima
+    price: float  # mean cost with penalty, minus that without constraints
+    largest: float  # largest weight that was tried, in cost per second
+    worst: float  # largest h of the optima
 
     def __str__(self) -> str:
         said = f"constraints: penalty of {self.weight:.3g}/s at h = 0"
@@ -57,15 +60,15 @@ class Relaxation(NamedTuple):
 
 
 def find_relaxation(problem: Problem, report: Report) -> Relaxation:
-    """The weight of a relaxed problem's penalty: the least of a series that keeps optima within h ≤ 0.
+    """Choose the smallest penalty weight of a geometric series for which the optima keep h ≤ 0 with a reserve.
 
-    The optima are those without constraints at first, and then follow the weight as it grows, until all of them are
-    kept; or until the penalty is most of what they cost and a hundredfold weight moves none of them any more. Then the
-    weight is the first of those that keep most.
+    The optima without constraints are the first initial guesses; each weight is warm-started from the previous one. The
+    search stops when all optima keep the constraints, or when the penalty is most of their cost and a hundredfold
+    weight has not moved any of them. Then it returns the smallest weight that keeps the most optima.
 
     Args:
-        problem: as Problem.relaxed gives it.
-        report: told what is being done.
+        problem: a problem with a penalty, made by Problem.relaxed; its weight is overwritten.
+        report: called with each stage of the work.
     """
     exact = in_float64(problem)
     cost = exact.cost
@@ -76,30 +79,32 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     free = float(finite.mean()) if len(finite) else 0.0
     unit = (float(sizes(exact, finite).mean()) if len(finite) else 0.0) or 1.0
     tried, closest = list[Relaxation](), list[Tensor]()
-    for k in range(WEIGHTS):
-        weight = unit / problem.horizon.duration * FIRST * FACTOR**k
+    for k in range(MAX_WEIGHTS):
+        weight = unit / problem.horizon.duration * FIRST_WEIGHT * WEIGHT_FACTOR**k
         cost.weight.fill_(weight)
-        report("optima with a penalty, dearer each time", k, 0)
+        report("optima with an increasing penalty", k, 0)
         path = optimal_trajectories(exact, path.x[0], path.u).path
-        worst = _worst(exact, path)
+        worst = _largest_constraint(exact, path)
         closest.append((worst / cost.margin).amax(-1))
-        kept = int((closest[-1] <= -RESERVE).sum())
+        kept = int((closest[-1] <= -MARGIN_RESERVE).sum())
         mean = float(path.cost.mean())
         ratio = mean / free if exact.has_goal and free else None
-        tried.append(Relaxation(weight, kept, ratio, STATES, mean - free, weight, float(worst.max())))
-        if kept == STATES or (mean - free > abs(free) + unit and _is_stalled(closest)):
+        tried.append(Relaxation(weight, kept, ratio, OPTIMA, mean - free, weight, float(worst.max())))
+        if kept == OPTIMA or (mean - free > abs(free) + unit and _is_stalled(closest)):
             break
     return max(tried, key=lambda each: each.kept)._replace(largest=tried[-1].weight, worst=tried[-1].worst)
 
 
 def _is_stalled(closest: Sequence[Tensor]) -> bool:
-    """Whether the greatest h of no trajectory, in units of its margin, has moved much by the last STALLED weights."""
-    return len(closest) > STALLED and bool(((closest[-1 - STALLED] - closest[-1]).abs() <= MOVED).all())
+    """Whether the last STALL_WEIGHTS weights have moved no trajectory's largest h, in units of the margin."""
+    return len(closest) > STALL_WEIGHTS and bool(
+        ((closest[-1 - STALL_WEIGHTS] - closest[-1]).abs() <= STALL_TOLERANCE).all()
+    )
 
 
 def _free_optima(problem: Problem, report: Report) -> Path:
-    """Optimal trajectories of a problem from a few states of X₀."""
-    x0 = problem.initial_states.sample(STATES, stream(0, START, 5))
+    """Optimal trajectories of the problem without constraints."""
+    x0 = problem.initial_states.sample(OPTIMA, stream(0, START, 5))
     expansions = [known for _, known in expansions_of(problem, report) if isinstance(known, Expansion)]
     laws = [*(greedy_law(problem, expansion) for expansion in expansions), at_rest(problem)]
     path = cheapest([path_under(problem, law, x0) for law in laws])
@@ -107,7 +112,7 @@ def _free_optima(problem: Problem, report: Report) -> Path:
     return optimal_trajectories(problem, x0, path.u, progress=progress).path
 
 
-def _worst(problem: Problem, path: Path) -> Tensor:
-    """The greatest h_j of each of some trajectories from the first step on, (states, k)."""
+def _largest_constraint(problem: Problem, path: Path) -> Tensor:
+    """The largest value of each h_j along each trajectory, from the first step on; (states, k)."""
     assert problem.constraints is not None
     return problem.constraints(path.x[1:]).amax(0)

@@ -1,4 +1,4 @@
-"""The lock in a run's folder: one process trains a run at a time."""
+"""The lock of a run's folder: only one process at a time trains a run."""
 
 import errno
 import os
@@ -10,14 +10,14 @@ from filelock import FileLock, Timeout
 from lyapnet.base.errors import LyapnetError, UsageError
 
 LOCK = ".lock"
-NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # what a file system without locks answers
+NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # errors of a file system without locks
 
 
 class RunLock:
-    """Held from its making to the end of its `with`. The kernel releases that of a dead process: none is ever stale.
+    """Acquires the lock on construction, releases it at the end of `with`. The kernel releases locks of dead processes.
 
     Raises:
-        UsageError: another process holds it; names that process.
+        UsageError: another process holds the lock; the message names it.
         LyapnetError: the folder cannot be written.
     """
 
@@ -30,8 +30,8 @@ class RunLock:
             self._lock.acquire()
         except Timeout as error:
             raise UsageError(
-                f"Expected a run that nobody trains, got {str(folder)!r}, which {_holder(folder / LOCK)} is training; "
-                "wait for it, or stop it with Ctrl-C, which saves."
+                f"Expected a run that nobody trains, got {str(folder)!r}, which {_read_holder(folder / LOCK)} is "
+                "training; wait for it, or stop it with Ctrl-C, which saves."
             ) from error
         except OSError as error:
             if error.errno not in NO_LOCKS:
@@ -48,13 +48,13 @@ class RunLock:
 
 
 def _write_holder(file: int) -> None:
-    """Write which process holds the lock into its file, from the second byte on: Windows locks the first."""
+    """Write into the lock file which process holds it, from the second byte on because Windows locks the first."""
     os.ftruncate(file, 0)
     os.write(file, f"\nprocess {os.getpid()} on {socket.gethostname()}\n".encode())
 
 
-def _holder(path: Path) -> str:
-    """The process that holds the lock."""
+def _read_holder(path: Path) -> str:
+    """Read which process holds the lock."""
     try:
         with path.open("rb", buffering=0) as file:
             file.seek(1)

@@ -1,4 +1,4 @@
-"""The folder of a run: what it holds, how it is made, and which one is the last."""
+"""The folder of a run: its files, how it is created, and the newest run of an experiment."""
 
 import errno
 import os
@@ -16,8 +16,8 @@ from lyapnet.training.run_lock import RunLock
 
 LAST, BEST = "last", "best"
 CONFIG = "config.yaml"
-EVALUATION = "evaluation.json"  # written last: its presence says that the run is finished
-RECORDED = {  # what is read of run.json: its types, and what version 0.1 leaves out
+EVALUATION = "evaluation.json"  # written last: a run with this file is finished
+RECORDED = {  # keys of run.json ↦ types, and the default for version 0.1, which lacks some keys (...: required)
     "finetuned_from": (str | None, ...), "compiled": (bool, False), "saved": (bool | None, None),
     "training_seconds": (float | int, 0.0), "peak_bytes": (int, 0), "returns": (list, []),
 }  # fmt: skip
@@ -32,12 +32,12 @@ class Run:
 
     @property
     def exists(self) -> bool:
-        """Whether there is such a run."""
+        """Whether the folder is that of a run."""
         return (self.folder / RUN_RECORD).is_file()
 
     @property
     def checkpoints(self) -> Path:
-        """Where last.ckpt and best.ckpt are."""
+        """The folder of last.ckpt and best.ckpt."""
         return self.folder / "checkpoints"
 
     @property
@@ -47,33 +47,33 @@ class Run:
 
     @property
     def best(self) -> Path:
-        """The checkpoint of the least validation loss."""
+        """The checkpoint with the least validation loss."""
         return self.checkpoints / f"{BEST}.ckpt"
 
     def members(self, config: Config) -> list["Run"]:
-        """Where each seed's best checkpoint and curves are: folders of their own, if there are several seeds."""
+        """The runs with each seed's best checkpoint and curves: subfolders, if there are several seeds."""
         labels = [label_of(one) for one in configs_of_seeds(config)]
         return [Run(self.folder / label) for label in labels] if config.seeds > 1 else [self]
 
     @property
     def finetuned_from(self) -> Path | None:
-        """The checkpoint whose weights the run started from."""
+        """The checkpoint with the initial weights of the run, if it was fine-tuned."""
         origin = self.record()["finetuned_from"]
         return Path(origin) if origin else None
 
     @property
     def compiled(self) -> bool:
-        """Whether the run is compiled, as it then goes on: machine code rounds differently."""
+        """Whether the run is compiled. It is resumed the same way, because compiled code rounds differently."""
         return self.record()["compiled"]
 
     @property
     def begun(self) -> bool:
-        """Whether it has left something that starting again would destroy, its last checkpoint or what came with it."""
+        """Whether the run has saved a checkpoint or a result that starting again would overwrite."""
         saved = self.record()["saved"]  # None under version 0.1, which did not record it
         return os.path.lexists(self.last) or self.finished or (self.best.exists() if saved is None else saved)
 
     def record(self) -> dict[str, Any]:
-        """What made the run, and what it took."""
+        """The content of run.json: provenance, training time and memory."""
         path = self.folder / RUN_RECORD
         record = {key: default for key, (_, default) in RECORDED.items()} | read_json(path, REPAIR)
         for key, (kinds, _) in RECORDED.items():
@@ -83,33 +83,33 @@ class Run:
         return record
 
     def note(self, **facts: Any) -> None:
-        """Add to the record, or replace in it."""
+        """Add facts to the record, or replace them."""
         write_json(self.folder / RUN_RECORD, {**self.record(), **facts})
 
     @property
     def finished(self) -> bool:
-        """Whether the run reached its end."""
+        """Whether the run is finished."""
         return (self.folder / EVALUATION).is_file()
 
     @property
     def evaluation(self) -> dict[str, Any]:
-        """What the best checkpoint of a finished run reaches, as `lyapnet evaluate --json` prints it.
+        """The evaluation of the best checkpoint of a finished run, as `lyapnet evaluate --json` prints it.
 
-        For several seeds: mean, spread, and each.
+        For several seeds: mean, standard deviation, and the evaluation of each.
         """
         return read_json(self.folder / EVALUATION, "resume the run with more iterations, which writes it anew")
 
 
 def is_further_process() -> bool:
-    """Whether this is a further process of a run whose folder and lock belong to the first one."""
+    """Whether this process is not the first one of a run; the first one owns the folder and the lock."""
     return int(os.environ.get("LOCAL_RANK", "0")) > 0
 
 
 def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock | None]:
-    """A folder that says what it is from its first moment on, so that a stopped run can always go on; and its lock.
+    """Create the folder of a new run and lock it. It appears together with run.json, so that it can always be resumed.
 
     Raises:
-        LyapnetError: it cannot be made.
+        LyapnetError: the folder cannot be created.
     """
     if is_further_process():
         return last_run(config), None
@@ -120,19 +120,19 @@ def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock |
         try:
             draft.chmod(0o755)
             write_json(draft / RUN_RECORD, _provenance(config, finetuned_from))
-            run = Run(_numbered(draft))
+            run = Run(_rename_to_next_number(draft))
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)
             raise
-        return run, RunLock(run.folder)  # only now: Windows renames no folder of an open file
+        return run, RunLock(run.folder)  # after renaming: Windows cannot rename a folder with an open file
     except OSError as error:
         raise LyapnetError(
             f"Expected a writable folder for runs, got {str(root)!r} ({error.strerror}); choose another with logs=PATH."
         ) from error
 
 
-def _numbered(draft: Path) -> Path:
-    """The folder under the next number, which another process may take meanwhile: then the one after it."""
+def _rename_to_next_number(draft: Path) -> Path:
+    """Rename a draft to version_K with the next free number K; tries again if another process takes the number."""
     while True:
         newest = max((number for number, _ in _versions(draft.parent)), default=-1)
         try:
@@ -165,8 +165,8 @@ def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:
         "seed": config.seed,
         "compiled": False,
         "saved": False,  # whether last.ckpt was ever written
-        "training_seconds": 0.0,  # of the processes that came to an end, kill -9 aside
-        "peak_bytes": 0,  # of memory, in the process that held most
+        "training_seconds": 0.0,  # total of all processes that were not killed
+        "peak_bytes": 0,  # largest memory of a process
         "finetuned_from": str(finetuned_from.resolve()) if finetuned_from else None,
         **versions("torch", "lightning"),
         "commit": commit(),

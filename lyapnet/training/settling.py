@@ -1,4 +1,4 @@
-"""The callback that ends a training in which further steps bring nothing."""
+"""Early stopping: ends a training whose validation loss has stopped falling."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,31 +14,36 @@ from lyapnet.training.learner import Learner, mean_over_processes
 from lyapnet.training.stages import Stages
 
 WINDOW = 40  # steps in which the validation loss has to fall
-COOLING = 40  # steps in which the learning rate then falls to its end
-NOISE = 5.0  # times the least gain: how far the mean loss of the window may be above the least
-PATIENCE = 120  # steps without a lower loss, after which it has stopped falling however it goes up and down
+COOLING = 40  # steps of the final decay of the learning rate
+NOISE_FACTOR = 5.0  # largest distance of the window's mean loss from the least loss, in units of the least gain
+PATIENCE = 120  # steps without a lower loss after which even an oscillating loss has stopped falling
 
 
 class Settling(Callback):
-    """Has a member's learning rate fall to its end once its validation loss has stopped falling; training ends with it.
+    """Decays a member's learning rate over COOLING steps once its validation loss has stopped falling; then ends.
 
-    The loss has stopped where its least value of the last WINDOW steps, the warmup not counted, is less than
-    `least_gain` below its least value before, and its mean not well above that: losses that go up and down need shorter
-    steps, not fewer. Where PATIENCE steps have brought no lower value either, that of the start counted, it has stopped
-    too: more would only cost time. Of several seeds, each settles as it would alone, and training ends with the last of
-    them; one that has ended waits with a rate of zero.
+    The loss has stopped falling if both hold:
+
+    1. Its least value in the last WINDOW steps is less than `least_gain` below its least value before. The warmup does
+       not count.
+    2. Its mean in the window is at most NOISE_FACTOR × `least_gain` above the least value, so that it does not
+       oscillate (an oscillating loss needs a smaller learning rate), or it has not fallen in PATIENCE steps, the
+       initial V included.
+
+    With several seeds each settles as it would alone; training ends with the last one, and the others wait with a
+    learning rate of zero.
 
     Args:
-        least_gain: in units of the loss, which are shares of the mean cost, or of the spread of the optimum where there
-            is no goal; 0: training takes all its steps.
-        warmup: steps in which the learning rate rises.
-        stages: where it is said.
+        least_gain: smallest gain, in units of the loss, which is relative to the mean cost, or to the spread of the
+            optimum if there is no goal; 0 disables early stopping.
+        warmup: steps of the learning rate's warmup.
+        stages: shows messages.
     """
 
     def __init__(self, least_gain: float, warmup: int, stages: Stages):
         self.least_gain, self.warmup, self.stages = least_gain, warmup, stages
         self.losses: dict[str, list[tuple[int, float]]] = {}  # label ↦ (step, loss) of each validation
-        self.cooling: dict[str, tuple[int, int]] = {}  # label ↦ between which steps the rate falls
+        self.cooling: dict[str, tuple[int, int]] = {}  # label ↦ first and last step of the final decay
 
     def state_dict(self) -> dict[str, Any]:
         return {"losses": self.losses, "cooling": self.cooling}
@@ -50,8 +55,8 @@ class Settling(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for member in members_of(pl_module):
             member.cooling = self.cooling.get(member.label)
-        self._shorten(trainer, members_of(pl_module))
-        if self.least_gain and trainer.global_step == 0:  # the start was validated by now
+        self._set_last_step(trainer, members_of(pl_module))
+        if self.least_gain and trainer.global_step == 0:  # the initial V is validated already
             self._note_losses(0, pl_module)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -63,7 +68,7 @@ class Settling(Callback):
             end, last = step + COOLING, trainer.max_epochs or math.inf
             if member.cooling is None and end < last and self._has_stopped(member.label, step):
                 self.cooling[member.label] = member.cooling = step, end
-                self._shorten(trainer, members)
+                self._set_last_step(trainer, members)
                 if trainer.is_global_zero:
                     named = f" of {member.label.replace('_', ' ')}" if member.label else ""
                     self.stages.console.print(
@@ -81,7 +86,7 @@ class Settling(Callback):
         losses = self.losses[label]
 
         def fell_by(steps: int, first: int) -> float:
-            """How far the least loss of so many last steps is below the least one before, from a first step on."""
+            """How far the least loss of the last `steps` steps is below the least one between `first` and these."""
             before = [loss for at, loss in losses if first <= at <= step - steps]
             since = [loss for at, loss in losses if at > step - steps]
             return min(before, default=math.inf) - min(since)
@@ -90,21 +95,21 @@ class Settling(Callback):
             return False
         window = [loss for at, loss in losses if at > step - WINDOW]
         above_least = fmean(window) - min(loss for _, loss in losses)
-        return above_least <= NOISE * self.least_gain or fell_by(PATIENCE, 0) < self.least_gain
+        return above_least <= NOISE_FACTOR * self.least_gain or fell_by(PATIENCE, 0) < self.least_gain
 
-    def _shorten(self, trainer: Trainer, members: Sequence[Learner]) -> None:
-        """End when all have settled."""
+    def _set_last_step(self, trainer: Trainer, members: Sequence[Learner]) -> None:
+        """Shorten the training if all members have settled."""
         end = end_of(self.cooling, len(members))
         if end < (trainer.max_epochs or math.inf):
             trainer.fit_loop.max_epochs = int(end)
 
 
 def end_of_training(checkpoint: Mapping[str, Any], config: Config) -> float:
-    """The last step of a training that has settled, as its checkpoint says; infinite where it has not."""
+    """The last step of a training that has settled, from its checkpoint; infinite if it has not."""
     state = checkpoint.get("callbacks", {}).get(Settling.__qualname__)
     return end_of(state["cooling"], config.seeds) if state and config.training.least_gain else math.inf
 
 
 def end_of(cooling: Mapping[str, tuple[int, int]], members: int) -> float:
-    """The last step of a training whose members have settled; infinite where one has not."""
+    """The last step of a training whose members have all settled; infinite otherwise."""
     return max(end for _, end in cooling.values()) if len(cooling) == members else math.inf

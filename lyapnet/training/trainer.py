@@ -1,4 +1,4 @@
-"""The Lightning trainer of a run: its loggers and its callbacks."""
+"""The Lightning trainer of a run, with its loggers and callbacks."""
 
 from functools import partial
 
@@ -25,7 +25,7 @@ from lyapnet.training.validation_optimum import ValidationOptimum
 
 
 def build_trainer(plan: Plan, console: Console) -> L.Trainer:
-    """The trainer of a planned run; it makes no file yet."""
+    """The trainer of a planned run; writes no files."""
     config, resumed_at = plan.config, plan.step if plan.resume_from else None
     loggers = [logger for run in plan.run.members(config) for logger in loggers_of_run(config, run, resumed_at)]
     return L.Trainer(
@@ -35,7 +35,7 @@ def build_trainer(plan: Plan, console: Console) -> L.Trainer:
         num_sanity_val_steps=0,
         inference_mode=False,  # figures and certificates need V_x after a validation too
         enable_model_summary=False,
-        use_distributed_sampler=False,  # each process has a stream of its own
+        use_distributed_sampler=False,  # each process has its own random stream
         default_root_dir=plan.run.folder,
         logger=loggers,
         callbacks=_callbacks(plan, console),
@@ -45,7 +45,7 @@ def build_trainer(plan: Plan, console: Console) -> L.Trainer:
 
 
 def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
-    """All callbacks, in the order in which they act."""
+    """All callbacks, in the order in which they are called."""
     config, run, stopwatch = plan.config, plan.run, Stopwatch()
     options, every, members = config.evaluation, config.training.validate_every, plan.module.members
     best = {member.label: one.best for member, one in zip(members, run.members(config), strict=True)}
@@ -70,9 +70,9 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
 
 
 def _compilation(plan: Plan, stages: Stages) -> list[Compilation]:
-    """What compiles the run, if anything may; a resumed run goes on as it was."""
+    """The callback that compiles the run, if allowed; a resumed run is compiled only if it was before."""
     options = plan.config.rollout
-    goes_on = plan.resume_from is not None
-    if options.gradient != "discrete" or options.compile == "off" or (goes_on and not plan.run.compiled):
+    is_resumed = plan.resume_from is not None
+    if options.gradient != "discrete" or options.compile == "off" or (is_resumed and not plan.run.compiled):
         return []
     return [Compilation(stages, plan.config.training.batch_size, plan.run.note)]

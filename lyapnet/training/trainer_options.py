@@ -1,4 +1,4 @@
-"""What the section `trainer` of a config may hand to lightning.Trainer."""
+"""The options of lightning.Trainer that the section `trainer` of a config may set."""
 
 import inspect
 import logging
@@ -17,9 +17,11 @@ TRAINER_OPTIONS = (
     "accelerator", "strategy", "devices", "gradient_clip_val", "gradient_clip_algorithm",
     "deterministic", "benchmark", "detect_anomaly", "profiler",
 )  # fmt: skip
-PROCESS = 200_000_000  # bytes that torch takes in each process of a training on several devices
+PROCESS_BYTES = 200_000_000  # memory of torch in each further process, in bytes
 SWITCH = "true or false", lambda value: isinstance(value, bool)
-VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {  # that Lightning does not judge: what is expected of them
+VALUES: dict[
+    str, tuple[str, Callable[[Any], bool]]
+] = {  # options that Lightning does not check: the expected value, its test
     "gradient_clip_val": ("a number ≥ 0", lambda value: type(value) in (int, float) and 0 <= value < math.inf),
     "deterministic": ("true, false or warn", lambda value: value in (True, False, "warn")),
     "benchmark": SWITCH,
@@ -28,16 +30,16 @@ VALUES: dict[str, tuple[str, Callable[[Any], bool]]] = {  # that Lightning does 
 
 
 def trainer_options(config: Config) -> dict[str, Any]:
-    """The options of a config: one CPU process unless it says otherwise."""
+    """The options of a config; by default one CPU process."""
     return {"accelerator": "cpu", "devices": 1, **config.trainer}
 
 
 def check_trainer_options(config: Config) -> None:
-    """Have Lightning judge the options now, before a run has a folder.
+    """Check the options, also by Lightning, before the folder of a run is created.
 
     Raises:
-        UsageError: an option that is unknown, or lyapnet's own; a value that Lightning refuses; devices that cannot
-            share an ensemble.
+        UsageError: an option is unknown or reserved for lyapnet, Lightning refuses its value, or an ensemble has
+            several devices.
     """
     for key, value in config.trainer.items():
         if key not in TRAINER_OPTIONS:
@@ -48,14 +50,14 @@ def check_trainer_options(config: Config) -> None:
         expected, holds = VALUES.get(key, ("", lambda _: True))
         if value is not None and not holds(value):
             raise UsageError(f"Expected trainer.{key} as {expected}, got {value!r}; correct it, or leave it out.")
-    _quiet()
+    _silence_notes()
     try:
         trainer = L.Trainer(logger=False, enable_checkpointing=False, **trainer_options(config))
-    except Exception as error:  # of many kinds: MisconfigurationException, ValueError, AttributeError, …
+    except Exception as error:  # MisconfigurationException, ValueError, AttributeError, …
         raise UsageError(
             f"Expected trainer options that Lightning accepts, got: {one_line(error).rstrip('.')}; correct the section."
         ) from error
-    require_memory("trainer.devices", trainer.num_devices, PROCESS * (trainer.num_devices - 1), "take fewer")
+    require_memory("trainer.devices", trainer.num_devices, PROCESS_BYTES * (trainer.num_devices - 1), "take fewer")
     if config.seeds > 1 and trainer.num_devices > 1:
         raise UsageError(
             f"Expected trainer.devices=1 for seeds={config.seeds}, got {trainer.num_devices} devices; seeds train side "
@@ -63,8 +65,8 @@ def check_trainer_options(config: Config) -> None:
         )
 
 
-def _quiet() -> None:
-    """Lightning's notes that are wrong here: one epoch is one step, and drawing states needs no workers."""
+def _silence_notes() -> None:
+    """Suppress notes of Lightning that do not apply: one epoch is one step, and the data loader needs no workers."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     for message in (".*LeafSpec.*", ".*does not have many workers.*"):
         warnings.filterwarnings("ignore", message)

@@ -1,4 +1,4 @@
-"""The optimum of the validation states, found before the first step."""
+"""The callback that computes the optimal cost of the validation states before the first step."""
 
 import time
 from functools import partial
@@ -15,17 +15,17 @@ from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner
 from lyapnet.training.stages import Stages
 
-COMPARED = 64  # of each member's validation states, the first: with these is the optimum sought
+COMPARED_STATES = 64  # first validation states of each member, whose optimum is computed
 
 
 class ValidationOptimum(Callback):
-    """Finds the optimum of COMPARED validation states before the first step, and says so.
+    """Computes the optimal cost of COMPARED_STATES validation states before the first step.
 
-    A checkpoint keeps it, so that a run is compared with the same numbers to its end, whatever the cache has by then.
+    Checkpoints store it, so that a resumed run is compared with the same numbers.
 
     Args:
-        stages: where it is said.
-        wanted: whether an optimum that is not known yet is sought.
+        stages: shows progress and messages.
+        wanted: whether to compute the optimum if the checkpoint has none.
     """
 
     def __init__(self, stages: Stages, wanted: bool = True):
@@ -51,11 +51,14 @@ class ValidationOptimum(Callback):
             self.stages("curves and figures of the start")
 
     def _solve(self, member: Learner, states: Tensor) -> Tensor | None:
-        """J* (members, b) of states (members, b, n), or (1, b) of (b, n), NaN after the first; None without oracle."""
+        """J* (members, b) for states (members, b, n), or (1, b) for (b, n); NaN after the first COMPARED_STATES states.
+
+        None if the problem has no oracle.
+        """
         started = time.perf_counter()
         try:
             oracle = oracle_of(member.problem, member.rollout.method)
-            compared = states[..., :COMPARED, :]
+            compared = states[..., :COMPARED_STATES, :]
             optima = oracle.solve(compared.flatten(0, -2), progress=partial(self.stages, "optima of validation states"))
         except OracleError as error:
             self.stages.console.print(f"no optimum to compare with: {error}", soft_wrap=True, markup=False)
@@ -63,7 +66,7 @@ class ValidationOptimum(Callback):
         seconds, missing = time.perf_counter() - started, ""
         if optima.failures:
             missing = f"; unknown for {optima.failures}, which are left out"
-        if missing or seconds > 0.2:  # else nobody waits for it
+        if missing or seconds > 0.2:  # short computations are not reported
             found = f"optimum of {len(optima.cost)} validation states, in {seconds:.0f} s"
             self.stages.console.print(f"{found}{missing}", soft_wrap=True)
         cost = optima.cost.cpu().reshape(-1, compared.shape[-2])

@@ -1,4 +1,4 @@
-"""What follows T where a goal is to be held: the law under which closed loops stay there."""
+"""The choice of the control law after T, under which closed loops stay near the goal."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,29 +11,29 @@ from lyapnet.base.errors import DivergenceError, one_line
 from lyapnet.base.types import PerState, State
 from lyapnet.task.problem import Problem
 
-LAWS = {  # those that can follow T, the one that is preferred first
+LAWS = {  # laws that can follow T, in order of preference
     "riccati": "the linear-quadratic regulator of the goal, for an infinite horizon",
     "receding": "V(0, x) and its law, as if the horizon began at every step",
     "hold": "V(T, x) and its law",
 }
-LOOPS, MULTIPLE = 64, 5  # closed loops that are tried, and up to how many T
-NEAR = 0.01  # share of the largest distance at t = 0 within which a closed loop is held, however near it was at T
+LOOPS, MULTIPLE = 64, 5  # number of test loops, and their duration in multiples of T
+NEAR = 0.01  # share of the largest distance at t = 0 that always counts as near the goal
 HELD = f"no farther from the goal at {MULTIPLE} T than at T"  # see is_held
-LONGEST = 20_000  # steps of a closed loop that is tried
+LONGEST = 20_000  # largest number of steps of a test loop
 REMEDY = "to choose another, load with beyond=hold, receding, riccati or error"
 
 
 class AfterHorizon(NamedTuple):
-    """A law after T, and how it was found to hold the goal."""
+    """A law after T, and how many test loops it keeps near the goal."""
 
     beyond: str  # a key of LAWS
-    held: int  # closed loops that it holds up to MULTIPLE T
-    loops: int  # of how many; 0 where none was tried
-    reason: str = ""  # why no law holds all of them; empty where this one does
+    held: int  # number of test loops that it holds up to MULTIPLE T
+    loops: int  # number of test loops; 0 if none was tried
+    reason: str = ""  # why no law holds all of them; empty if this one does
 
     @property
     def holds(self) -> bool:
-        """Whether it holds every closed loop that was tried."""
+        """Whether the law holds every test loop, and there was one."""
         return 0 < self.loops == self.held
 
     def __str__(self) -> str:
@@ -46,9 +46,9 @@ class AfterHorizon(NamedTuple):
 
 
 def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State]) -> AfterHorizon:
-    """The first of LAWS that holds closed loops from X₀ up to MULTIPLE T; else the one that holds most.
+    """The first of LAWS that holds all test loops from X₀ up to MULTIPLE T; else the law that holds most.
 
-    A task without end has one law for all time, which is tried alone.
+    A stationary task has one law for all time, and only that law is tested.
 
     Args:
         closed_loops: (a key of LAWS, x₀ (b, n), steps) ↦ the states (steps + 1, b, n) under that law after T.
@@ -58,28 +58,28 @@ def choose_law(problem: Problem, closed_loops: Callable[[str, State, int], State
     if MULTIPLE * problem.horizon.steps > LONGEST:
         return AfterHorizon("hold", 0, 0, f"not tried, as {MULTIPLE} T are more than {LONGEST} steps")
     x0 = problem.initial_states.sample(LOOPS, torch.Generator().manual_seed(0))
-    held, reasons = {"hold": 0}, []  # what V says at T is there whatever f, g and the cost do
+    held, reasons = {"hold": 0}, []  # hold always exists
     for law in ("hold",) if problem.horizon.stationary else LAWS:
         try:
             stays = is_held(problem, closed_loops(law, x0, MULTIPLE * problem.horizon.steps))
             held[law] = int(stays.sum())
         except DivergenceError:
             held[law] = 0
-        except Exception as refusal:  # of any kind: f, g and the cost, whose derivatives are asked, may be the user's
+        except Exception as refusal:  # f, g and the cost may be the user's
             reasons.append(f"{law}: {one_line(refusal)}")
             continue
         if held[law] == LOOPS:
             return AfterHorizon(law, LOOPS, LOOPS)
         reasons.append(f"{law}: {held[law]} of {LOOPS}")
-    most = max(held, key=lambda law: held[law])  # hold, where others hold as many
+    most = max(held, key=lambda law: held[law])  # hold, if it holds as many as others
     return AfterHorizon(most, held[most], LOOPS, "; ".join(reasons))
 
 
 def is_held(problem: Problem, x: State) -> Bool[Tensor, " batch"]:
-    """Whether closed loops x (nodes, batch, n) that go on after T are held, judged by their last node.
+    """Whether closed loops x (nodes, batch, n) that continue after T are held near the goal at their last node.
 
-    In the states that the cost weighs, ‖x − x*‖ is then no larger than at T, or than NEAR times the largest at t = 0;
-    and no constraint was violated after T by more than before.
+    That is: ‖x − x*‖, in the states that the cost weighs, is at most its value at T, or at most NEAR times the largest
+    at t = 0; and no constraint is violated after T by more than before.
     """
     N, distance = problem.horizon.steps, distance_to_goal(problem, x)
     stays = distance[-1] <= distance[N].clamp(min=NEAR * float(distance[0].max()))
@@ -97,7 +97,7 @@ def distance_to_goal(problem: Problem, x: State) -> PerState:
 
 
 def from_plain(content: Any) -> AfterHorizon | None:
-    """What a checkpoint says, as _asdict had it; None where it says nothing that can be read."""
+    """Restore from the plain data of _asdict in a checkpoint; None if it is missing or invalid."""
     types = {"beyond": str, "held": int, "loops": int, "reason": str}
     if not isinstance(content, dict) or {key: type(value) for key, value in content.items()} != types:
         return None

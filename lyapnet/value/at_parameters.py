@@ -1,4 +1,4 @@
-"""V of a family of problems at one value of its parameters."""
+"""V of a family of problems at fixed parameters."""
 
 import torch
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from lyapnet.value.calculus import ValueFunction
 
 
 class AtParameters(ValueFunction):
-    """V(t, (x, p)) of a family as a function of (t, x), at one p.
+    """V(t, (x, p)) of a family as a function of (t, x) at fixed p.
 
     Args:
-        V: of the family.
-        p: (k,).
+        V: value function of the family.
+        p: the parameters (k,).
     """
 
     p: Float[Tensor, " k"]
@@ -23,14 +23,14 @@ class AtParameters(ValueFunction):
         self.V, self.made_for = V, V.made_for
         self.register_buffer("p", p, persistent=False)
 
-    def _joined(self, x: Tensor) -> Tensor:
+    def _append_parameters(self, x: Tensor) -> Tensor:
         return torch.cat([x, self.p.expand(*x.shape[:-1], -1)], -1)
 
     def forward(self, t: Time, x: State) -> PerState:
-        return self.V(t, self._joined(x))
+        return self.V(t, self._append_parameters(x))
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
-        value, gradient = self.V.value_and_state_gradient(t, self._joined(x))
+        value, gradient = self.V.value_and_state_gradient(t, self._append_parameters(x))
         return value, gradient[..., : x.shape[-1]]
 
     def curvature(self, t: Time) -> Tensor | None:

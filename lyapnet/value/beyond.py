@@ -1,4 +1,4 @@
-"""What a controller does after T, for which V was not trained."""
+"""Control laws and value functions that continue after T, where V was not trained."""
 
 import logging
 from collections.abc import Callable
@@ -18,16 +18,16 @@ BEYOND = {**LAWS, "error": "a ValueError"}
 Chooser = Callable[[], AfterHorizon]
 
 
-class Sequel(nn.Module):
-    """What follows T: a law's name, and the regulator where it is riccati.
+class LawAfterHorizon(nn.Module):
+    """The law after T: its name, and the regulator if it is riccati.
 
     Args:
-        problem: whose T it is.
-        beyond: a key of BEYOND; None: what `choose` finds, when it is first asked for.
-        noted: whether it was said already what that is.
+        problem: the problem with T.
+        beyond: a key of BEYOND; None: the result of `choose`, which is called on first use.
+        noted: whether the law after T was already logged.
 
     Raises:
-        ValueError: another `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
+        ValueError: unknown `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
     """
 
     problem: Problem
@@ -40,7 +40,7 @@ class Sequel(nn.Module):
             raise ValueError(f"Expected beyond as one of {', '.join(BEYOND)}, got {beyond!r}; choose one of them.")
         self.problem, self._choose = problem, choose
         self._beyond, self.regulator = None, None
-        if beyond is None and problem.horizon.stationary:  # then nothing changes at T
+        if beyond is None and problem.horizon.stationary:  # the law does not change at T
             beyond = "hold"
         if beyond is not None:
             self._follow(beyond)
@@ -53,14 +53,14 @@ class Sequel(nn.Module):
 
     @property
     def beyond(self) -> str:
-        """The law's name; where nobody chose one, it is chosen now."""
+        """The name of the law; it is chosen now if nobody did before."""
         if self._beyond is None:
             self._follow(self._choose().beyond)
         assert self._beyond is not None
         return self._beyond
 
     def note_once(self) -> None:
-        """Say in a log what follows T, where nobody chose it."""
+        """Log once which law follows T, if it was chosen automatically."""
         if not self._noted:
             self._noted = True
             logging.getLogger(__name__).warning(
@@ -72,12 +72,12 @@ class Sequel(nn.Module):
 
 
 class ContinuedValue(ValueFunction):
-    """V(t, x) up to T, and after it what goes with the law."""
+    """V(t, x) up to T; after it the value that belongs to the law after T."""
 
     V: ValueFunction
-    sequel: Sequel
+    sequel: LawAfterHorizon
 
-    def __init__(self, V: ValueFunction, sequel: Sequel):
+    def __init__(self, V: ValueFunction, sequel: LawAfterHorizon):
         super().__init__()
         self.V, self.sequel = V, sequel
 
@@ -91,37 +91,37 @@ class ContinuedValue(ValueFunction):
         return self.at_any_time(t, x)
 
     def at_any_time(self, t: Time, x: State) -> PerState:
-        """The same by one course for all t, to be traced."""
+        """The same without branches on t, for tracing."""
         beyond, late = self.sequel.beyond, is_after(t, self.sequel.duration)
-        value, regulator = self.V(_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
+        value, regulator = self.V(_time_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
         return value if regulator is None else torch.where(late, regulator.cost(x), value)
 
 
 class ContinuedPolicy(ValuePolicy):
-    """u(t, x) = policy(t, x) before T, and from T on what `beyond` says; its V is continued likewise after T.
+    """u(t, x) = policy(t, x) before T, and the law `beyond` from T on; V is continued after T in the same way.
 
     Args:
-        problem, policy: what is continued.
-        beyond: a key of BEYOND; None: what `choose` finds, when it is first asked for, and a note when it counts.
-        noted: whether it was said already what that is.
+        problem, policy: the problem, and its law up to T.
+        beyond: a key of BEYOND; None: the result of `choose`, which is called on first use and logged.
+        noted: whether the law after T was already logged.
 
     Raises:
-        ValueError: another `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
+        ValueError: unknown `beyond`; or riccati, and the goal is no equilibrium that a linear law can stabilise.
     """
 
     V: ContinuedValue
     policy: ValuePolicy
-    sequel: Sequel
+    sequel: LawAfterHorizon
     held: bool
 
     def __init__(self, problem: Problem, policy: ValuePolicy, beyond: str | None, choose: Chooser, noted: bool = False):
-        sequel = Sequel(problem, beyond, choose, noted)
+        sequel = LawAfterHorizon(problem, beyond, choose, noted)
         super().__init__(problem, ContinuedValue(policy.V, sequel))
         self.policy, self.sequel, self.held = policy, sequel, policy.held
 
     @property
     def beyond(self) -> str:
-        """The name of the law after T; where nobody chose one, it is chosen now."""
+        """The name of the law after T; it is chosen now if nobody did before."""
         return self.sequel.beyond
 
     def forward(self, t: Time, x: State) -> Control:
@@ -136,14 +136,14 @@ class ContinuedPolicy(ValuePolicy):
         return self.at_any_time(t, x)
 
     def at_any_time(self, t: Time, x: State) -> Control:
-        """The same by one course for all t, to be traced; without a word on what follows T."""
+        """The same without branches on t, for tracing; does not log the law after T."""
         beyond, late = self.beyond, is_at_end(t, self.sequel.duration)
-        u, regulator = self.policy(_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
+        u, regulator = self.policy(_time_within(t, late, self.sequel.duration, beyond), x), self.sequel.regulator
         return u if regulator is None else torch.where(late[..., None], regulator(x), u)
 
 
 class LaterPolicy(ValuePolicy):
-    """A law, and its V, on a clock that starts late: policy(t + start, x)."""
+    """A law and its V with shifted time: policy(t + start, x)."""
 
     policy: ValuePolicy
     start: float
@@ -171,7 +171,7 @@ class _LaterValue(ValueFunction):
 def is_after(t: Time, duration: float) -> Bool[Tensor, "*batch"]:
     """Whether a time is after T.
 
-    Differences are compared, as the exporter to ONNX rounds numbers that are compared to float32.
+    The difference is compared, because the ONNX exporter rounds compared numbers to float32.
     """
     return t - duration > slack(t, duration)
 
@@ -182,15 +182,15 @@ def is_at_end(t: Time, duration: float) -> Bool[Tensor, "*batch"]:
 
 
 def slack(t: Time, duration: float) -> float:
-    """By how much a time that was added up may miss the ends of the horizon."""
+    """Tolerance at the ends of the horizon for the rounding of summed times."""
     return max(1e-9, 4 * torch.finfo(t.dtype).eps) * duration
 
 
-def _within(t: Time, late: Tensor, duration: float, beyond: str | None) -> Time:
-    """A time within the horizon for each that is late.
+def _time_within(t: Time, late: Tensor, duration: float, beyond: str | None) -> Time:
+    """The time at which V and its law are evaluated, within the horizon.
 
     Raises:
-        ValueError: it is an error.
+        ValueError: a time is after T, and `beyond` is error.
     """
     if beyond == "receding":
         return torch.where(late, 0.0, t)

@@ -1,7 +1,7 @@
-"""V(t, x), and the one place that differentiates it: gradients, Lie derivatives, V̇.
+"""The base class of V(t, x), and its derivatives: gradients, Lie derivatives, V̇.
 
-Everything here works under torch.no_grad() too, which Lightning's validation and odeint_adjoint's forward pass switch
-on: gradients are enabled inside, and the result is part of the outer graph only if the caller records one.
+Everything here also works under torch.no_grad(), as in Lightning's validation and odeint_adjoint's forward pass:
+gradients are enabled inside, and the result is part of the outer graph only if the caller records one.
 """
 
 from abc import ABC, abstractmethod
@@ -17,24 +17,24 @@ from lyapnet.task.systems import ControlAffineSystem
 class ValueFunction(nn.Module, ABC):
     """V(t, x): a value function, a Lyapunov function, or a candidate for one.
 
-    A subclass writes `forward` with torch operations on tensors of any leading shape. Its gradient is found by
-    automatic differentiation; one that knows V_x as plain forward operations overrides `value_and_state_gradient`,
-    which is faster, and compiles and exports everywhere.
+    A subclass implements `forward` with torch operations on tensors of any leading shape. Its gradient is computed by
+    automatic differentiation. A subclass with a formula for V_x overrides `value_and_state_gradient`, which is faster,
+    and can be compiled and exported everywhere.
     """
 
     made_for: type[nn.Module] | None = None
-    """The control law that V is made for, a ValuePolicy: what trains V sets it; None: unknown."""
+    """The control law that V is made for, a ValuePolicy; training sets it. None: unknown."""
 
     @abstractmethod
     def forward(self, t: Time, x: State) -> PerState:
-        """V(t, x) for t in s, scalar or one time each, and x (*batch, n); (*batch,), in units of cost."""
+        """V(t, x), (*batch,), in units of cost, for t in s, a scalar or one time for each state, and x (*batch, n)."""
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         """(V, V_x) of shapes (*batch,) and (*batch, n); they share most of their work."""
         return self(t, x), gradients(self, t, x)[1]
 
     def curvature(self, t: Time) -> Tensor | None:
-        """A positive semidefinite model of V_xx at t, (*batch, n, n), for control laws; None where V has none."""
+        """A positive semidefinite model of V_xx at t, (*batch, n, n), for control laws; None if V has none."""
         return None
 
 
@@ -44,7 +44,7 @@ def gradients(V: Value, t: Time, x: State) -> tuple[PerState, State]:
     with torch.enable_grad():
         t = _differentiable(t.expand(x.shape[:-1]), recording)
         x = _differentiable(x, recording)
-        # each V depends on its own (t, x) alone, so the gradient of the sum holds every state's gradient
+        # each V depends only on its own (t, x), so the gradient of the sum contains every state's gradient
         V_t, V_x = torch.autograd.grad(V(t, x).sum(), (t, x), create_graph=recording, materialize_grads=True)
     return V_t, V_x
 
@@ -60,11 +60,11 @@ def input_lie_derivative(system: ControlAffineSystem, x: State, V_x: State) -> C
 
 
 def time_derivative(V: ValueFunction, system: ControlAffineSystem, t: Time, x: State, u: Control) -> PerState:
-    """V̇ = V_t + V_xᵀ(f(x) + g(x)u), with the V_x that control laws read, so that bounds see them cancel."""
+    """V̇ = V_t + V_xᵀ(f(x) + g(x)u), with the same V_x as in control laws, so that interval bounds see terms cancel."""
     V_t, V_x = gradients(V, t, x)[0], V.value_and_state_gradient(t, x)[1]
     return V_t + (V_x * system.dynamics(x, u)).sum(-1)
 
 
 def _differentiable(leaf: Tensor, recording: bool) -> Tensor:
-    """The tensor itself where the caller's graph runs through it, else a fresh leaf of its value."""
+    """The tensor itself if it is part of the caller's graph, else a new leaf with its value."""
     return leaf if recording and leaf.requires_grad else leaf.detach().requires_grad_()

@@ -1,4 +1,4 @@
-"""First and second derivatives of steps along trajectories, also where one of them does not exist."""
+"""First and second derivatives of steps along trajectories, with replacements where one does not exist."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,17 +10,17 @@ from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 
 Step = Callable[[State, Control], tuple[State, PerState]]  # (x, u) ↦ (F, l)
-BESIDE = 1e-3  # of the extent of trajectories: how far beside a node derivatives are taken that do not exist at it
+STEP_ASIDE = 1e-3  # distance from a node at which a missing derivative is taken, relative to the trajectories' extent
 
 
 class StepDerivatives:
-    """First and second derivatives in z = (x, u) of what one step leads to and costs, by torch, many z at once.
+    """First and second derivatives of a step's next state and cost in z = (x, u), by torch, for many z at once.
 
-    A row of a Jacobian is taken of a copy of z, all rows in one sweep backwards: the operations of one sweep are few.
+    For a Jacobian z is copied once for each output, so that one backward pass computes all rows.
 
     Args:
-        step: (x, u) ↦ (F, l), where one step leads and what it costs.
-        n: states.
+        step: (x, u) ↦ (F, l), the next state and the cost of a step.
+        n: number of states.
     """
 
     def __init__(self, step: Step, n: int):
@@ -69,24 +69,24 @@ class Steps(NamedTuple):
     F_z: Tensor
     paid: Tensor
     l_z: Tensor
-    l_zz: Tensor  # what the second derivatives of Q have besides F_zᵀHF_z
+    l_zz: Tensor  # second derivatives of Q besides F_zᵀHF_z
     end: tuple[PerState, State, Tensor]  # φ, φ_x and φ_xx
-    mended: Tensor  # (N + 1, *batch), where a derivative does not exist
-    beside: Tensor  # (n + m,), how far beside z it is then taken
+    replaced: Tensor  # (N + 1, *batch), whether a derivative does not exist at a node
+    beside: Tensor  # (n + m,), the distance from z at which it is then taken
 
 
 def steps_along(
     derivatives: StepDerivatives, terminal: Callable[[State], PerState], x: StatePath, u: ControlPath
 ) -> Steps:
-    """The derivatives along x (N + 1, b, n) under u (N, b, m), but the second ones of F.
+    """The derivatives along x (N + 1, b, n) under u (N, b, m), except the second derivatives of F.
 
-    Those that do not exist at a node, as the second one of |v|v at rest, are the mean of those BESIDE it on either
-    side, or those of the one side that has them.
+    A derivative that does not exist at a node, such as the second one of |v|v at rest, is replaced by the mean of those
+    on both sides of the node, or by that of the one side where it exists.
 
     Args:
         terminal: φ.
     """
-    n, beside = x.shape[-1], _beside(x, u)
+    n, beside = x.shape[-1], _steps_aside(x, u)
     z = torch.cat([x[:-1], u], -1).detach()
 
     def at_end(x: Tensor) -> list[Tensor]:
@@ -97,16 +97,19 @@ def steps_along(
             return [phi.detach(), phi_x.detach(), jacobian(phi_x, x).detach()]
 
     values = [part.unflatten(0, z.shape[:-1]) for part in derivatives.first(z.flatten(0, -2))]
-    (F, paid), (slopes, mended) = values[:2], _mended(lambda z, _: derivatives.first(z)[2:], z, values[2:], beside)
+    (F, paid), (slopes, replaced) = (
+        values[:2],
+        _replace_missing(lambda z, _: derivatives.first(z)[2:], z, values[2:], beside),
+    )
     phi, *bends = at_end(x[-1])
-    (phi_x, phi_xx), end_mended = _mended(lambda x, _: at_end(x)[1:], x[-1], bends, beside[:n])
+    (phi_x, phi_xx), end_mended = _replace_missing(lambda x, _: at_end(x)[1:], x[-1], bends, beside[:n])
     F_z, l_z, l_zz = slopes
-    end, mended = (phi, phi_x, phi_xx), torch.cat([mended, end_mended[None]])
-    return Steps(z, F, F_z, paid, l_z, l_zz, end, mended, beside)
+    end, replaced = (phi, phi_x, phi_xx), torch.cat([replaced, end_mended[None]])
+    return Steps(z, F, F_z, paid, l_z, l_zz, end, replaced, beside)
 
 
 def costates(steps: Steps) -> StatePath:
-    """The slope of what controls cost from where each step lands on, (N, b, n): p_N = φ_x, p_n = l_x + F_xᵀp_{n+1}."""
+    """The costates p_1 … p_N (N, b, n), the gradient of the cost to go: p_N = φ_x, p_n = l_x + F_xᵀp_{n+1}."""
     p = [steps.end[1]]
     n = p[0].shape[-1]
     for l_z, F_z in zip(steps.l_z[1:].flip(0), steps.F_z[1:].flip(0), strict=True):
@@ -115,36 +118,36 @@ def costates(steps: Steps) -> StatePath:
 
 
 def with_curvature(derivatives: StepDerivatives, steps: Steps, p: StatePath) -> Steps:
-    """The same with the second derivatives of pᵀF added to l_zz: at nodes where no side has them, with none.
+    """Add the second derivatives of pᵀF to l_zz; zero at nodes where they exist on neither side.
 
     Args:
-        p: (N, b, n), of where each step lands.
+        p: the costates (N, b, n) at the end of each step.
     """
     z = steps.z
     bends = derivatives.curvature(z.flatten(0, -2), p.flatten(0, -2)).unflatten(0, z.shape[:-1])
-    (bent,), missing = _mended(lambda z, rows: [derivatives.curvature(z, p[rows])], z, [bends], steps.beside)
-    mended = steps.mended | torch.cat([missing, torch.zeros_like(missing[:1])])
-    return steps._replace(l_zz=steps.l_zz + bent.nan_to_num(0, 0, 0), mended=mended)
+    (bent,), missing = _replace_missing(lambda z, rows: [derivatives.curvature(z, p[rows])], z, [bends], steps.beside)
+    replaced = steps.replaced | torch.cat([missing, torch.zeros_like(missing[:1])])
+    return steps._replace(l_zz=steps.l_zz + bent.nan_to_num(0, 0, 0), replaced=replaced)
 
 
-def _beside(x: StatePath, u: ControlPath) -> Tensor:
-    """BESIDE of how far each component of (x, u) goes, of its size where it stays, of 1 where that is 0."""
+def _steps_aside(x: StatePath, u: ControlPath) -> Tensor:
+    """STEP_ASIDE times the range of each component of (x, u), or its size if it is constant, or 1 if that is 0."""
     found = list[Tensor]()
     for path in (x.detach().flatten(0, -2), u.detach().flatten(0, -2)):
         extent, size = path.amax(0) - path.amin(0), path.abs().amax(0)
         found.append(extent.where(extent > 0, size.where(size > 0, 1)))
-    return BESIDE * torch.cat(found)
+    return STEP_ASIDE * torch.cat(found)
 
 
-def _mended(
+def _replace_missing(
     function: Callable[[Tensor, Tensor], list[Tensor]], z: Tensor, parts: list[Tensor], beside: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Derivatives at z of all nodes, where they are not finite from beside them, and where that is so.
+    """Replace non-finite derivatives by those beside the nodes; returns also which nodes these are.
 
     Args:
-        function: (z, rows) ↦ the same derivatives at other z of those nodes.
+        function: (z, rows) ↦ the derivatives at other z for some nodes.
         parts: the derivatives at z.
-        beside: a deviation of z, to either side.
+        beside: the deviation of z to either side.
     """
     missing = ~torch.stack([part.flatten(z.ndim - 1).isfinite().all(-1) for part in parts]).all(0)
     if missing.any():
@@ -157,7 +160,7 @@ def _mended(
 
 
 def jacobian(y: Tensor, z: Tensor) -> Tensor:
-    """∂y/∂z, (*batch, outputs, inputs), each state's by itself; zero where y does not depend on z."""
+    """∂y/∂z of each state, (*batch, outputs, inputs); zero if y does not depend on z."""
     if not y.requires_grad:
         return y.new_zeros(*y.shape, z.shape[-1])
     rows = [torch.autograd.grad(y_i.sum(), z, create_graph=True, materialize_grads=True)[0] for y_i in y.unbind(-1)]

@@ -1,4 +1,4 @@
-"""A problem linearised at its goal, or the reason why it cannot be."""
+"""Linearisation of a problem at its goal, or the reason why it does not exist."""
 
 import copy
 from collections.abc import Callable
@@ -18,30 +18,28 @@ from lyapnet.value.expansions import Expansion, in_float64, riccati
 
 LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 NAME_A_GOAL = "name target: in the config, or cost.goal, where the task has a goal"
-NEARBY, NEAR = 8, 1e-3  # states around the goal, and how far away they are, in units of X₀
-TRAINED, SOLVED = 3e-3, 1e-4  # ε of a kink, in units of the usual size: V can be learned, optima cost what they do
-USUAL = 256  # states around the goal as far away as X₀, by which the size of a cost is known
-KINK, BENT = 1e-9, 1e-2  # how far from the goal slopes are compared, in units of X₀; by how much they differ at a kink
+NEARBY_STATES, NEARBY_DISTANCE = 8, 1e-3  # random states near the goal; their distance, in units of X₀
+TRAINED, SOLVED = 3e-3, 1e-4  # ε of smoothing relative to the usual size: large enough to learn V; small, for optima
+SCALE_STATES = 256  # random states around the goal, as far away as X₀, that give the usual size of a cost
+KINK_DISTANCE = 1e-9  # distance from the goal at which slopes are compared to find a kink, in units of X₀
+KINK_JUMP = 1e-2  # relative jump of the slope that counts as a kink
 
 
 class Missing(NamedTuple):
-    """Why something is not known, and what to do about it."""
+    """The reason why something does not exist, and what to do about it."""
 
     reason: str
     remedy: str
 
 
 class Linearisation(NamedTuple):
-    """ẋ ≈ f + gu* + A(x − x*) + g(u − u*) around the goal x* and the control u* that costs nothing.
-
-    Entries may not be finite.
-    """
+    """ẋ ≈ f + gu* + A(x − x*) + g(u − u*) around the goal x* and the control at rest u*; may be non-finite."""
 
     f: State
     g: InputMatrix
     A: Matrix  # ∂(f + gu*)/∂x
-    missing_values: Missing | None  # why there is no f or no g at the goal
-    missing: Missing | None  # the same, or why there is no A
+    missing_values: Missing | None  # why f or g does not exist at the goal
+    missing: Missing | None  # why f, g or A does not exist
 
 
 def linearised(problem: Problem) -> Linearisation:
@@ -76,61 +74,59 @@ def riccati_or_reason(problem: Problem) -> Expansion | Missing:
 
 @torch.no_grad()
 def rounded(problem: Problem, share: float = TRAINED) -> Problem:
-    """The problem with a cost that is smooth at the goal, where q or φ has a kink there that can be rounded; else it
-    itself.
+    """The problem with a smoothed cost, if q or φ has a kink at the goal that can be smoothed; else the problem itself.
 
-    Where closed loops end and stay, V_xx grows without bound towards a kink: neither second derivatives nor solvers
-    that need them lead to an optimum.
+    Towards a kink where closed loops end, V_xx grows without bound, so that methods with second derivatives fail.
 
     Args:
-        share: of what a root, a norm or an absolute value is around the goal, as far away as X₀: ε.
+        share: ε, relative to the size of the root, norm or absolute value around the goal at the distance of X₀.
     """
     if smoothed_part(problem.cost) is not None or not problem.has_goal:
         return problem
     own = in_float64(problem)
-    written, x = as_written(own.cost), _around(own, USUAL, 1.0)
+    written, x = as_written(own.cost), _around(own, SCALE_STATES, 1.0)
     if not _has_kink(own, written, x):
         return problem
     smooth = SmoothedCost(as_written(problem.cost), x, own.goal, share)
     if not smooth.words or _has_kink(own, SmoothedCost(written, x, own.goal, share), x):
         return problem
-    return problem.replaced(cost=_with_written(problem.cost, smooth).to(problem.initial_states.lower))
+    return problem.replaced(cost=_replace_innermost(problem.cost, smooth).to(problem.initial_states.lower))
 
 
-def _with_written(cost: Cost, written: Cost) -> Cost:
-    """A cost with another one in the place of what is written; the prices of constraints and of a domain stay."""
+def _replace_innermost(cost: Cost, written: Cost) -> Cost:
+    """Replace the innermost cost; the penalties of constraints and of a domain around it stay."""
     if cost is as_written(cost) or not isinstance(cost, MadeOfAnother):
         return written
     outer = copy.deepcopy(cost)
-    outer.cost = _with_written(cost.cost, written)
+    outer.cost = _replace_innermost(cost.cost, written)
     return outer
 
 
 def smoothed_part(cost: Cost) -> SmoothedCost | None:
-    """What rounds the kinks of a cost, where something does."""
+    """The part of a cost that smooths its kinks; None if there is none."""
     while isinstance(cost, MadeOfAnother) and not isinstance(cost, SmoothedCost):
         cost = cost.cost
     return cost if isinstance(cost, SmoothedCost) else None
 
 
 def _has_kink(problem: Problem, cost: Cost, x: State) -> bool:
-    """Whether q or φ has no finite first and second derivative at the goal, or slopes that jump there."""
+    """Whether q or φ has a non-finite first or second derivative at the goal, or a slope that jumps there."""
     goal = problem.goal
     for function in (cost.state, cost.terminal):
         value, *derivatives = _to_second_order(function, goal)
         if bool(value.isfinite()) and not all(part.isfinite().all() for part in derivatives):
             return True
-        steps = [distance * (x - goal) for distance in (KINK, KINK / 10)]
+        steps = [distance * (x - goal) for distance in (KINK_DISTANCE, KINK_DISTANCE / 10)]
         bend, closer = ((function(goal + step) + function(goal - step) - 2 * value).abs() for step in steps)
         size = function(x).abs()
-        # where slopes jump it falls to a tenth, where they do not to a hundredth
-        if bool(((bend > BENT * KINK * size[size.isfinite()].mean()) & (closer > bend / 30)).any()):
+        # at a tenth of the distance it falls to a tenth if the slope jumps, else to a hundredth
+        if bool(((bend > KINK_JUMP * KINK_DISTANCE * size[size.isfinite()].mean()) & (closer > bend / 30)).any()):
             return True
     return False
 
 
 def singular(error: RuntimeError) -> Missing:
-    """What an error of torch's linear algebra says to a user."""
+    """A message to the user for an error of torch's linear algebra."""
     return Missing(
         f"a matrix of second derivatives is singular, or not finite ({one_line(error)})",
         "give every control a weight in R, and look at f, g and the cost where trajectories lead",
@@ -155,31 +151,31 @@ def _missing_slope(problem: Problem, A: Matrix) -> Missing | None:
     if A.isfinite().all():
         return None
     by = torch.nonzero(~A.isfinite().all(0)).flatten()
-    rates = torch.nonzero(~A.isfinite().all(1) & _bent(problem, by)).flatten()
+    rates = torch.nonzero(~A.isfinite().all(1) & _varying_rates(problem, by)).flatten()
     names = list(problem.system.state_names)
     what, states = (", ".join(names[i] for i in which.tolist()) for which in (rates, by))
     return Missing(f"f + gu* has no finite slope at the goal: that of the rate of {what}, by {states}", TO_WRITE)
 
 
-def _bent(problem: Problem, by: Tensor) -> Tensor:
-    """Which rates have slopes by some states that change near the goal, or all: at the goal a NaN spreads to others."""
+def _varying_rates(problem: Problem, by: Tensor) -> Tensor:
+    """Which rates have slopes by some states that vary near the goal, else all; at the goal itself a NaN spreads."""
     with torch.enable_grad():
-        x = _around(problem, NEARBY, NEAR).requires_grad_()
-        rate = problem.system.dynamics(x, problem.rest.expand(NEARBY, -1))
+        x = _around(problem, NEARBY_STATES, NEARBY_DISTANCE).requires_grad_()
+        rate = problem.system.dynamics(x, problem.rest.expand(NEARBY_STATES, -1))
         slopes = jacobian(rate, x).detach()[..., by]
     bent = (slopes - slopes[0]).abs().amax((0, -1)) > 0
     return bent if bent.any() else torch.ones_like(bent)
 
 
 def _around(problem: Problem, count: int, distance: float) -> State:
-    """States (b, n) around the goal, at a distance in units of X₀."""
+    """Random states (b, n) around the goal, at about a distance in units of X₀."""
     extent = problem.initial_states.reach_from(problem.goal)
     away = torch.randn(count, problem.system.n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return problem.goal + distance * away * extent.where(extent > 0, 1)
 
 
 def _missing_cost(problem: Problem) -> Missing | None:
-    """Why the cost has no second order at the goal."""
+    """The reason why the cost has no second order expansion at the goal; None if it has one."""
     R = problem.cost.R(problem.goal).detach()
     if not R.isfinite().all() or float(torch.linalg.eigvalsh(R).min()) <= 0:
         return Missing(f"R is not positive definite at the goal: {R.tolist()}", "give every control a weight")
@@ -193,7 +189,7 @@ def _missing_cost(problem: Problem) -> Missing | None:
 
 @torch.enable_grad()
 def _to_second_order(function: Callable[[State], PerState], x: State) -> tuple[Tensor, Tensor, Tensor]:
-    """The value, slope and second derivative of a function at a state."""
+    """The value, gradient and Hessian of a function at a state."""
     x = x.detach().clone().requires_grad_()
     value = function(x)
     slope = jacobian(value[None], x)[0]

@@ -1,4 +1,4 @@
-"""Control laws that a value function defines."""
+"""Control laws that are defined by a value function."""
 
 from typing import NamedTuple
 
@@ -17,12 +17,13 @@ from lyapnet.value.calculus import ValueFunction, drift_lie_derivative, gradient
 from lyapnet.value.derivatives import jacobian
 from lyapnet.value.expansions import held_control, riccati
 
-DESCENTS, SHARES = 3, (1.0, 0.5, 0.25, 0.1)  # of the lookahead law: Newton steps, and what is tried of each
-STEEP = 5  # as many steps where V is as steep as it is close to constraints
+DESCENTS = 3  # Newton steps of the lookahead law
+STEEP = 5  # the same with constraints, near which V is steep
+SHARES = (1.0, 0.5, 0.25, 0.1)  # step sizes of the line search in each Newton step
 
 
 class PolicyOutput(NamedTuple):
-    """A control, and the value function that it comes from, at the same (t, x)."""
+    """A control with the value and state gradient of V at the same (t, x)."""
 
     u: Control
     value: PerState
@@ -33,8 +34,8 @@ class ValuePolicy(nn.Module):
     """u = policy(t, x), a control law that V defines."""
 
     held: bool = False  # whether u is made to be held for Δt from t on
-    origin: str = ""  # where V and u come from, in words, if they were made elsewhere
-    precision: str | None = None  # of the arithmetic in which u is computed, if its rounding counts; else real numbers
+    origin: str = ""  # where V and u come from, if they were imported
+    precision: str | None = None  # floating-point format of u for proofs that include its rounding; None: real numbers
     system: ControlAffineSystem
     cost: Cost
     controls: ControlSet
@@ -45,7 +46,7 @@ class ValuePolicy(nn.Module):
         self.system, self.cost, self.controls, self.V = problem.system, problem.cost, problem.controls, V
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
-        """u, V and V_x; a law that needs V_x anyway shares it."""
+        """u, V and V_x; a law that needs V_x for u computes it only once."""
         return PolicyOutput(self(t, x), *self.V.value_and_state_gradient(t, x))
 
 
@@ -56,7 +57,7 @@ class HJBPolicy(ValuePolicy):
         return self._minimise(x, self.V.value_and_state_gradient(t, x)[1])
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
-        if type(self).forward is not HJBPolicy.forward:  # a law derived from this one
+        if type(self).forward is not HJBPolicy.forward:  # a subclass with its own law
             return super().with_value(t, x)
         value, V_x = self.V.value_and_state_gradient(t, x)
         return PolicyOutput(self._minimise(x, V_x), value, V_x)
@@ -66,7 +67,7 @@ class HJBPolicy(ValuePolicy):
         if self.controls.limited:
             R = self.cost.R(x)
             return self.controls.minimise(R, self.cost.about_rest(R, b))
-        u = -0.5 * self.cost.solve_R(x, b)  # with the one inverse of a constant R
+        u = -0.5 * self.cost.solve_R(x, b)  # a constant R is inverted only once
         return u if self.cost.rest is None else u + self.cost.rest
 
 
@@ -75,17 +76,17 @@ class SontagPolicy(ValuePolicy):
 
         u = −(a + √(a² + qσ))/σ · R⁻¹b,   and 0 where b = 0,
 
-    so that V̇ = −√(a² + qσ) wherever b ≠ 0: V decreases for every control-Lyapunov function V, however far from
+    so that V̇ = −√(a² + qσ) wherever b ≠ 0: V decreases for every control Lyapunov function V, even if it is far from
     the value function. With the true value function it is the HJB policy. Close to the goal a and σ are small
     differences of rounded numbers: in float32, u chatters within about ‖x‖ = 1e-4.
 
-    It is made for U = ℝᵐ. About a target u is counted from u*, and f is f + gu*.
+    It requires U = ℝᵐ. With a target, u − u* replaces u, and f + gu* replaces f.
 
     Raises:
         ValueError: the problem limits its controls.
 
     Sources: Sontag, "A 'universal' construction of Artstein's theorem on nonlinear stabilization", Systems & Control
-    Letters 1989 (σ in the place of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
+    Letters 1989 (σ instead of q); Primbs, Nevistić, Doyle, "Nonlinear optimal control: a control Lyapunov
     function and receding horizon perspective", Asian Journal of Control 1999 (this form).
     """
 
@@ -106,9 +107,9 @@ class SontagPolicy(ValuePolicy):
             a = a + (LgV * self.cost.rest).sum(-1)
         q = self.cost.state(x)
         sigma = (LgV * direction).sum(-1)
-        # √ has no derivative at 0, which the goal reaches: keep its argument positive
+        # √ has no derivative at 0, its value at the goal: keep the argument positive
         root = torch.sqrt(a**2 + q * sigma + torch.finfo(x.dtype).tiny)
-        # Where a < 0 the quotient is q/(root − a), which stays finite as σ → 0; each branch guards the other's zero.
+        # For a < 0 the quotient equals q/(root − a), finite as σ → 0; both branches have safe denominators.
         falling = a < 0
         gain_falling = q / torch.where(falling, root - a, 1.0)
         gain_rising = (a + root) / torch.where(falling | (sigma <= 0), 1.0, sigma)
@@ -122,11 +123,11 @@ class SampledPolicy(ValuePolicy):
 
         u = argmin over u ∈ U of ½ uᵀ(ℓ_uu + Δt BᵀHB)u + (BᵀV_x(t + Δt, F(x, 0)) + ℓ_u)ᵀu,
 
-    for V of curvature H along B = F_u/Δt. F and ∫ℓ are one step of the horizon's method: with Euler F = x + Δt(f + gu),
-    B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x it is the optimal
-    law of a linear problem, and finite at any Δt; −½R⁻¹gᵀV_x under Euler steps is unstable where Δt λ_max(R⁻¹gᵀHg)/2
-    exceeds about 2. As Δt → 0 both are the same. H is V's own model of its curvature, or the Riccati solution at the
-    goal, zero where there is no goal. About a target, u is counted from u*, and f is f + gu*.
+    for a V with curvature H, and B = F_u/Δt. F and ∫ℓ are one step of the horizon's method. With Euler steps
+    F = x + Δt(f + gu), B = g, ℓ_u = 0, ℓ_uu = 2R, and with U = ℝᵐ the law is −(2R + Δt gᵀHg)⁻¹ gᵀV_x. With V = xᵀP_n x
+    it is the optimal law of a linear problem, and finite at any Δt, whereas −½R⁻¹gᵀV_x is unstable under Euler steps if
+    Δt λ_max(R⁻¹gᵀHg)/2 exceeds about 2. Both agree as Δt → 0. H is V's own model of its curvature, or the Riccati
+    solution at the goal, or zero without a goal. With a target, u − u* replaces u, and f + gu* replaces f.
     """
 
     held: bool = True
@@ -146,7 +147,7 @@ class SampledPolicy(ValuePolicy):
         return held_control(self.problem, free, V_x, self._curvature(after))
 
     def _after(self, t: Time) -> Time:
-        """t + Δt, within the horizon."""
+        """t + Δt, at most T."""
         return (t + self.problem.horizon.dt).clamp(max=self.problem.horizon.duration)
 
     def _curvature(self, t: Time) -> Tensor:
@@ -157,19 +158,20 @@ class SampledPolicy(ValuePolicy):
 
 
 class LookaheadPolicy(SampledPolicy):
-    """The same minimiser, of V itself and not of a model of its curvature that is one for all states:
+    """The one-step lookahead law: it minimises with V itself instead of a quadratic model with curvature H,
 
         u = argmin over u ∈ U of Q(u) = ∫ℓ + V(t + Δt, F(x, u)).
 
-    From the sampled law on, DESCENTS Newton steps, STEEP where there are constraints, with Q_uu/Δt = ℓ_uu + Δt BᵀV_xx
-    B, or H for V_xx where that is not convex; of each, the share of SHARES that lowers Q most, or none. For a V that is
-    steep within one step, as close to state constraints, where the sampled law overshoots. Its derivative is that of
-    the minimiser (implicit function theorem), up to what the steps leave of Q_u, and V_xᵀF_uu, which is zero with
-    Euler. Where Q_uu/Δt does not exceed CONVEX · ℓ_uu, both are those of the model H, and u may be short of the
-    minimiser. In float32 u is as exact as the rounding of V lets Q be compared.
+    It starts from the sampled law and takes DESCENTS Newton steps (STEEP with constraints) with Q_uu/Δt = ℓ_uu +
+    Δt BᵀV_xxB, or with H for V_xx if that is not convex. Each step uses the step size of SHARES that lowers Q most, or
+    none. It is meant for a V that is steep within one step, as near constraints, where the sampled law overshoots.
+
+    Its derivative is that of the minimiser (implicit function theorem), up to the remaining Q_u and to V_xᵀF_uu, which
+    is zero with Euler steps. Where Q_uu/Δt does not exceed CONVEX · ℓ_uu, step and derivative are those of the model H,
+    and u may not reach the minimiser. In float32 the accuracy of u is limited by the rounding of V in comparisons of Q.
 
     Source: Bertsekas, Dynamic Programming and Optimal Control, 2017, vol. 1 ch. 6 (one-step lookahead); Nocedal,
-    Wright, Numerical Optimization, 2006, ch. 3 (the steps).
+    Wright, Numerical Optimization, 2006, ch. 3 (Newton's method with line search).
     """
 
     def forward(self, t: Time, x: State) -> Control:
@@ -178,7 +180,7 @@ class LookaheadPolicy(SampledPolicy):
         with torch.no_grad():
             u = super().forward(t, x)
             for _ in range(DESCENTS if self.problem.constraints is None else STEEP):
-                u = step.descended(u, H)
+                u = step.descend(u, H)
         if not torch.is_grad_enabled():
             return u
         moved = step.newton(u, H)
@@ -186,16 +188,16 @@ class LookaheadPolicy(SampledPolicy):
 
 
 class _HeldStep:
-    """One step from x with u held: Q(u) = ∫ℓ + V(t + Δt, F(x, u)), and ways down it."""
+    """The objective of one step from x with u held, Q(u) = ∫ℓ + V(t + Δt, F(x, u)), and its Newton steps."""
 
     def __init__(self, problem: Problem, V: ValueFunction, after: Time, x: State):
         self.problem, self.V, self.after, self.x = problem, V, after, x
 
-    def descended(self, u: Control, H: Tensor) -> Control:
-        """The best of u and some shares of the Newton step from it."""
+    def descend(self, u: Control, H: Tensor) -> Control:
+        """The best of u and of the points of a line search along the Newton step."""
         direction = self.newton(u, H) - u
         tried = torch.stack([u, *(self.problem.controls.project(u + share * direction) for share in SHARES)])
-        paid = self._paid(tried)
+        paid = self._step_values(tried)
         best, least = u, paid[0]
         for control, cost in zip(tried[1:], paid[1:], strict=True):
             better = cost < least
@@ -203,7 +205,7 @@ class _HeldStep:
         return best
 
     def newton(self, u: Control, H: Tensor) -> Control:
-        """The minimiser over U of Q to second order around u, with its curvature as a number."""
+        """The minimiser over U of the quadratic model of Q around u; the curvature is not differentiated."""
         answer = self.problem.response(self.x, u)
         with torch.enable_grad():
             z = answer.x if answer.x.requires_grad else answer.x.detach().requires_grad_()
@@ -212,13 +214,13 @@ class _HeldStep:
         slope = apply(answer.by_control.mT, V_x) + answer.slope
         return self.problem.controls.minimise(curvature / 2, slope - apply(curvature, u.detach()))
 
-    def _paid(self, u: Control) -> PerState:
+    def _step_values(self, u: Control) -> PerState:
         """Q of controls (k, *batch, m)."""
         following, paid = self.problem.step(self.x.expand(*u.shape[:-1], -1), u)
         return paid + self.V(self.after, following)
 
     def _curvature(self, answer: Response, z: State, V_x: State, H: Tensor) -> Tensor:
-        """Q_uu/Δt where that is convex, else with H for V_xx; without a graph, from V_x at z with its graph."""
+        """Q_uu/Δt if it is convex, else with H for V_xx; a constant, computed from the graph of V_x at z."""
         B, paid, dt = answer.by_control.detach(), answer.curvature.detach(), self.problem.horizon.dt
         own = dt * multiply(jacobian(apply(B.mT, V_x), z).detach(), B)
         own = paid + (own + own.mT) / 2
@@ -227,10 +229,10 @@ class _HeldStep:
 
 
 def known_law(problem: Problem, V: ValueFunction) -> type[ValuePolicy] | None:
-    """The control law that V is made for, if that is known.
+    """The control law that V is made for; None if it is unknown.
 
-    It is the one that V names. A V with a model of its curvature has it for laws that hold u: it is made for the law of
-    the standard recipe, with constraints the one that looks ahead.
+    It is `made_for`, if set. Otherwise a V with a model of its curvature is made for a law that holds u: the sampled
+    law, or the lookahead law with constraints.
     """
     if V.made_for is not None:
         if not issubclass(V.made_for, ValuePolicy):
@@ -243,9 +245,9 @@ def known_law(problem: Problem, V: ValueFunction) -> type[ValuePolicy] | None:
 
 
 def gain_over_step(problem: Problem, V: ValueFunction) -> float:
-    """Δt λ_max(R⁻¹gᵀV_xx g)/2, the greatest of some states and times: by what share V's HJB and sampled law differ.
+    """The largest Δt λ_max(R⁻¹gᵀV_xx g)/2 over some states and times: how much V's HJB and sampled law differ.
 
-    In −½R⁻¹gᵀV_x, R stands where the held law has R + ½Δt gᵀV_xx g.
+    The HJB law is −½R⁻¹gᵀV_x; the sampled law has R + ½Δt gᵀV_xx g instead of R.
     """
     X0, times = problem.initial_states, problem.horizon.times(problem.goal)
     x = torch.stack([X0.center, (X0.center + X0.upper) / 2, problem.goal])

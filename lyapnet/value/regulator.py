@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator of a problem's goal, for an infinite horizon; of a family, one for each member."""
+"""The infinite-horizon linear-quadratic regulator at a problem's goal; for a family, one for each member."""
 
 import itertools
 import operator
@@ -16,40 +16,40 @@ from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import in_float64
 
-STILL = 1e-9  # by which a mode has to decay in each step
-EQUILIBRIUM = 1e-6  # largest |ẋ| at the goal under the control that costs nothing
+DECAY_MARGIN = 1e-9  # smallest relative decay of each mode in a step
+EQUILIBRIUM_TOLERANCE = 1e-6  # largest |ẋ| at the goal under the control at rest
 NODES = 5  # Chebyshev nodes along each parameter of a family
-MOST_NODES = 200
-INTERPOLATED = 1e-2  # largest error of an interpolated gain, relative to the largest of its entries
+MOST_NODES = 200  # largest number of nodes of all parameters together
+INTERPOLATION_TOLERANCE = 1e-2  # largest error of an interpolated gain, relative to its largest entry
 
 
 class Gains(NamedTuple):
-    """δᵀPδ, what is left to pay from x* + δ, and the law u = u* − Kδ."""
+    """The cost to go δᵀPδ from x* + δ, and the law u = u* − Kδ."""
 
     P: Float[np.ndarray, "n n"]
     K: Float[np.ndarray, "m n"]
 
 
 class Regulator(nn.Module):
-    """u = u* − K(x − x*), kept to U: optimal for the problem linearised at its goal, over an infinite horizon.
+    """u = u* − K(x − x*), projected onto U: optimal for the problem linearised at its goal, over an infinite horizon.
 
-    P solves the discrete algebraic Riccati equation of one step with u held; δᵀPδ, δ = x − x*, is what is left to pay.
-    States that neither the rates nor q depend on, such as a cart's position, have no part in it. Of a family, P and K
-    are polynomials in its parameters, through those of the members at Chebyshev nodes.
+    P solves the discrete algebraic Riccati equation of one step with u held; δᵀPδ, δ = x − x*, is the cost to go.
+    States on which neither the rates nor q depend, such as a cart's position, are left out. For a family, P and K are
+    polynomials in its parameters that interpolate the members at Chebyshev nodes.
 
     Args:
-        purpose, instead: what asks for it, and what else can be done, for messages.
-        spread: where q does not see every mode that has to be stabilised, pay φ's Hessian besides q, an Nth of it in
-            each of the N steps of T, as a task that weighs its end alone asks to be held there.
+        purpose, instead: what needs the regulator, and the alternative, for messages.
+        spread: whether to add an Nth of φ's Hessian to q in each step if q does not detect every mode that has to be
+            stabilised; for tasks that weigh only their terminal state.
 
     Raises:
         ValueError: the goal is no equilibrium, no linear law stabilises it, or a family has too many parameters, or
-            members whose gains no such polynomial fits.
+            gains that no such polynomial fits.
     """
 
     problem: Problem
-    basis: "_ChebyshevBasis | None"  # of a family
-    P: Matrix  # of a family (nodes, n + k, n + k), coefficients of Chebyshev polynomials
+    basis: "_ChebyshevBasis | None"  # for a family
+    P: Matrix  # for a family the coefficients of Chebyshev polynomials, (nodes, n + k, n + k)
     K: Float[Tensor, "m n"]  # likewise
 
     def __init__(
@@ -73,7 +73,7 @@ class Regulator(nn.Module):
         return self.problem.controls.project(self.problem.rest - feedback)
 
     def cost(self, x: State) -> PerState:
-        """What is left to pay, without limits."""
+        """The cost to go without control limits."""
         offset = self.problem.cost.from_goal(x)
         if self.basis is None:
             return quadratic_form(self.P, offset)
@@ -81,14 +81,14 @@ class Regulator(nn.Module):
 
 
 class _Solver:
-    """The gains at a goal, (n,), or at that of one member of a family, (x*(p), p)."""
+    """Computes the gains at a goal (n,), or at the goal (x*(p), p) of a member of a family."""
 
     def __init__(self, exact: Problem, purpose: str, instead: str, spread: bool):
         self.exact, self.purpose, self.instead, self.spread = exact, purpose, instead, spread
 
     def __call__(self, goal: State) -> Gains:
         exact, u = self.exact, self.exact.rest
-        if float(exact.system.dynamics(goal, u).abs().max()) > EQUILIBRIUM:
+        if float(exact.system.dynamics(goal, u).abs().max()) > EQUILIBRIUM_TOLERANCE:
             raise ValueError(f"Expected a goal that is an equilibrium for {self.purpose}, got another; {self.instead}.")
         jacobian, hessian = torch.autograd.functional.jacobian, torch.autograd.functional.hessian
         A, B = (np.asarray(part) for part in jacobian(lambda *z: exact.step(*z)[0], (goal, u)))
@@ -101,7 +101,7 @@ class _Solver:
         reason: Exception | None = None
         for weights in (Q, Q + of_end) if self.spread else (Q,):
             try:
-                return _stabilising(A, B, weights, S, R, moves)
+                return _stabilising_gains(A, B, weights, S, R, moves)
             except (ValueError, np.linalg.LinAlgError) as error:
                 reason = error
         raise ValueError(
@@ -110,29 +110,31 @@ class _Solver:
         ) from reason
 
 
-def _stabilising(A: np.ndarray, B: np.ndarray, Q: np.ndarray, S: np.ndarray, R: np.ndarray, moves: np.ndarray) -> Gains:
-    """P and K of a step x' = Ax + Bu that costs xᵀQx + 2xᵀSu + uᵀRu, in the states that move.
+def _stabilising_gains(
+    A: np.ndarray, B: np.ndarray, Q: np.ndarray, S: np.ndarray, R: np.ndarray, moves: np.ndarray
+) -> Gains:
+    """P and K of a step x' = Ax + Bu with cost xᵀQx + 2xᵀSu + uᵀRu, in the states that move.
 
     Raises:
-        ValueError, LinAlgError: there is none under which all states that count decay.
+        ValueError, LinAlgError: no gains stabilise all relevant states.
     """
-    counts = moves & ((np.eye(len(A)) != A)[moves].any(0) | Q.any(0) | S.any(1))
-    if not counts.any():
+    relevant = moves & ((np.eye(len(A)) != A)[moves].any(0) | Q.any(0) | S.any(1))
+    if not relevant.any():
         raise ValueError("no state has a part in it")
-    A, B, Q, S = A[counts][:, counts], B[counts], Q[counts][:, counts], S[counts]
-    from scipy.linalg import solve_discrete_are  # loaded where it is asked for: it takes a tenth of a second
+    A, B, Q, S = A[relevant][:, relevant], B[relevant], Q[relevant][:, relevant], S[relevant]
+    from scipy.linalg import solve_discrete_are  # imported here because it takes 0.1 s
 
     P = solve_discrete_are(A, B, Q, R, s=S)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S.T)
     slowest = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
-    if slowest >= 1 - STILL:
+    if slowest >= 1 - DECAY_MARGIN:
         raise ValueError(f"a regulator with a factor of {slowest:.9g} in each step")
-    among_all = np.eye(len(counts))[counts]
-    return Gains(among_all.T @ P @ among_all, K @ among_all)
+    embedding = np.eye(len(relevant))[relevant]
+    return Gains(embedding.T @ P @ embedding, K @ embedding)
 
 
 class _ChebyshevBasis(nn.Module):
-    """Products of Chebyshev polynomials of the parameters of a family, each scaled to its range, and kept within it."""
+    """Products of Chebyshev polynomials of a family's parameters, each scaled to its range and clamped to it."""
 
     center: Float[Tensor, " k"]
     half_widths: Float[Tensor, " k"]
@@ -148,7 +150,7 @@ class _ChebyshevBasis(nn.Module):
         self.register_buffer("half_widths", torch.where(half > 0, half, 1.0).to(like), persistent=False)
 
     def forward(self, x: State) -> list[PerState]:
-        """Each of the products at the parameters of states (*batch, n + k)."""
+        """The products at the parameters of states (*batch, n + k)."""
         axes = []
         for k, (i, count) in enumerate(zip(self.constants, self.counts, strict=True)):
             s = ((x[..., i] - self.center[k]) / self.half_widths[k]).clamp(-1.0, 1.0)
@@ -159,17 +161,17 @@ class _ChebyshevBasis(nn.Module):
         return [reduce(operator.mul, factors) for factors in itertools.product(*axes)]
 
     def nodes(self) -> Float[Tensor, "nodes k"]:
-        """The parameters at which the products are fitted, as many as there are products."""
+        """The Chebyshev nodes, parameters at which the gains are interpolated; as many as products."""
         angles = [(torch.arange(count, dtype=torch.float64) + 0.5) * torch.pi / count for count in self.counts]
         scaled = torch.cartesian_prod(*(a.cos() for a in angles)).reshape(-1, len(angles))
         return self.center + self.half_widths * scaled
 
 
 def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
-    """The coefficients of the gains of a family: exact at the nodes, and held against members between them.
+    """Interpolate the gains of a family at the nodes, and check the result at random members between them.
 
     Raises:
-        ValueError: too many parameters, or the gains of members between the nodes are others.
+        ValueError: too many parameters, or a large error between the nodes.
     """
     nodes = basis.nodes()
     if len(nodes) > MOST_NODES:
@@ -186,7 +188,7 @@ def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
     for known, expected in zip(zip(*at_nodes, strict=True), zip(*at_others, strict=True), strict=True):
         found = np.tensordot(np.linalg.inv(matrix), np.stack(known), 1)
         error = np.abs(np.tensordot(others, found, 1) - np.stack(expected)).max() / np.abs(expected).max()
-        if error > INTERPOLATED:
+        if error > INTERPOLATION_TOLERANCE:
             raise ValueError(
                 f"Expected a family whose gains are smooth in its parameters for {solve.purpose}, got an error of "
                 f"{error:.1%} between {len(nodes)} members; narrow the family, take one member, or {solve.instead}."
@@ -196,7 +198,7 @@ def _fit(basis: _ChebyshevBasis, exact: Problem, solve: _Solver) -> Gains:
 
 
 def _goal_of(exact: Problem, p: Float[Tensor, " k"]) -> State:
-    """(x*(p), p): where from_goal vanishes for the parameters p of a family."""
+    """(x*(p), p), the goal of a family's member with parameters p, where from_goal vanishes."""
     constants = list(exact.system.constants)
     state = exact.goal.clone()
     state[constants] = p

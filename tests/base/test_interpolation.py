@@ -148,7 +148,7 @@ def test_a_smooth_curve_follows_a_solution_of_riccatis_equation_and_its_slope():
     t, P, slope = riccati_path(400)
     errors = []
     for curve in (SmoothCurve(4.0, [2, 2]), Curve(torch.linspace(0, 4, 65), torch.zeros(65, 2, 2))):
-        curve.take(t, P)
+        curve.fit(t, P)
         at = t.clone().requires_grad_()
         y = curve(at)
         assert_close(y[-1], P[-1], rtol=0, atol=1e-12)
@@ -168,7 +168,7 @@ def test_the_slope_at_the_end_is_right_where_y_settles_there_within_few_nodes():
         return torch.exp(20 * (t - 0.8)) + torch.cos(2 * t)
 
     curve, t = SmoothCurve(0.8, [1]), torch.linspace(0, 0.8, 81)
-    curve.take(t, y(t)[:, None])
+    curve.fit(t, y(t)[:, None])
     at = torch.linspace(0, 0.8, 1000).requires_grad_()
     (slope,) = torch.autograd.grad(curve(at).sum(), at)
     expected = 20 * torch.exp(20 * (at.detach() - 0.8)) - 2 * torch.sin(2 * at.detach())
@@ -177,7 +177,7 @@ def test_the_slope_at_the_end_is_right_where_y_settles_there_within_few_nodes():
 
 def test_a_smooth_curve_takes_constants_as_they_are_and_few_nodes():
     curve = SmoothCurve(2.0, [3])
-    curve.take(torch.linspace(0, 2, 5), torch.tensor([[0.0, -3.0, 1e-30]]).expand(5, 3))
+    curve.fit(torch.linspace(0, 2, 5), torch.tensor([[0.0, -3.0, 1e-30]]).expand(5, 3))
     assert_close(curve(torch.linspace(0, 2, 50)), torch.tensor([[0.0, -3.0, 1e-30]]).expand(50, 3), rtol=0, atol=0)
 
 
@@ -185,7 +185,7 @@ def test_bounds_of_a_smooth_curve_have_no_kinks():
     """Of its slope, on boxes across its time: a tenth of the width, a tenth of the range."""
     t, P, _ = riccati_path(400)
     curve = SmoothCurve(4.0, [2, 2])
-    curve.take(t, P)
+    curve.fit(t, P)
 
     def slope(t, x):
         (V_t, _) = gradients(lambda t, x: ((curve(t) @ x[..., None])[..., 0] * x).sum(-1), t, x)

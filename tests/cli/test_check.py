@@ -26,9 +26,9 @@ TASK = {
 
 @pytest.fixture(autouse=True)
 def _few_optima(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
 
 
 def linear(A, B, **changes):

@@ -255,9 +255,9 @@ def test_a_whole_check_where_the_origin_is_no_state(tmp_path, capfd, monkeypatch
         "initial_states: {lower: 0.5, upper: 2}\nhorizon: {steps: 10, dt: 0.1}\n"
     )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 4)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 4)
     shorten_fits(monkeypatch, 20, 10)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
     monkeypatch.setattr("lyapnet.training.optima.optimal_cost", lambda problem: None)
     assert main(["check", "task.yaml"]) == 0
     shown, notes = capfd.readouterr()

@@ -171,11 +171,11 @@ def test_further_starts_end_where_they_take_much_longer_than_the_first_minimum(m
     short = transcription_of("cartpole_swingup", iterations=count - 1)[0].minimise(x0, still)
     assert short == "IPOPT: Maximum_Iterations_Exceeded"
     unknown = transcription_of("cartpole_swingup")[0]
-    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    monkeypatch.setattr(transcription, "BRIEF_ITERATIONS", (2, 150))
     assert unknown.minimise(x0, still, briefly=True).cost == first.cost, "nothing is known of how long one takes"
     monkeypatch.undo()
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost
-    monkeypatch.setattr(transcription, "BRIEF", (2, 150))
+    monkeypatch.setattr(transcription, "BRIEF_ITERATIONS", (2, 150))
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost, "as long as the first one took, and longer"
     monkeypatch.setattr(transcription, "LONGER", 0)
     assert oracle.minimise(x0, still, briefly=True) == "IPOPT: Maximum_Iterations_Exceeded"
@@ -242,7 +242,7 @@ def test_where_the_first_states_have_one_minimum_the_others_follow_their_neighbo
 
 
 def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch):
-    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    monkeypatch.setattr(transcription, "_SINGLE_MINIMUM_TASKS", set())
     oracle, box = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
     counts, minimise, tried = Counter(), Transcription.minimise, 0
 
@@ -256,7 +256,7 @@ def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch)
         optima = oracle.solve(x0)
         tried += 1
     assert counts[1] <= counts[0] - (EXPLORED - EXPLORED_AGAIN)
-    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    monkeypatch.setattr(transcription, "_SINGLE_MINIMUM_TASKS", set())
     monkeypatch.setenv("LYAPNET_CACHE", f"{oracle.cache.folder}_empty")
     again, _ = transcription_of("pendulum_swingup", "horizon.steps=20", "horizon.dt=0.05")
     assert_close(again.solve(batches[1]).cost, optima.cost, rtol=1e-7, atol=0)
@@ -269,13 +269,13 @@ def test_a_batch_after_one_that_showed_one_minimum_has_fewer_starts(monkeypatch)
 
 
 def test_states_close_to_each_other_say_nothing_of_others(monkeypatch):
-    monkeypatch.setattr(transcription, "_WITH_ONE_MINIMUM", set())
+    monkeypatch.setattr(transcription, "_SINGLE_MINIMUM_TASKS", set())
     oracle, box = transcription_of("double_integrator", "horizon.steps=10", "horizon.dt=0.1")
     x0 = box.sample(EXPLORED, torch.Generator().manual_seed(0))
     oracle.solve(0.1 * x0)
-    assert not transcription._WITH_ONE_MINIMUM
+    assert not transcription._SINGLE_MINIMUM_TASKS
     oracle.solve(x0)
-    assert len(transcription._WITH_ONE_MINIMUM) == 1
+    assert len(transcription._SINGLE_MINIMUM_TASKS) == 1
 
 
 def test_known_controls_that_cost_less_are_tried_from_any_state():

@@ -143,7 +143,7 @@ def test_what_an_operating_point_is_rounded_to_is_solved_for():
 @pytest.mark.gate
 @pytest.mark.parametrize("name", ["reach", "sir"])
 def test_a_penalty_keeps_the_constraints(name, monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 6)
+    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 6)
     problem, state = problem_in(HERE / name), list(RIGHT[name])[1:2]
     found = find_relaxation(problem.relaxed(), silent)
     assert found.kept == 6

@@ -174,7 +174,7 @@ def test_a_state_from_which_a_limit_cannot_be_kept_has_no_optimum():
 
 @pytest.mark.gate
 def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 3)
+    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 3)
     problem = bryson_denham(0.1).relaxed()
     found, said = find_relaxation(problem, silent), []
     assert found.kept == found.states
@@ -199,9 +199,9 @@ def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
 @pytest.fixture
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 260, 140)
-    monkeypatch.setattr("lyapnet.training.relaxation.STATES", 6)
+    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 6)
 
 
 @pytest.fixture(scope="module")

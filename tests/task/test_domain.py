@@ -225,10 +225,10 @@ def test_what_is_no_domain_is_refused_in_one_line(domain, message):
 @pytest.fixture
 def brief(monkeypatch):
     """A search for a start that takes a second or two."""
-    monkeypatch.setattr("lyapnet.training.optima.OPTIMA", 12)
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.optima.MAX_OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 60, 30)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
 
 
 def written_to(tmp_path, **changes):

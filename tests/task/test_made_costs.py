@@ -114,9 +114,9 @@ def test_a_guess_that_is_slow_at_first_is_not_given_up():
 
 @pytest.mark.gate
 def test_it_trains_and_comes_back(tmp_path, monkeypatch):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 260, 140)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
     brief = ["training.iterations=2", "evaluation.test_states=4", "evaluation.validation_states=4", "loggers=[csv]",
              "rollout.gradient=backprop"]  # fmt: skip
     run = lyapnet.train({**made(periodic=["angle"], obstacles=[BUMP]), "logs": str(tmp_path)}, brief)

@@ -194,11 +194,11 @@ def test_all_of_a_batch_are_settled_by_rounds_alone(monkeypatch):
     R, controls = factor @ factor.mT + 0.1 * torch.eye(6), ControlBox(-1.0, 1.0)
     expected, asked = minimise_in_graph(controls, R, b), []
     monkeypatch.setattr(
-        ControlBox, "_of_many", lambda *given: asked.append(len(given[2])) or controls.project(given[2])
+        ControlBox, "_minimise_by_active_set", lambda *given: asked.append(len(given[2])) or controls.project(given[2])
     )
     assert_close(controls.minimise(R, b), expected, rtol=0, atol=1e-10)
     assert not asked
-    monkeypatch.setattr("lyapnet.task.sets.SETTLING", 1)
+    monkeypatch.setattr("lyapnet.task.sets.SIMULTANEOUS_ROUNDS", 1)
     controls.minimise(R, b)
     assert 0 < asked[0] < 4000, "in fewer rounds some are not settled"
 

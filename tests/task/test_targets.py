@@ -193,9 +193,9 @@ def test_what_a_cost_ignores_it_ignores_about_a_target():
 
 @pytest.mark.gate
 def test_fine_tuning_to_another_target_is_no_silent_matter(tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
     brief = ["training.iterations=1", "evaluation.test_states=2", "evaluation.validation_states=2", "loggers=[csv]",
              "rollout.gradient=backprop", "evaluation.optimum=false"]  # fmt: skip
     task = {**MINE, "logs": str(tmp_path)}

@@ -25,7 +25,7 @@ from lyapnet.experiment.config import load_config
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, inside, optima_of, simulate
 
 LIMIT = 300.0  # CPU seconds
-GRACE = 60.0  # seconds, to keep what was found after the limit
+GRACE_ITERATIONS = 60.0  # seconds, to keep what was found after the limit
 
 
 def cpu_seconds(process: psutil.Process) -> float:
@@ -55,7 +55,7 @@ def train(folder: Path, seed: int, limit: float, changes: Sequence[str] = ()) ->
             if used > limit and not stopped:
                 stopped = True
                 process.send_signal(signal.SIGINT)
-            if used > limit + GRACE:
+            if used > limit + GRACE_ITERATIONS:
                 process.kill()
         status = process.wait()
     return {"status": status, "cpu": used, "wall": time.monotonic() - started, "stopped": stopped}

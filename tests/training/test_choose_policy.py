@@ -37,7 +37,7 @@ FITTED = "V fitted for the law that looks ahead"
 @pytest.fixture
 def brief(monkeypatch, tmp_path):
     """The task, its log folder, and a search for a start that is brief and finds that looking ahead gains a fifth."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 60, 20)
     monkeypatch.setattr("lyapnet.training.start._gain_by_looking_ahead", lambda policy, x0: 0.2)
     return {**TASK, "logs": str(tmp_path)}

@@ -14,7 +14,7 @@ from tensorboard.summary.writer.event_file_writer import EventFileWriter
 import lyapnet
 from lyapnet.base.files import write_atomically
 from lyapnet.training import figure_logger
-from lyapnet.training.loggers import quiet_writers
+from lyapnet.training.loggers import without_writer_tracebacks
 from lyapnet.training.metrics_file import MetricsFile, read_curves
 from tests.runs import SMALL, logged
 
@@ -153,7 +153,7 @@ def test_finished_run_is_left_as_it_is(resumed):
 def test_a_writer_whose_folder_is_gone_tells_the_training_alone(quiet, told, tmp_path, monkeypatch):
     seen, folder = [], tmp_path / "run"
     monkeypatch.setattr(threading, "excepthook", seen.append)
-    with quiet_writers() if quiet else nullcontext():
+    with without_writer_tracebacks() if quiet else nullcontext():
         writer = EventFileWriter(str(folder))
         writer.flush()
         shutil.rmtree(folder)
@@ -168,7 +168,7 @@ def test_other_threads_are_heard():
     raised = []
     before, threading.excepthook = threading.excepthook, raised.append
     try:
-        with quiet_writers():
+        with without_writer_tracebacks():
             thread = threading.Thread(target=Path("/nowhere/at/all").stat)
             thread.start()
             thread.join()

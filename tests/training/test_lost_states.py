@@ -13,8 +13,8 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import Linear
 from lyapnet.training import lost_states
 from lyapnet.training.data import EnsembleDataModule, InitialStateDataModule
-from lyapnet.training.lost_states import EXCESS, KEPT, SOUGHT, excess
-from lyapnet.training.validation_optimum import COMPARED
+from lyapnet.training.lost_states import MAX_LOST_STATES, MIN_EXCESS, SEARCHED_STATES, excess
+from lyapnet.training.validation_optimum import COMPARED_STATES
 from tests.problems import problem_of
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, values, without_figures
 
@@ -81,16 +81,16 @@ def test_excess_is_relative_to_what_v_says_or_to_the_typical_cost():
 def test_what_is_kept_is_lost_under_the_weights_that_found_it(run):
     shares = values(run.run, "lost_fraction/val")
     assert [*shares] == VALIDATIONS
-    x0 = PROBLEM.initial_states.sample(SOUGHT, stream(0, LOST, 17))
+    x0 = PROBLEM.initial_states.sample(SEARCHED_STATES, stream(0, LOST, 17))
     controller = lyapnet.load(run.last)
     trajectory = controller.rollout(x0.double())
-    lost = excess(trajectory.cost, trajectory.require_value()[0]) > EXCESS
+    lost = excess(trajectory.cost, trajectory.require_value()[0]) > MIN_EXCESS
     found = int(lost.sum())
-    assert 0 < found < SOUGHT
-    assert shares[17] == pytest.approx(found / SOUGHT)
+    assert 0 < found < SEARCHED_STATES
+    assert shares[17] == pytest.approx(found / SEARCHED_STATES)
     kept = lost_of(run.last)
-    torch.testing.assert_close(kept[: min(found, KEPT)], x0[lost][:KEPT].double())
-    assert len(kept) == min(KEPT, sum(round(share * SOUGHT) for share in shares.values()))
+    torch.testing.assert_close(kept[: min(found, MAX_LOST_STATES)], x0[lost][:MAX_LOST_STATES].double())
+    assert len(kept) == min(MAX_LOST_STATES, sum(round(share * SEARCHED_STATES) for share in shares.values()))
 
 
 @pytest.mark.gate
@@ -147,11 +147,11 @@ def _diverges():
 
 @pytest.mark.parametrize("seeds", [1, 2])
 def test_of_many_validation_states_the_first_are_compared_with_their_optimum(seeds, tmp_path):
-    evaluation = {**SMALL["evaluation"], "validation_states": COMPARED + 6}
+    evaluation = {**SMALL["evaluation"], "validation_states": COMPARED_STATES + 6}
     desk = trained(tmp_path, seeds=seeds, evaluation=evaluation, training={**SMALL["training"], "iterations": 1})
     cost = read_checkpoint(desk.last)["callbacks"]["ValidationOptimum"]["cost"]
-    assert cost.shape == (seeds, COMPARED + 6)
-    assert cost[:, :COMPARED].isfinite().all()
-    assert cost[:, COMPARED:].isnan().all()
+    assert cost.shape == (seeds, COMPARED_STATES + 6)
+    assert cost[:, :COMPARED_STATES].isfinite().all()
+    assert cost[:, COMPARED_STATES:].isnan().all()
     folder = desk.run if seeds == 1 else desk.run / "seed_0"
     assert all(value > 0 for value in values(folder, "optimality_gap/val").values()), "over those that are known"

@@ -10,7 +10,7 @@ from torch.testing import assert_close
 from lyapnet.evaluation.oracles import Optima
 from lyapnet.task.systems import IntegratorChain, Linear
 from lyapnet.training import optima
-from lyapnet.training.optima import how_many, optima_for
+from lyapnet.training.optima import count_optima, optima_for
 from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under, riccati
 from tests.problems import problem_of
 from tests.value.expansions.test_expansions import hanging
@@ -18,7 +18,7 @@ from tests.value.expansions.test_expansions import hanging
 
 def test_as_many_trajectories_as_fit_into_memory(monkeypatch):
     problem = problem_of(Linear([[0.0, 1.0], [1.0, 0.0]], [[0.0], [1.0]]), steps=20, dt=0.1)
-    monkeypatch.setattr(optima, "NUMBERS", 2 * problem.horizon.steps * 3**2)
+    monkeypatch.setattr(optima, "MAX_DERIVATIVE_ENTRIES", 2 * problem.horizon.steps * 3**2)
     assert optima_for(problem, [riccati(problem)], problem.initial_states.sample(9)).path.cost.shape == (2,)
 
 
@@ -37,7 +37,7 @@ def test_few_are_sought_and_the_others_follow(monkeypatch, without_oracle):
         return optimal_trajectories(problem, x0, u)
 
     monkeypatch.setattr(optima, "optimal_trajectories", counted)
-    monkeypatch.setattr(optima, "SOUGHT", 4)
+    monkeypatch.setattr(optima, "FROM_SCRATCH", 4)
     optimum = optima_for(problem, expansions, x0)
     assert batches[0] == 4
     assert 5 in batches
@@ -53,8 +53,8 @@ def test_what_an_oracle_knows_better_is_taken(share, many, taken, monkeypatch, w
     """And where that is so for many of the first, of the others too."""
     problem = hanging(steps=40)
     x0, expansions, batches = problem.initial_states.sample(5), [riccati(problem)], []
-    monkeypatch.setattr(optima, "ROUNDS", 0)
-    for name, value in (("FAR", 3), ("MANY", many)):
+    monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
+    for name, value in (("BY_ORACLE", 3), ("MIN_IMPROVED_SHARE", many)):
         monkeypatch.setattr(optima, name, value)
     good, idle = optima_for(problem, expansions, x0).path, path_under(problem, at_rest(problem), x0)
 
@@ -78,8 +78,8 @@ def test_controls_of_the_oracle_are_where_the_search_from_other_states_begins(mo
     """But for the last one, which has none and begins with a neighbour's law."""
     problem, begun = hanging(steps=40), []
     x0, expansions = problem.initial_states.sample(6), [riccati(problem)]
-    monkeypatch.setattr(optima, "ROUNDS", 0)
-    for name in ("SOUGHT", "FAR"):
+    monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
+    for name in ("FROM_SCRATCH", "BY_ORACLE"):
         monkeypatch.setattr(optima, name, 3)
     good = optima_for(problem, expansions, x0).path
     u = good.u.index_fill(1, torch.tensor([5]), torch.nan)
@@ -110,7 +110,7 @@ def test_a_search_ends_in_its_seconds(without_oracle):
 
 
 def test_a_task_of_one_state_has_fewer_optima():
-    counts = [how_many(problem_of(IntegratorChain(n))) for n in (1, 2, 3)]
+    counts = [count_optima(problem_of(IntegratorChain(n))) for n in (1, 2, 3)]
     assert counts == [48, 512, 512]
 
 
@@ -131,7 +131,7 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
     monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
     assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)
     begun.clear()
-    monkeypatch.setattr(optima, "ROUNDS", 0)
+    monkeypatch.setattr(optima, "NEIGHBOUR_ROUNDS", 0)
     assert optima_for(problem, expansions, x0).path.cost[0] > 2 * expected[0]
 
 

@@ -15,7 +15,7 @@ from lyapnet.task.systems import Linear, Pendulum
 from lyapnet.training import pretraining
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import optima_for
-from lyapnet.training.pretraining import errors, examples_of, examples_visited, fit
+from lyapnet.training.pretraining import draw_examples, errors, examples_visited, fit
 from lyapnet.value.expansions import at_rest, optimal_trajectories, path_under, riccati
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import SampledPolicy
@@ -44,7 +44,7 @@ def shifted(problem, by):
 
 def test_examples_are_the_value_function_of_a_linear_problem(problem):
     optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
-    examples = examples_of(problem, optimum, GENERATOR)
+    examples = draw_examples(problem, optimum, GENERATOR)
     along, near = examples.x.reshape(2, problem.horizon.steps, 6, problem.system.n)
     assert torch.equal(along, optimum.path.x[:-1])
     apart = (along[:, :, None] - along[:, None]).abs().max()
@@ -58,7 +58,7 @@ def test_a_law_that_looks_ahead_has_examples_where_its_search_begins_and_where_i
     """About the control that costs nothing, and about the best one; with constraints about the best one alone."""
     problem = problem_of(Pendulum(), steps=12, dt=0.05)
     optimum = optimal_trajectories(problem, problem.initial_states.sample(3), torch.zeros(12, 3, 1))
-    plain, ahead = (examples_of(problem, optimum, torch.Generator().manual_seed(1), each) for each in (False, True))
+    plain, ahead = (draw_examples(problem, optimum, torch.Generator().manual_seed(1), each) for each in (False, True))
     assert len(ahead.t) == 2 * len(plain.t)
     at_rest, at_best = (ahead.each(lambda column, k=k: column.unflatten(0, (2, 2, -1))[:, k]) for k in (0, 1))
     assert_close(at_rest.about, torch.zeros_like(at_rest.about))
@@ -69,7 +69,7 @@ def test_a_law_that_looks_ahead_has_examples_where_its_search_begins_and_where_i
     never = StateLimits([1], [50.0], [1.0], [1.0])
     relaxed = problem.replaced(constraints=never).relaxed(weight=1e-6)
     assert_close(
-        examples_of(relaxed, optimum, torch.Generator().manual_seed(1), True).about, at_best.about.flatten(0, 1)
+        draw_examples(relaxed, optimum, torch.Generator().manual_seed(1), True).about, at_best.about.flatten(0, 1)
     )
 
 
@@ -79,7 +79,7 @@ def test_the_excess_is_what_wrong_controls_cost(problem):
     policy, times = SampledPolicy(problem, V), problem.horizon.times(torch.zeros(()))
     path = path_under(problem, lambda n, x: policy(times[n], x).detach(), x0)
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 1, 1))
-    along = examples_of(
+    along = draw_examples(
         problem, optimum._replace(path=optimum.path._replace(x=path.x), expansion=at(path.x, problem)), GENERATOR
     )
     _, excess = errors(V, along, problem)
@@ -94,7 +94,7 @@ def test_a_wrong_slope_costs_nothing_where_the_control_stays_at_its_limit():
     limited = free.replaced(controls=ControlBox([-1.0], [1.0]))
     optimum = optimal_trajectories(limited, torch.tensor([[5.0], [8.0]]), torch.zeros(10, 2, 1))
     assert bool((optimum.path.u == -1).all())
-    start = examples_of(limited, optimum, GENERATOR).each(lambda column: column[:2])  # both states x₀
+    start = draw_examples(limited, optimum, GENERATOR).each(lambda column: column[:2])  # both states x₀
 
     def excess(share, problem=limited):
         scaled = Formula(lambda t, x: share * (optimum.expansion.gradient[1] * x).sum(-1))
@@ -132,7 +132,7 @@ def learner_of(problem, value_scale):
 
 def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     problem, seen, unseen = swing
-    examples, others = (examples_of(problem, optimum, GENERATOR) for optimum in (seen, unseen))
+    examples, others = (draw_examples(problem, optimum, GENERATOR) for optimum in (seen, unseen))
     learner = learner_of(problem, float(examples.cost.mean()))
     before = [float(error.detach()) for error in errors(learner.V, others, problem)]
     fit(learner, seen, examples)
@@ -143,9 +143,9 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
 
 @pytest.mark.gate
 def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(swing, monkeypatch):
-    """At most ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
+    """At most MAX_ROUNDS times; what stays is the V whose law cost least, though it is not the last."""
     problem, seen, _ = swing
-    given, costs = examples_of(problem, seen, GENERATOR), list[float]()
+    given, costs = draw_examples(problem, seen, GENERATOR), list[float]()
     mean, led = float(seen.path.cost.mean()), Learner.path_from
 
     def fitted(*pretended):
@@ -175,7 +175,7 @@ def test_a_law_that_costs_too_much_is_fitted_where_it_leads_until_it_does_not(sw
     assert len(costs) == 5, "after one in vain there is another"
     assert kept == pytest.approx(costs[4], rel=1e-6)
     kept = fitted(2, 1.5, 1.4, 1.3, 1.2, 1.1)
-    assert len(costs) == 1 + pretraining.ROUNDS
+    assert len(costs) == 1 + pretraining.MAX_ROUNDS
     assert kept == pytest.approx(costs[4], rel=1e-6)
 
 
@@ -213,13 +213,13 @@ def test_near_states_are_no_further_than_their_expansion_is_believed(swing, monk
     def furthest():
         """The greatest ½ δᵀ|H|δ, as a share of the cost."""
         generator = torch.Generator().manual_seed(1)
-        along, near = examples_of(problem, seen, generator).x.reshape(2, problem.horizon.steps, 12, 2)
+        along, near = draw_examples(problem, seen, generator).x.reshape(2, problem.horizon.steps, 12, 2)
         values, vectors = torch.linalg.eigh(H)
         moved = (vectors.mT @ (near - along)[..., None])[..., 0]
         return float(((moved**2 * values.abs()).sum(-1) / 2 / cost).max())
 
     anyhow = furthest()
-    monkeypatch.setattr(pretraining, "TRUSTED_NEAR", anyhow / 5)
+    monkeypatch.setattr(pretraining, "NEIGHBOUR_TRUST_LIMIT", anyhow / 5)
     assert furthest() == pytest.approx(anyhow / 5)
 
 
@@ -227,11 +227,11 @@ def test_where_no_law_is_finite_a_fit_leaves_the_weights(swing, monkeypatch):
     problem, seen, _ = swing
     learner, x = learner_of(problem, 1.0), torch.randn(5, 2)
     before = learner.V(torch.zeros(()), x)
-    monkeypatch.setattr(pretraining, "ROUNDS", 1)
+    monkeypatch.setattr(pretraining, "MAX_ROUNDS", 1)
     diverging = path_under(problem, at_rest(problem), seen.path.x[0])
     diverging = diverging._replace(cost=diverging.cost * torch.inf)
     monkeypatch.setattr(Learner, "path_from", lambda *arguments: diverging)
-    fit(learner, seen, examples_of(problem, seen, GENERATOR))
+    fit(learner, seen, draw_examples(problem, seen, GENERATOR))
     assert_close(learner.V(torch.zeros(()), x), before, rtol=0, atol=0)
 
 
@@ -239,7 +239,7 @@ def test_errors_count_against_what_their_own_trajectory_costs(problem):
     """From a state that is dear, a V that is off by a tenth is off as much as from others; from a cheap one, less."""
     x0 = torch.tensor([[1.0, 0.0], [10.0, 0.0], [20.0, 0.0]])
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
-    examples, exact = examples_of(problem, optimum, GENERATOR), shifted(problem, 0.0)
+    examples, exact = draw_examples(problem, optimum, GENERATOR), shifted(problem, 0.0)
     wrong = Formula(lambda t, x: 1.1 * exact(t, x))
     off = [errors(wrong, examples.each(lambda column, row=row: column[[row]]), problem)[0].item() for row in range(3)]
     assert off == pytest.approx([0.01 * 1e-4, 0.01, 0.01], rel=1e-6)
@@ -264,7 +264,7 @@ def test_the_states_that_a_law_visits_are_examples(problem):
     for error in errors(shifted(problem, 0.0), visited, problem):
         assert float(error.detach()) < 1e-20
     assert float(errors(shifted(problem, 0.1), visited, problem)[1].detach()) > 1e-6
-    assert len(examples_of(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
+    assert len(draw_examples(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -284,6 +284,6 @@ def test_only_finite_trajectories_are_examples(problem):
     optimum = optimal_trajectories(problem, x0, torch.zeros(problem.horizon.steps, 3, 1))
     broken = optimum.path.cost.clone()
     broken[1] = torch.inf
-    examples = examples_of(problem, optimum._replace(path=optimum.path._replace(cost=broken)), GENERATOR)
+    examples = draw_examples(problem, optimum._replace(path=optimum.path._replace(cost=broken)), GENERATOR)
     assert len(examples.t) == 2 * 2 * problem.horizon.steps
     assert_close(examples.cost.unique(), optimum.path.cost[[0, 2]].sort().values)

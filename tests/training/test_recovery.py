@@ -16,7 +16,7 @@ from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.training.build import build_module
 from lyapnet.training.experiment import train
 from lyapnet.training.learner import Learner
-from lyapnet.training.recovery import MOST, RETURNS, RISE, SLOWER, RisingCost
+from lyapnet.training.recovery import COMPARED_SHARE, DIVERGENCE_COST_RATIO, MAX_RETURNS, RATE_DIVISOR, RisingCost
 
 
 @pytest.fixture
@@ -81,8 +81,8 @@ def test_it_goes_on_from_the_last_checkpoint_with_a_smaller_rate(config, capsys,
     assert read_checkpoint(run.last)["global_step"] == 12
     (entry,) = run.record()["returns"]
     assert entry["to"] == 4
-    assert math.isclose(entry["rate_share"], 1 / SLOWER)
-    assert [r / u for r, u in zip(rates(run), rates(untroubled), strict=True)] == pytest.approx([1 / SLOWER])
+    assert math.isclose(entry["rate_share"], 1 / RATE_DIVISOR)
+    assert [r / u for r, u in zip(rates(run), rates(untroubled), strict=True)] == pytest.approx([1 / RATE_DIVISOR])
     steps = [line.split(",")[0] for line in (run.folder / "metrics.csv").read_text().splitlines()[1:]]
     assert len(steps) == len(set(steps))
 
@@ -92,8 +92,8 @@ def test_before_the_first_checkpoint_it_goes_back_to_its_start(config, capsys, m
     run, out = run_of(config, capsys)
     assert "Going back to step 0" in out.replace("\n", " ")
     assert read_checkpoint(run.last)["global_step"] == 12
-    slower = {**config, "training": {**config["training"], "learning_rate": 0.01 / SLOWER}}
-    slower["training"]["final_learning_rate"] = 1e-4 / SLOWER
+    slower = {**config, "training": {**config["training"], "learning_rate": 0.01 / RATE_DIVISOR}}
+    slower["training"]["final_learning_rate"] = 1e-4 / RATE_DIVISOR
     expected, _ = run_of(slower, capsys)
     weights, others = (read_checkpoint(r.last)["state_dict"] for r in (run, expected))
     for name in weights:
@@ -102,9 +102,9 @@ def test_before_the_first_checkpoint_it_goes_back_to_its_start(config, capsys, m
 
 def test_it_gives_up(config, capsys, monkeypatch):
     Breaks(monkeypatch, range(2, 100))
-    with pytest.raises(DivergenceError, match=f"{RETURNS} returns did not help"):
+    with pytest.raises(DivergenceError, match=f"{MAX_RETURNS} returns did not help"):
         run_of(config, capsys)
-    assert len(capsys.readouterr().out.split("Going back")) == RETURNS + 1
+    assert len(capsys.readouterr().out.split("Going back")) == MAX_RETURNS + 1
 
 
 def test_a_stiff_law_is_named(config, capsys, monkeypatch):
@@ -124,17 +124,17 @@ def test_a_rising_cost_is_a_divergence(config, tmp_path):
     trainer = Trainer(logger=False, enable_checkpointing=False, default_root_dir=tmp_path, accelerator="cpu")
 
     def validate(watch, cost):
-        few = int((1 - MOST) * 64)  # that cost far more
+        few = int((1 - COMPARED_SHARE) * 64)  # that cost far more
         costs = torch.cat([torch.full((64 - few,), cost), torch.full((few,), 1e6)])[torch.randperm(64)]
         module.members[0].validation = SimpleNamespace(cost=costs)
         watch.on_validation_end(trainer, module)
 
-    for cost in (3.0, 2.0, 0.99 * 2 * RISE, 2.0):
+    for cost in (3.0, 2.0, 0.99 * 2 * DIVERGENCE_COST_RATIO, 2.0):
         validate(watch, cost)
     resumed.load_state_dict(watch.state_dict())
     for each in (watch, resumed):
-        with pytest.raises(DivergenceError, match=f"at most {2 * RISE:g}, as 2 was reached before"):
-            validate(each, 1.01 * 2 * RISE)
+        with pytest.raises(DivergenceError, match=f"at most {2 * DIVERGENCE_COST_RATIO:g}, as 2 was reached before"):
+            validate(each, 1.01 * 2 * DIVERGENCE_COST_RATIO)
 
 
 def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
@@ -143,7 +143,7 @@ def test_a_resumed_run_stays_slower(config, capsys, monkeypatch):
     longer = {**config, "training": {**config["training"], "iterations": 16}}
     again, _ = run_of(longer, capsys, resume="last")
     assert again.folder == run.folder
-    assert math.isclose(read_checkpoint(run.last)["lyapnet"]["rate_share"], 1 / SLOWER)
+    assert math.isclose(read_checkpoint(run.last)["lyapnet"]["rate_share"], 1 / RATE_DIVISOR)
     assert len(read_json(run.folder / "run.json", "")["returns"]) == 1
 
 

@@ -138,7 +138,7 @@ def test_its_points_fail_the_condition_or_are_undecided(run):
     *failing, first, second = points
     assert {tuple(first.tolist()), tuple(second.tolist())} == {(0.01, 0.2, -0.3), (0.02, 1.5, 2.5)}
     failing = torch.stack(failing)
-    assert len(failing) == refinement.FURTHER
+    assert len(failing) == refinement.POINTS_PER_ROUND
     with torch.no_grad():
         c, W = condition(failing[:, 0], failing[:, 1:]), condition.height(failing[:, 0], failing[:, 1:])
     assert (c > 0).all()
@@ -167,9 +167,9 @@ def region_run(tmp_path_factory):
     tiny = [each for each in TINY if "steps" not in each]
     changes = [*tiny, "horizon={steps: 40, dt: 0.2, stationary: true}", "training.warmup=0", "pointwise.points=16"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lyapnet.training.start.OPTIMA", 6)
+        patch.setattr("lyapnet.training.start.MAX_OPTIMA", 6)
         shorten_fits(patch, 5, 5)
-        patch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+        patch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
         assert main(["train", "--config", "conf/regions/van_der_pol.yaml", f"logs={folder}", *changes]) == 0
     return folder / "van_der_pol_region/version_0"
 

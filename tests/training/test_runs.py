@@ -357,7 +357,7 @@ def test_stopped_while_its_start_is_sought_a_run_says_how_to_go_on(script, tmp_p
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [script])
     with monkeypatch.context() as patch:
-        patch.setattr("lyapnet.training.experiment.kept_or_chosen", stops)
+        patch.setattr("lyapnet.training.experiment.load_or_choose_start", stops)
         assert main(["train", "--config", "experiment.yaml", *TINY]) == 130
     said, command, again = capsys.readouterr().err.splitlines()[-1].partition(" Continue with: ")
     assert said == "SIGINT: stopped at once."

@@ -22,7 +22,7 @@ def wait_for(log, lines):
 
 
 def test_a_log_has_a_line_for_each_stage_and_never_is_silent_for_long(monkeypatch, log):
-    monkeypatch.setattr("lyapnet.training.stages.QUIET", 0.02)
+    monkeypatch.setattr("lyapnet.training.stages.LOG_INTERVAL", 0.02)
     with Stages(Console(file=log, width=20), "start") as report:
         report("optima from 96 states of X₀")
         report("fitting", 0, 2000)
@@ -53,7 +53,7 @@ def test_what_is_quickly_done_says_nothing(log):
 
 
 def test_nothing_is_said_at_rest(monkeypatch, log):
-    monkeypatch.setattr("lyapnet.training.stages.QUIET", 0.02)
+    monkeypatch.setattr("lyapnet.training.stages.LOG_INTERVAL", 0.02)
     with Stages(Console(file=log), "sound", patience=0.02) as report:
         report("bounding boxes")
         wait_for(log, 1)

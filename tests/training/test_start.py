@@ -17,7 +17,7 @@ from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.training import pretraining
 from lyapnet.training.build import build_module
-from lyapnet.training.candidates import CALM
+from lyapnet.training.candidates import ZERO_VALUE
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.start import choose_start, expansions_of
 from lyapnet.value.expansions import optimal_trajectories
@@ -62,7 +62,9 @@ def test_a_linear_task_is_solved_before_the_first_step(monkeypatch):
     (learner,), start = started(LINEAR)
     problem = learner.problem
     assert "Riccati" in start.chosen.name
-    assert [candidate.name for candidate in start.candidates] == [CALM, start.chosen.name], "X₀ is around the goal"
+    assert [candidate.name for candidate in start.candidates] == [ZERO_VALUE, start.chosen.name], (
+        "X₀ is around the goal"
+    )
     x = problem.initial_states.sample(20)
     exact = discrete_riccati(problem.system, problem.cost, problem.horizon)
     assert_close(learner.rollout(x).cost, exact.value(0, x), rtol=1e-5, atol=0)
@@ -104,7 +106,7 @@ def test_far_from_the_goal_optima_are_the_best_start(swing):
     assert seconds[1] > 0
     assert seconds[1:] == sorted(seconds[1:])
     assert seconds[2] < seconds[0] < seconds[3], "V = 0 is tried where what is quick to know is known"
-    assert costs[CALM] > 10 * start.chosen.cost
+    assert costs[ZERO_VALUE] > 10 * start.chosen.cost
     mean = learner.rollout(learner.problem.initial_states.sample(64)).cost.mean()
     assert float(mean.detach()) == pytest.approx(start.chosen.cost, rel=0.05)
 
@@ -210,7 +212,7 @@ def test_a_run_records_its_start_and_loads_with_it(tmp_path, capsys):
     record = json.loads((run.folder / "run.json").read_text())["start"]
     assert record["chosen"] == "the Riccati solution at the goal"
     assert record["seconds"].keys() == record["tried"].keys()
-    assert record["tried"][CALM] > record["tried"][record["chosen"]]
+    assert record["tried"][ZERO_VALUE] > record["tried"][record["chosen"]]
     assert "start: the Riccati solution at the goal, the cheapest of" in capsys.readouterr().out
     controller = load(run.best)
     assert controller.config.rollout.policy == "sampled"
@@ -252,7 +254,7 @@ def test_optima_are_sought_where_there_is_no_expansion():
     optimum = optimal_trajectories(smooth, x, guess).path.cost
     cost = module.members[0].rollout(x).cost.detach()
     assert float((cost / optimum).median()) < 1.03
-    calm = next(candidate for candidate in start.candidates if candidate.name == CALM)
+    calm = next(candidate for candidate in start.candidates if candidate.name == ZERO_VALUE)
     assert calm.cost > 1.5 * start.chosen.cost, "what it was before"
 
 

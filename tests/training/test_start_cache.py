@@ -13,7 +13,7 @@ from lyapnet.training import start_cache
 from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints
 from lyapnet.training.facts import facts_of
-from lyapnet.training.start_cache import StartCache, kept_or_chosen
+from lyapnet.training.start_cache import StartCache, load_or_choose_start
 from tests.fits import few_optima
 
 TASK = {
@@ -73,7 +73,7 @@ def drawn(*overrides):
 
 def begun(*overrides):
     members = drawn(*overrides)
-    return members, kept_or_chosen(members)
+    return members, load_or_choose_start(members)
 
 
 @pytest.mark.gate

@@ -52,13 +52,13 @@ def test_a_curvature_that_is_missing_at_one_node_does_not_cost_the_others_theirs
     for system in (Drone(), Rooted()):
         optimum = of(drone(system), x0)
         assert all(part.isfinite().all() for part in optimum.expansion)
-        assert optimum.mended.tolist() == [1, 1]
+        assert optimum.replaced.tolist() == [1, 1]
     h = 1e-3
     moved = x0 + torch.tensor([h, 0, 0, 0])
     slope = (of(problem, moved).path.cost - of(problem, moved - torch.tensor([2 * h, 0, 0, 0])).path.cost) / (2 * h)
     assert_close(optimum.expansion.gradient[0, :, 0], slope, rtol=1e-4, atol=0)
     moving = of(problem, x0 + torch.tensor([0, 0, 0.1, 0]))
-    assert moving.mended.tolist() == [0, 0], "away from rest nothing is missing"
+    assert moving.replaced.tolist() == [0, 0], "away from rest nothing is missing"
 
 
 def test_without_that_it_is_no_number():
@@ -75,7 +75,7 @@ def test_derivatives_that_exist_are_left_as_they_are():
     problem, x0 = drone(), torch.tensor([[3.0, 1.0, 0.5, 0.2]])
     path = path_under(problem, lambda n, x: torch.full_like(x[..., :2], 0.5), x0)
     steps = along(problem, path.x, path.u)
-    assert not steps.mended.any()
+    assert not steps.replaced.any()
     p = torch.randn(30, 1, 4)
     curved = with_curvature(StepDerivatives(problem.step, 4), steps, p)
     z = steps.z[4, 0]
@@ -83,7 +83,7 @@ def test_derivatives_that_exist_are_left_as_they_are():
     assert_close(curved.l_zz[4, 0] - steps.l_zz[4, 0], hessian)
     rest = path_under(problem, at_rest(problem), x0 * torch.tensor([1.0, 1, 0, 0]))
     still = with_curvature(StepDerivatives(problem.step, 4), along(problem, rest.x, rest.u), p)
-    assert bool(still.mended[:-1].all()), "at rest it is missing at every node"
+    assert bool(still.replaced[:-1].all()), "at rest it is missing at every node"
     assert still.l_zz.isfinite().all()
 
 

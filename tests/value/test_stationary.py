@@ -184,7 +184,7 @@ def network():
     """A network with random weights about a goal that is not the origin."""
     torch.manual_seed(1)
     V = StationaryNetwork(SCALING, [8, 6], embedded_angles=[0]).double()
-    V.take(torch.tensor([0.3, -0.2]).double(), torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double(), 0.4)
+    V.start_from_regulator(torch.tensor([0.3, -0.2]).double(), torch.tensor([[2.0, 0.5], [0.5, 1.0]]).double(), 0.4)
     torch.nn.init.normal_(V.network.output.weight, std=0.5)
     return V.requires_grad_(False)
 
@@ -255,7 +255,7 @@ def test_from_the_goal_alone_there_is_a_start():
 @pytest.mark.gate
 def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
     """Of a pendulum between tight limits it lies far below what V is on a wide X₀, and a fit sees both."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 24)
     shorten_fits(monkeypatch, 150, 50)
     tight = ["controls={lower: -12, upper: 12}", "initial_states={lower: [-3, -3], upper: [3, 3]}", "cost.R=0.05"]
     (learner,) = build_module(config_from_plain(PENDULUM, tight)).members
@@ -272,7 +272,7 @@ def test_the_level_up_to_which_the_regulator_is_right_is_found(monkeypatch):
 @pytest.fixture
 def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)
 
 

@@ -1,4 +1,4 @@
-"""Ground truth: optima known by another route than learning; training asks for none but of other states, to start."""
+"""Oracles: optimal costs by methods without learning. Training uses them only for its initial V, on other states."""
 
 import importlib.util
 
@@ -32,20 +32,21 @@ __all__ = [
 
 
 def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
-    """x₀ ↦ J*(x₀), the least cost from each of a batch of initial states, in their own dtype.
+    """The oracle x₀ ↦ J*(x₀) of a problem, the least cost from each of a batch of initial states.
 
-    Where the system is `Linear`, R a matrix, U = ℝᵐ and nothing constrained, it is Riccati's: that of the discretised
-    task, J_N*, with Euler, and that of the continuous task with any other integrator. Else it is found by direct
-    transcription, within the limits of U and h(x) ≤ 0: with the steps of that integrator, rk4 for an adaptive one, and
-    u held over each. Rollouts of laws that are not held read them at every stage of a step, and may so cost less, by
-    O(Δt²). Where the cost has a kink at the goal, the optimum is that of the rounded task, and its controls count for
-    what they cost in the task as it is written.
+    * Riccati, if the system is `Linear`, R is a constant matrix, U = ℝᵐ and there are no constraints: of the
+      discretised task for Euler steps, of the continuous task for any other integrator.
+    * Direct transcription otherwise, within the limits of U and h(x) ≤ 0, with the steps of the integrator (rk4 for an
+      adaptive one) and u held over each step. A law that is not held is evaluated at every stage of a step, and may
+      therefore cost less, by O(Δt²).
+
+    If the cost has a kink at the goal, the controls are optimal for the smoothed cost; J* is their original cost.
 
     Args:
-        method: of the steps; None: the horizon's.
+        method: integrator of the steps; None: that of the horizon.
 
     Raises:
-        OracleError: there is none; says why, and what to do.
+        OracleError: there is no oracle; says why, and what to do.
         ValueError: a weight of the cost does not fit the system's dimensions.
     """
     if problem.controls.limits is None:
@@ -60,7 +61,7 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         try:
             return RiccatiOracle(solve(system, cost, horizon))
-        except (RuntimeError, OverflowError) as error:  # torch's LinAlgError is no public name
+        except (RuntimeError, OverflowError) as error:  # RuntimeError: torch's LinAlgError is not public
             raise OracleError(
                 f"Expected matrices whose Riccati equation rounding lets be solved, got others ({one_line(error)}); "
                 "choose units in which they are of similar size."
@@ -69,7 +70,7 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
         raise OracleError(
             "Expected CasADi for the optimum of a nonlinear task, got none; pip install 'lyapnet[oracle]'."
         )
-    from lyapnet.evaluation.oracles.transcription import Transcription  # needs the extra
+    from lyapnet.evaluation.oracles.transcription import Transcription  # needs CasADi
 
     steps, smooth = "rk4" if method in ADAPTIVE_METHODS else method, rounded(problem, SOLVED)
     found = Transcription(smooth, steps)
@@ -77,7 +78,7 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
 
 
 def optimal_cost(problem: Problem, method: str | None = None) -> Oracle | None:
-    """The oracle of a task, or None where there is none.
+    """The oracle of a task; None if there is none.
 
     Raises:
         ValueError: a weight of the cost does not fit the system's dimensions.

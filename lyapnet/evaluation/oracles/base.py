@@ -1,4 +1,4 @@
-"""What an oracle is: the least cost from each initial state, and how it is known."""
+"""The base class of oracles, which compute the least cost from each initial state."""
 
 import math
 from abc import ABC, abstractmethod
@@ -9,11 +9,11 @@ import torch
 
 from lyapnet.base.types import ControlPath, PerState, State
 
-Report = Callable[[int, int], None]  # (initial states done, of how many)
+Report = Callable[[int, int], None]  # called with (initial states done, total)
 
 
 def silent(done: int, total: int) -> None:
-    """No progress shown."""
+    """A report that shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class Optima:
 
     Attributes:
         cost: J*(x₀); NaN where no optimum was found.
-        reasons: why not, one for each initial state; empty where it was found.
-        u: the optimal controls (N, b, m), where the oracle has them.
+        reasons: for each initial state the reason why no optimum was found; empty if it was found.
+        u: the optimal controls (N, b, m); None if the oracle has none.
     """
 
     cost: PerState
@@ -32,7 +32,7 @@ class Optima:
 
     @property
     def failures(self) -> int:
-        """How many have no optimum."""
+        """The number of states without optimum."""
         return int(torch.isnan(self.cost).sum())
 
 
@@ -46,9 +46,9 @@ class Oracle(ABC):
         """The optima of a batch (b, n).
 
         Args:
-            known: a control sequence from each x₀, (N, b, m), which an iterative oracle takes for one of its starts.
-            progress: is told how many states are done.
-            seconds: of this thread's work, after which an iterative oracle tries no further state.
+            known: controls from each x₀, (N, b, m), an additional initial guess for an iterative oracle.
+            progress: called with the number of states that are done.
+            seconds: CPU seconds of this thread after which an iterative oracle tries no further state.
         """
 
     def __call__(self, x0: State) -> PerState:

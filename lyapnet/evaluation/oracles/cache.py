@@ -1,4 +1,4 @@
-"""Optimal controls kept on disk from run to run: one small file for each task and initial state."""
+"""A disk cache of optimal controls: one small file for each task and initial state."""
 
 import contextlib
 import hashlib
@@ -23,8 +23,8 @@ from lyapnet.task.sets import ControlSet
 class OptimaCache:
     """(task, x₀) ↦ the best controls found so far, (N, m).
 
-    A task is what its trace says: the operations and constants of dynamics, cost and Δt, N, and the control set. What
-    cannot be read is not there; what cannot be written is not kept.
+    A task is identified by the traced operations and constants of its dynamics, cost and Δt, by N, and by the control
+    set. Files that cannot be read or written are ignored.
     """
 
     def __init__(self, graphs: Sequence[GraphModule], steps: int, m: int, controls: ControlSet):
@@ -35,9 +35,9 @@ class OptimaCache:
         self.folder = cache_folder() / "optima" / _hash(repr([self.shape, *parts]).encode())
 
     def read(self, x0: Tensor) -> Tensor | None:
-        """The controls kept for a state (n,)."""
+        """The stored controls of a state (n,); None if there are none."""
         try:
-            # the archive's checksums tell a damaged file
+            # the archive's checksums detect damaged files
             with np.load(io.BytesIO(self._file(x0).read_bytes()), allow_pickle=False) as entries:
                 u = torch.from_numpy(entries["u"])
         except (OSError, EOFError, KeyError, ValueError, TypeError, zipfile.BadZipFile):
@@ -46,12 +46,14 @@ class OptimaCache:
         return u if fits else None
 
     def write(self, x0: Tensor, u: Control) -> None:
-        """Keep the controls of a state (n,), in place of what was kept."""
+        """Store the controls of a state (n,), replacing earlier ones."""
         content = io.BytesIO()
         np.savez(content, u=u.numpy())
         with contextlib.suppress(OSError):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.TemporaryDirectory(dir=self.folder, prefix=".new_") as draft:  # of this process alone
+            with tempfile.TemporaryDirectory(
+                dir=self.folder, prefix=".new_"
+            ) as draft:  # no other process uses this folder
                 path = Path(draft) / "optimum"
                 write_atomically(path, content.getvalue())
                 path.replace(self._file(x0))

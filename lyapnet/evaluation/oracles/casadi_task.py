@@ -1,4 +1,4 @@
-"""A task as CasADi functions, for solvers that plan: its step, its end and its constraints."""
+"""A task as CasADi functions, for nonlinear programming: its step, its terminal cost and its constraints."""
 
 from collections.abc import Callable, Sequence
 
@@ -14,26 +14,26 @@ from lyapnet.task.problem import Problem
 
 
 class CasadiTask:
-    """The torch system itself, read by `symbolic`: (x_n, u_n) ↦ (x_{n+1}, ∫ℓ), x_N ↦ φ and x ↦ h.
+    """The torch functions translated to CasADi: (x_n, u_n) ↦ (x_{n+1}, ∫ℓ), x_N ↦ φ and x ↦ h.
 
     Attributes:
-        graphs: the traces of those three, or two.
-        step, end, inside: the same as CasADi's; inside is None without constraints.
+        graphs: the torch traces of these functions.
+        step, end, inside: the CasADi functions; inside is None without constraints.
 
     Args:
         problem: in float64 on the CPU.
 
     Raises:
-        OracleError: dynamics or cost are not in torch operations that CasADi has too.
+        OracleError: dynamics or cost use torch operations that CasADi lacks.
     """
 
     def __init__(self, problem: Problem):
         self.problem, self.graphs = problem, list[GraphModule]()
         system = problem.system
         x, u = torch.zeros(1, system.n, dtype=torch.float64), torch.zeros(1, system.m, dtype=torch.float64)
-        self.step = self._translated(self.step_in_torch, (x, u))
-        self.end = self._translated(self.end_in_torch, (x,))
-        self.inside = None if problem.constraints is None else self._translated(self.inside_in_torch, (x,))
+        self.step = self._translate(self.step_in_torch, (x, u))
+        self.end = self._translate(self.end_in_torch, (x,))
+        self.inside = None if problem.constraints is None else self._translate(self.inside_in_torch, (x,))
 
     def step_in_torch(self, x: State, u: Control) -> tuple[State, PerState]:
         """(x_{n+1}, ∫ℓ over the step); with Euler (x_n + Δt(f + gu), Δt ℓ(x_n, u_n))."""
@@ -48,7 +48,7 @@ class CasadiTask:
         assert self.problem.constraints is not None
         return (self.problem.constraints(x),)
 
-    def _translated(self, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> casadi.Function:
+    def _translate(self, function: Callable[..., Tensors], arguments: Sequence[Tensor]) -> casadi.Function:
         self.graphs.append(traced(function, arguments))
         translated = symbolic(self.graphs[-1], arguments)
         require_equal(translated, function, arguments)

@@ -1,4 +1,4 @@
-"""Local minima of one problem for each initial state, each from several starts and from its neighbours' ends."""
+"""Multi-start search: local minima from several initial guesses for each state, and from the neighbours' minima."""
 
 import math
 import time
@@ -10,16 +10,16 @@ import numpy as np
 
 from lyapnet.evaluation.oracles.base import Report
 
-HOPELESS = 8  # failures from the first states on, after which there is nothing to be expected for the others
-SECONDS = 15.0  # of the starts of one state, after which no further one is made
-EXPLORED = 16  # first states on which all starts are tried, before it is judged whether there are several minima
-EXPLORED_AGAIN = 8  # the same, where an earlier batch over the same X₀ has shown one minimum from each of its states
-NEIGHBOURS = 3  # nearest initial states, whose optima are starts for each other
-SAME = 1e-6  # relative difference of two costs that are the same
+HOPELESS = 8  # if the first states fail in such a number, the others are not tried
+SECONDS = 15.0  # seconds for one state, after which no further initial guess is tried
+EXPLORED = 16  # first states on which all initial guesses are tried, to detect several local minima
+EXPLORED_AGAIN = 8  # the same, if an earlier batch over the same X₀ had a single minimum from each state
+NEIGHBOURS = 3  # nearest initial states, whose optima are initial guesses for each other
+SAME = 1e-6  # relative difference below which two costs count as equal
 
 
 class Candidate(NamedTuple):
-    """A trajectory from an initial state: a start, or the local minimum that one led to."""
+    """A trajectory from an initial state: an initial guess, or a local minimum."""
 
     x: np.ndarray  # (N, n), from x₁ on
     u: np.ndarray  # (N, m)
@@ -27,26 +27,29 @@ class Candidate(NamedTuple):
 
 
 def is_better(one: Candidate | None, other: Candidate | None) -> bool:
-    """Whether one costs less than the other, by more than rounding; anything is better than none."""
+    """Whether one candidate costs less than the other by more than rounding; any candidate is better than None."""
     if one is None or other is None:
         return one is not None
     return one.cost < other.cost - SAME * abs(other.cost)
 
 
 class MultiStart:
-    """The best candidate of each initial state, improved start by start.
+    """The best candidate of each initial state, improved by one initial guess after another.
 
-    Which local minimum a start leads to is luck, but the least cost is continuous in x₀: what was found from one state
-    is the first start of those after it that are near. Of the first `explored` states all starts are tried, and what
-    was found from the states around. Where none of them improves on a minimum that is known, the other states have that
-    first start alone, and those that cost less than where it led. Else they have all of them too, and in the end what
-    was found from one state is tried from the states around it, and from theirs, as long as that improves any.
+    The result of a local solver may be only a local minimum, but the least cost is continuous in x₀. Therefore optima
+    of nearby states serve as initial guesses:
+
+    1. Each state starts with the optimum of the nearest solved state.
+    2. The first `explored` states also try all their own guesses and the optima of the states around.
+    3. If none of these improves a known minimum, the other states skip their own guesses, except those that are cheaper
+       than the minimum they have. Otherwise they try all guesses, and at the end optima are passed on from neighbour to
+       neighbour as long as any state improves.
 
     Args:
         x0: (b, n).
-        best: what is known already, one entry for each state.
-        minimise: (x₀, start, briefly) ↦ the local minimum, or why there is none; briefly where one is known already.
-        explored: how many of the first states are explored.
+        best: a known candidate for each state, or None.
+        minimise: (x₀, guess, briefly) ↦ the local minimum, or the reason for none; briefly if one is known already.
+        explored: number of explored states.
     """
 
     def __init__(
@@ -57,17 +60,17 @@ class MultiStart:
         explored: int = EXPLORED,
     ):
         self.x0, self.best, self.minimise, self.explored = x0, list(best), minimise, explored
-        self.reasons = [""] * len(x0)  # why the last start that led nowhere did so
-        self.several = False  # whether a start has improved on a minimum that was known
-        self._tried = dict[tuple[int, int], Candidate]()  # by state and identity, as no start is tried twice
+        self.reasons = [""] * len(x0)  # for each state why its last unsuccessful guess failed
+        self.several = False  # whether a guess has improved a known minimum
+        self._tried = dict[tuple[int, int], Candidate]()  # (state, id of the guess), so that none is tried twice
 
     def run(self, starts: Mapping[int, Iterable[Candidate]], progress: Report, until: float = math.inf) -> None:
-        """Try the starts of some states, given by their indices, and what was found from the states around.
+        """Try the initial guesses of some states, given by their indices, and the optima of the states around.
 
         Args:
-            until: when this thread's work has taken so many seconds, no further state is tried.
+            until: CPU time of this thread after which no further state is tried.
         """
-        failures, last = 0, ""  # in a row, from the first state on; the reason of the last one
+        failures, last = 0, ""  # consecutive failures from the first state on, -1 after a success; the last reason
         for done, (i, own) in enumerate(starts.items()):
             progress(done, len(starts))
             if time.thread_time() > until:
@@ -77,7 +80,7 @@ class MultiStart:
                 self.reasons[i] = self.reasons[i] or f"{last}, from {HOPELESS} states in a row; this one was not tried"
                 continue
             began, solved = time.monotonic(), [j for j in starts if j != i and self.best[j] is not None]
-            if solved:  # the optimum of the nearest of them, from where IPOPT most often has the shortest way
+            if solved:  # the nearest optimum is usually the best initial guess for IPOPT
                 self._try(i, self.best[solved[int(self._distances(i)[solved].argmin())]])
             is_enough = done >= self.explored and not self.several and self.best[i] is not None
             for start in own:
@@ -95,7 +98,7 @@ class MultiStart:
         progress(len(starts), len(starts))
 
     def _exchange(self, states: Iterable[int], others: Sequence[int]) -> None:
-        """Try from some states what was found from those of others that are around."""
+        """Try from some states the optima of their neighbours among others; improved states pass theirs on."""
         nearest = {i: self._nearest(i, others) for i in others}
         followers = defaultdict(list)
         for i, neighbours in nearest.items():
@@ -108,7 +111,7 @@ class MultiStart:
                 pairs.extend((k, i) for k in followers[i])
 
     def _try(self, i: int, start: Candidate | None) -> bool:
-        """Whether a start improves a state's best."""
+        """Try an initial guess; return whether it improves the best candidate of a state."""
         if start is None or (i, id(start)) in self._tried:
             return False
         self._tried[i, id(start)] = start
@@ -123,11 +126,11 @@ class MultiStart:
         return improved
 
     def _distances(self, i: int) -> np.ndarray:
-        """Squared distances from a state to all, each component measured against its spread in the batch."""
+        """Squared distances from a state to all, with each component scaled by its range in the batch."""
         spread = np.ptp(self.x0, axis=0)
         return (((self.x0 - self.x0[i]) / np.where(spread > 0, spread, 1)) ** 2).sum(1)
 
     def _nearest(self, i: int, others: Sequence[int]) -> list[int]:
-        """The nearest of some other states, nearest first."""
+        """The NEIGHBOURS nearest of some other states, nearest first."""
         distance = self._distances(i)
         return sorted((j for j in others if j != i), key=lambda j: distance[j])[:NEIGHBOURS]

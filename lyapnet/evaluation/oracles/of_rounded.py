@@ -1,4 +1,4 @@
-"""Optima of a task whose cost has a kink at the goal, from those of the same task with the kink rounded."""
+"""Optima of a task whose cost has a kink at the goal, from the optima of the task with a smoothed kink."""
 
 import math
 
@@ -11,15 +11,15 @@ from lyapnet.value.expansions import in_float64, path_under
 
 
 class OracleOfRounded(Oracle):
-    """What the optimal controls of a rounded task cost in the task as it is written.
+    """The original cost of the controls that are optimal for the smoothed cost.
 
-    That is no less than the optimum, and no more than it but for the rounding: each cost is rounded down, by ε at most
+    It is at least the optimum, and exceeds it at most by the smoothing error: smoothing lowers the cost, by at most ε
     for each root, norm and absolute value.
 
     Args:
-        rounded: the oracle of the rounded task, which finds controls.
-        problem: the task as it is written.
-        method: of the steps.
+        rounded: the oracle of the smoothed task.
+        problem: the original task.
+        method: integrator of the steps.
     """
 
     def __init__(self, rounded: Oracle, problem: Problem, method: str):

@@ -1,7 +1,7 @@
-"""The linear-quadratic task solved exactly: Riccati equations in discrete and in continuous time.
+"""Exact solution of linear-quadratic tasks by Riccati equations in discrete and continuous time.
 
-Ground truth for tests and tables, never used in training. The matrices are computed in float64 on the CPU whatever the
-precision and device of the task: they are tiny, and what judges a float32 run should not share its rounding.
+A reference for tests and tables, never used in training. The small matrices are computed in float64 on the CPU, so that
+the reference does not share the rounding of a float32 run.
 """
 
 import math
@@ -17,7 +17,7 @@ from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.systems import Linear
 
-SUBSTEPS = 10_000  # restarts within one step of Δt, at most: a task of 100 steps takes a minute then
+SUBSTEPS = 10_000  # largest number of restarts in one step of Δt; with 100 steps this takes a minute
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def discrete_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) -> R
         K_n = (ΔtR + GᵀP_{n+1}G)⁻¹GᵀP_{n+1}F,
         P_n = Δt(Q + K_nᵀRK_n) + (F − GK_n)ᵀP_{n+1}(F − GK_n),   P_N = Q_T,
 
-    so that J_N*(x₀) = x₀ᵀP_0x₀. Joseph's form of P_n: a sum of positive semidefinite terms, whatever the rounding.
+    so that J_N*(x₀) = x₀ᵀP_0x₀. This is Joseph's form of P_n, which remains positive semidefinite under rounding.
 
     Raises:
         ValueError: R depends on the state, or a weight does not fit the system's dimensions.
@@ -88,7 +88,7 @@ def continuous_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) ->
 
     Raises:
         ValueError: R depends on the state, or a weight does not fit the system's dimensions.
-        OverflowError: the equation has a mode that is faster than Δt by more than SUBSTEPS.
+        OverflowError: the equation has a mode with more than SUBSTEPS time constants in Δt.
 
     Source: Kenney, Leipnik, "Numerical integration of the differential matrix Riccati equation", IEEE Transactions on
     Automatic Control 1985 (the modified Davison-Maki method).
@@ -96,7 +96,7 @@ def continuous_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) ->
     A, B, Q, R, Q_T = _matrices(system, cost)
     RinvBT = torch.linalg.solve(R, B.mT)
     H = torch.cat([torch.cat([A, -B @ RinvBT], 1), torch.cat([-Q, -A.mT], 1)])
-    # Over a long h the fastest mode of exp(−hH) drowns the others in X and rounding loses P: |λ|h ≤ 1 between restarts.
+    # Over a long h the fastest mode of exp(−hH) dominates X, and rounding loses P: keep |λ|h ≤ 1 between restarts.
     fastest = horizon.dt * float(torch.linalg.eigvals(H).abs().max())
     if not fastest <= SUBSTEPS:
         raise OverflowError(f"a mode of {fastest:.1g} time constants in a step of Δt")
@@ -110,7 +110,7 @@ def continuous_riccati(system: Linear, cost: QuadraticCost, horizon: Horizon) ->
 
 
 def _flow_back(flow: Tensor, P: Tensor, substeps: int) -> Tensor:
-    """P one node earlier: (X, Y) = exp(−hH)(I, P) and P ← YX⁻¹, as often as asked."""
+    """P one node earlier: (X, Y) = exp(−hH)(I, P) and P ← YX⁻¹, `substeps` times."""
     for _ in range(substeps):
         X, Y = (flow @ torch.cat([torch.eye(len(P)).to(P), P])).split(len(P))
         P = _symmetrised(torch.linalg.solve(X, Y, left=False))
@@ -118,7 +118,7 @@ def _flow_back(flow: Tensor, P: Tensor, substeps: int) -> Tensor:
 
 
 def _matrices(system: Linear, cost: QuadraticCost) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """(A, B, Q, R, Q_T) in float64 on the CPU, or a ValueError that says why there is no Riccati equation."""
+    """(A, B, Q, R, Q_T) in float64 on the CPU; raises ValueError if there is no Riccati equation."""
     if cost.R_constant is None:
         raise ValueError(
             "Expected a constant R, got a function R(x); give R as a matrix, as the Riccati equation has it."

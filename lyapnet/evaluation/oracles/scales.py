@@ -1,4 +1,4 @@
-"""Units in which a transcribed task has numbers of about 1: how far tried paths go, and what they cost."""
+"""Scaling of a transcribed task to numbers of about 1, from the extents and costs of trial paths."""
 
 import math
 
@@ -9,14 +9,14 @@ from lyapnet.base.types import State
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import Path, at_rest, cheapest, greedy_law, path_under, riccati, sizes
 
-TRIED = 16  # states of X₀ from which paths are tried
+TRIED = 16  # random states of X₀ for trial paths
 
 
 class Scales:
-    """The extents of paths from states of X₀: of each state the cheapest under no control, Riccati's, the middle of U.
+    """The extents of trial paths from X₀: the cheapest of the control at rest, the Riccati law, and the middle of U.
 
     Attributes:
-        of_states, of_controls: (n,), (m,); of a component that stays where it is, its size, or 1.
+        of_states, of_controls: (n,), (m,); for a component that does not change, its size, or 1.
 
     Args:
         problem: in float64 on the CPU; U a box.
@@ -40,7 +40,7 @@ class Scales:
         self._of_cost = (float(size.median()) if len(size) else 0.0) or 1.0
 
     def paths(self, x0: State) -> Path:
-        """The cheapest of the tried paths from each state (b, n)."""
+        """The cheapest trial path from each state (b, n)."""
         low, high = (side.expand(self.problem.system.m) for side in self._limits)
         middle = ((low + high) / 2).where(low.isfinite() & high.isfinite(), 0.0)
         laws = [at_rest(self.problem), lambda _, x: middle.expand(*x.shape[:-1], -1)]
@@ -49,7 +49,7 @@ class Scales:
         return cheapest([path_under(self.problem, law, x0) for law in laws])
 
     def of_cost(self, x0: np.ndarray) -> float:
-        """A cost of about the size of J*(x₀), as IPOPT's barrier is absolute."""
+        """An estimate of the size of J*(x₀); scaling is needed because IPOPT's barrier parameter is absolute."""
         if self._riccati is not None:
             cost = float(self._riccati.initially(torch.from_numpy(x0)))
             if 0 < cost < math.inf:
@@ -60,10 +60,10 @@ class Scales:
     def _limits(self) -> tuple[torch.Tensor, torch.Tensor]:
         limits = self.problem.controls.limits
         assert limits is not None
-        return limits[0].double(), limits[1].double()  # those of Unbounded have torch's default type
+        return limits[0].double(), limits[1].double()  # Unbounded has limits of torch's default dtype
 
     def _of_controls(self, u: torch.Tensor) -> np.ndarray:
-        """The width of U, or how far tried controls go where it has none."""
+        """Half the width of U, or the extent of the trial controls where U is unbounded."""
         low, high = (side.expand(self.problem.system.m) for side in self._limits)
         width = (high - low) / 2
         tried = torch.from_numpy(_extents(u.flatten(0, 1))) if u.numel() else torch.ones_like(width)
@@ -71,6 +71,6 @@ class Scales:
 
 
 def _extents(values: torch.Tensor) -> np.ndarray:
-    """How far each column goes, or its size where it stays, or 1 where that is 0."""
+    """The range of each column, or its size if it is constant, or 1 if it is 0."""
     extent, size = values.amax(0) - values.amin(0), values.abs().amax(0)
     return extent.where(extent > 1e-9 * size, size.where(size > 0, 1.0)).numpy()

@@ -1,6 +1,6 @@
-"""The optimum of any task by direct transcription: all states and controls at once, by CasADi and IPOPT.
+"""Optima by direct transcription: all states and controls are variables of a nonlinear program (CasADi, IPOPT).
 
-Ground truth for tests and tables, never used in training. The model is the torch system itself, read by `symbolic`.
+A reference for tests and tables. The model is the torch system itself, translated by `symbolic`.
 """
 
 import math
@@ -26,42 +26,41 @@ from lyapnet.evaluation.oracles.scales import Scales
 from lyapnet.task.problem import Problem
 
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-ACCEPTABLE = 1e-7  # tolerances in units of the scales, at which IPOPT may end after five iterations that gain nothing
-VIOLATED = 1e-6  # h that is still taken for zero
-ASIDE = 1e-3  # of the extents: how far from the goal straight lines end, where slopes may not exist
-BESIDE = 1e-8  # of the extents: how far from x₀ a path may begin, for a cost that is the same
+ACCEPTABLE = 1e-7  # scaled tolerance at which IPOPT may stop after five iterations without progress
+CONSTRAINT_TOLERANCE = 1e-6  # largest h that counts as zero
+GOAL_OFFSET = 1e-3  # distance from the goal at which initial lines end, in units of the extents: slopes may not exist
+START_OFFSET = 1e-8  # shift of x₀ if slopes do not exist there, in units of the extents
 INVALID = "IPOPT: Invalid_Number_Detected"
-WITHIN = 1e-6  # of a state's size: how far within the borders of the domain optima stay, where slopes are moderate
-SECONDS = 10.0  # of one start
-BRIEF = 40, 150  # iterations at least and at most, after which a further start of a state with a minimum is given up
-LONGER = 3  # times the iterations that a first minimum has taken, between these two
-SPREAD = 0.5  # of the widths of X₀, over which explored states reach
-_WITH_ONE_MINIMUM = set[tuple[Any, ...]]()  # tasks and their X₀, of which this process has explored a batch
-BENT, BENDS = 8, 2  # of how many initial states random starts are tried, and how many of each
+DOMAIN_MARGIN = 1e-6  # distance of optima from the borders of the domain, relative to a state's size
+SECONDS = 10.0  # IPOPT's seconds for one initial guess
+BRIEF_ITERATIONS = 40, 150  # smallest and largest limit of iterations, if a minimum of the state is known
+BRIEF_FACTOR = 3  # this limit, relative to the iterations of a first minimum
+MIN_SPREAD = 0.5  # share of the widths of X₀ over which explored states must extend
+_SINGLE_MINIMUM_TASKS = set[tuple[Any, ...]]()  # tasks with their X₀ that had one minimum from each explored state
+RANDOM_CURVE_STATES = 8  # first initial states that try random curves as initial guesses
+CURVES_PER_STATE = 2  # random curves for each of these states
 
 
 class Transcription(Oracle):
     """min over x₁ … x_N, u₀ … u_{N−1} ∈ U of Δt Σ_{n<N} ℓ(x_n, u_n) + φ(x_N) subject to x_{n+1} = x_n + Δt(f + gu)
-    and h(x_n) ≤ 0 for n ≥ 1, within the domain; by another Runge-Kutta method, of the cost and along the steps that it
-    makes with u held.
+    and h(x_n) ≤ 0 for n ≥ 1, within the domain; other Runge-Kutta methods use their own steps and costs, with u held.
 
-    States, controls, steps and J are in units of the extents of tried paths, which are parameters of the program.
+    All variables and J are scaled by the extents of trial paths; these scales are parameters of the nonlinear program.
 
-    The problem is not convex, and IPOPT finds local minima. Each initial state has several starts: a straight line to
-    close by the goal, random curves, the controls that the caller knows, a tried path where none of these leads to a
-    minimum, and the optima of its neighbours in the batch; where these lead to one minimum from each of the first
-    states, spread over the batch, the others follow their neighbours alone. The least cost counts, as a rollout of its
-    controls in torch has it, and is kept on disk. What no start leads to, or the rollout does not confirm, is NaN, and
-    once the first few states have none, the others are not tried. Controls that violate a constraint are none to
-    compare with.
+    The problem is not convex, and IPOPT finds local minima. Each initial state has several initial guesses: a straight
+    line towards the goal, random curves, controls known to the caller, the optima of its neighbours in the batch, and a
+    trial path if none of these leads to a minimum. If all guesses lead to one minimum for each of the first states, the
+    other states use only their neighbours' optima. The reported cost is that of a rollout in torch; the best controls
+    are stored on disk. A state has NaN if no guess leads to a minimum or the rollout does not confirm it. If all of the
+    first few states fail, the others are not tried. Known controls that violate a constraint are ignored.
 
     Args:
-        problem: what is solved; a copy of it, in float64 on the CPU, whatever its own precision.
-        method: of the steps, a key of TABLEAUX; None: the horizon's.
-        iterations: of IPOPT from one start, at most.
+        problem: the problem; it is copied to float64 on the CPU.
+        method: integrator of the steps, a key of TABLEAUX; None: that of the horizon.
+        iterations: largest number of IPOPT's iterations from one initial guess.
 
     Raises:
-        OracleError: dynamics or cost are not in torch operations that CasADi has too.
+        OracleError: dynamics or cost use torch operations that CasADi lacks.
 
     Source: Betts, Practical Methods for Optimal Control Using Nonlinear Programming, ch. 4; Wächter, Biegler, "On the
     implementation of an interior-point filter line-search algorithm", Mathematical Programming 2006 (IPOPT).
@@ -73,18 +72,18 @@ class Transcription(Oracle):
         self.task = CasadiTask(self.problem)
         self.cache = OptimaCache(self.task.graphs, horizon.steps, system.m, self.problem.controls)
         box = self.problem.initial_states
-        self._where = self.cache.folder.name, *box.lower.tolist(), *box.upper.tolist()
+        self._task_and_box = self.cache.folder.name, *box.lower.tolist(), *box.upper.tolist()
         self._stopped = False
         limits = self.problem.controls.limits
         domain = self.problem.domain
         bounded = self.problem.controls.limited or self.task.inside is not None or domain is not None
         self._limit, self._solver = _solver(self.task, horizon.steps, iterations, bounded)
         self._iterations = iterations
-        self._taken = 0  # most iterations of a first minimum so far; 0: none is known
+        self._most_iterations = 0  # largest number of iterations of a first minimum; 0: none yet
         self._scales = Scales(self.problem)
-        assert limits is not None  # oracle_of asks before
+        assert limits is not None  # checked by oracle_of
         free = torch.full((system.n,), torch.inf)
-        ends = (-free, free) if domain is None else domain.narrowed(WITHIN)
+        ends = (-free, free) if domain is None else domain.narrowed(DOMAIN_MARGIN)
         self._bounds = [
             np.concatenate([
                 np.tile(side.expand(system.m).numpy() / self._scales.of_controls, horizon.steps),
@@ -92,13 +91,13 @@ class Transcription(Oracle):
             ])
             for side, end in zip(limits, ends, strict=True)
         ]  # fmt: skip
-        # the defects of the steps vanish, and h ≤ 0
+        # bounds of the constraints: defects of the steps = 0, h ≤ 0
         more = 0 if self.task.inside is None else horizon.steps * self.task.inside.size1_out(0)
         defects = np.zeros(system.n * horizon.steps)
         self._held = [np.concatenate([defects, np.full(more, side)]) for side in (-np.inf, 0.0)]
 
     def rollout(self, x0: State, u: ControlPath) -> tuple[StatePath, PerState]:
-        """(x, J_N) under given controls, by the torch system."""
+        """(x, J_N) under given controls, computed in torch."""
         x, J = [x0], torch.zeros_like(x0[..., 0])
         for control in u:
             following, step_cost = self.problem.step(x[-1], control)
@@ -108,13 +107,13 @@ class Transcription(Oracle):
     def solve(
         self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
     ) -> Optima:
-        """The optima of a batch (b, n): from disk, unless `known` controls cost less than those."""
+        """The optima of a batch (b, n); those on disk are used unless the `known` controls cost less."""
         states = x0.detach().double().cpu()
         nothing: list[Tensor | None] = [None] * len(states)
-        stored = self._replayed(states, [self.cache.read(x) for x in states])
+        stored = self._replay(states, [self.cache.read(x) for x in states])
         within = None if known is None else self.problem.controls.project(known.detach().double().cpu())
-        given = self._replayed(states, nothing if within is None else within.unbind(1))
-        explored = EXPLORED_AGAIN if self._where in _WITH_ONE_MINIMUM else EXPLORED
+        given = self._replay(states, nothing if within is None else within.unbind(1))
+        explored = EXPLORED_AGAIN if self._task_and_box in _SINGLE_MINIMUM_TASKS else EXPLORED
         search = MultiStart(states.numpy(), stored, self.minimise, explored)
         pending = [i for i in range(len(states)) if stored[i] is None or is_better(given[i], stored[i])]
         if pending:
@@ -123,24 +122,24 @@ class Transcription(Oracle):
             starts = dict(zip(pending, self._starts(states, pending, given, search), strict=True))
             self._search(search, starts, progress, time.thread_time() + seconds)
             if search.several:
-                _WITH_ONE_MINIMUM.discard(self._where)
+                _SINGLE_MINIMUM_TASKS.discard(self._task_and_box)
             elif explored == EXPLORED and self._is_spread(states[pending[:EXPLORED]], search):
-                _WITH_ONE_MINIMUM.add(self._where)
-        optima = self._verified(states, search, given)
+                _SINGLE_MINIMUM_TASKS.add(self._task_and_box)
+        optima = self._verify(states, search, given)
         for i, best in enumerate(search.best):
             if best is not None and best is not stored[i] and not optima.reasons[i]:
                 self.cache.write(states[i], torch.from_numpy(best.u))
         return Optima(optima.cost.to(x0), optima.reasons, None if optima.u is None else optima.u.to(x0))
 
     def _is_spread(self, states: Tensor, search: MultiStart) -> bool:
-        """Whether there are EXPLORED states, they reach over half of X₀ in each component, and all have a minimum."""
+        """Whether EXPLORED states have a minimum and extend over MIN_SPREAD of X₀ in each component."""
         if len(states) < EXPLORED or any(best is None for best in search.best):
             return False
         box = self.problem.initial_states
-        return bool((states.amax(0) - states.amin(0) >= SPREAD * (box.upper - box.lower)).all())
+        return bool((states.amax(0) - states.amin(0) >= MIN_SPREAD * (box.upper - box.lower)).all())
 
-    def _replayed(self, states: Tensor, controls: Sequence[Tensor | None]) -> list[Candidate | None]:
-        """The trajectories of the controls that there are, and that keep the state finite and within constraints."""
+    def _replay(self, states: Tensor, controls: Sequence[Tensor | None]) -> list[Candidate | None]:
+        """The trajectories of given controls; None if they are not finite, violate constraints or leave the domain."""
         candidates: list[Candidate | None] = [None] * len(states)
         some = [i for i, u in enumerate(controls) if u is not None]
         if some:
@@ -151,7 +150,7 @@ class Transcription(Oracle):
                 if self.problem.domain is not None:
                     admitted &= ~self.problem.domain.left(x, slack=0.0)
                 if self.problem.constraints is not None:
-                    admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= VIOLATED
+                    admitted &= self.problem.constraints.worst(x[1:]).amax(0) <= CONSTRAINT_TOLERANCE
             columns = (x.unbind(1), u.unbind(1), J.tolist(), admitted.tolist())
             for i, path, control, cost, good in zip(some, *columns, strict=True):
                 if good:
@@ -161,10 +160,10 @@ class Transcription(Oracle):
     def _starts(
         self, states: Tensor, pending: Sequence[int], given: Sequence[Candidate | None], search: MultiStart
     ) -> Iterator[Iterator[Candidate]]:
-        """For each pending state: what the caller knows, and the line to the goal with the control that costs nothing.
+        """The initial guesses of each pending state: known controls, and a line to the goal with the control at rest.
 
-        The first BENT states try random curves around that line too; a better minimum that these find reaches the
-        others from neighbour to neighbour. Where nothing has led to a minimum, the path that was tried is the last one.
+        The first RANDOM_CURVE_STATES states also try random curves around that line; a better minimum from these is
+        passed on to the other states. If nothing leads to a minimum, the trial path is the last guess.
         """
         N, random = self.problem.horizon.steps, np.random.default_rng(0)
         goal, rest = self.problem.goal.numpy(), self.problem.rest.expand(N, -1).numpy()
@@ -172,16 +171,16 @@ class Transcription(Oracle):
         waves = np.stack([np.sin(k * np.pi * s) / k for k in (1, 2, 3)])  # smooth, and zero at both ends
         extent = states.abs().amax(0).numpy()
         scale = np.where(extent > 0, extent, 1.0)
-        tried, aside = self._scales.paths(states), ASIDE * self._scales.of_states * s
-        curves = math.ceil(BENT * BENDS / min(BENT, len(pending)))
+        tried, aside = self._scales.paths(states), GOAL_OFFSET * self._scales.of_states * s
+        curves = math.ceil(RANDOM_CURVE_STATES * CURVES_PER_STATE / min(RANDOM_CURVE_STATES, len(pending)))
         for k, i in enumerate(pending):
             line = goal + (1 - s) * (states[i].numpy() - goal) + aside
             bends = scale * (waves * random.standard_normal((curves, 3, 1, len(scale)))).sum(1)
-            paths = (line, *(line + bends)) if k < BENT else (line,)
+            paths = (line, *(line + bends)) if k < RANDOM_CURVE_STATES else (line,)
             cold = [Candidate(x, rest, math.inf) for x in paths]
             known = given[i]
             path = Candidate(tried.x[1:, i].numpy(), tried.u[:, i].numpy(), math.inf)
-            yield _until(search, i, cold if known is None else [known, *cold], path)
+            yield _with_fallback(search, i, cold if known is None else [known, *cold], path)
 
     def _search(
         self, search: MultiStart, starts: Mapping[int, Iterable[Candidate]], progress: Report, until: float
@@ -191,30 +190,34 @@ class Transcription(Oracle):
         with signals_taken(self._stop):
             try:
                 search.run(starts, progress, until)
-            finally:  # where CasADi made an error of its own of what ended it
+            finally:  # CasADi may have replaced the exception by its own
                 if self._stopped:
                     self._stop()
 
     def _stop(self, *_: object) -> None:
-        """Take a signal: CasADi ends at what this raises, and keeps it to itself or raises something else."""
+        """Handle a signal. CasADi stops at this exception, but may swallow or replace it."""
         self._stopped = True
         raise Interrupted("Stopped while seeking optima; those of earlier evaluations are kept.", 130)
 
     def minimise(self, x0: np.ndarray, start: Candidate, briefly: bool = False) -> Candidate | str:
-        """The local minimum that IPOPT finds from a start, or its reason for none.
+        """The local minimum that IPOPT finds from an initial guess, or the reason for none.
 
         Args:
-            briefly: in not many more iterations than a first minimum has taken.
+            briefly: whether to limit the iterations by BRIEF_FACTOR times those of a first minimum.
         """
         most = self._iterations
         if briefly:
-            least, most = BRIEF
-            most = min(most, self._iterations, max(least, LONGER * self._taken) if self._taken else most)
+            least, most = BRIEF_ITERATIONS
+            most = min(
+                most,
+                self._iterations,
+                max(least, BRIEF_FACTOR * self._most_iterations) if self._most_iterations else most,
+            )
         found = self._minimum(x0, start, most)
-        if found == INVALID:  # where slopes do not exist at x₀ itself, as those of |v| at rest
-            found = self._minimum(x0 + BESIDE * self._scales.of_states, start, most)
+        if found == INVALID:  # slopes may not exist at x₀ itself, such as that of |v| at rest
+            found = self._minimum(x0 + START_OFFSET * self._scales.of_states, start, most)
         if not briefly and not isinstance(found, str):
-            self._taken = max(self._taken, self._limit.done)
+            self._most_iterations = max(self._most_iterations, self._limit.done)
         return found
 
     def _minimum(self, x0: np.ndarray, start: Candidate, iterations: int) -> Candidate | str:
@@ -224,7 +227,7 @@ class Transcription(Oracle):
         given = np.concatenate([x0, [scale], of_x, of_u])
         least, greatest = self._held
         self._limit.start(iterations)
-        with redirect_stderr(StringIO()):  # CasADi warns of what ends it; it goes on as a reason, or as what was raised
+        with redirect_stderr(StringIO()):  # hides CasADi's warning; the reason is returned
             result = self._solver(x0=guess, p=given, lbx=lower, ubx=upper, lbg=least, ubg=greatest)
         status = self._solver.stats()["return_status"]
         if self._stopped:
@@ -233,13 +236,13 @@ class Transcription(Oracle):
             return f"IPOPT: {'Maximum_Iterations_Exceeded' if self._limit.is_reached() else status}"
         u, x = np.split(np.asarray(result["x"]).ravel(), [start.u.size])
         u = of_u * u.reshape(start.u.shape)
-        u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # which IPOPT may pass
+        u = self.problem.controls.project(torch.from_numpy(u)).numpy()  # IPOPT may slightly violate U
         return Candidate(of_x * x.reshape(start.x.shape), u, scale * float(result["f"]))
 
-    def _verified(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
-        """The costs of the best controls in a rollout, where that confirms them."""
-        replayed = self._replayed(states, [None if b is None else torch.from_numpy(b.u) for b in search.best])
-        reasons = list(map(_doubt, search.best, replayed, given, search.reasons))
+    def _verify(self, states: Tensor, search: MultiStart, given: Sequence[Candidate | None]) -> Optima:
+        """The costs of the best controls in a rollout; NaN if the rollout does not confirm them."""
+        replayed = self._replay(states, [None if b is None else torch.from_numpy(b.u) for b in search.best])
+        reasons = list(map(_reason_to_reject, search.best, replayed, given, search.reasons))
         cost = torch.full((len(states),), math.nan, dtype=torch.float64)
         u = torch.full((self.problem.horizon.steps, len(states), self.problem.system.m), math.nan, dtype=torch.float64)
         for i, candidate in enumerate(replayed):
@@ -248,15 +251,15 @@ class Transcription(Oracle):
         return Optima(cost, reasons, u)
 
 
-def _until(search: MultiStart, i: int, starts: Sequence[Candidate], last: Candidate) -> Iterator[Candidate]:
-    """Some starts of a state, and one more where none of them has led to a minimum."""
+def _with_fallback(search: MultiStart, i: int, starts: Sequence[Candidate], last: Candidate) -> Iterator[Candidate]:
+    """The initial guesses of a state, and a last one if none of them has led to a minimum."""
     yield from starts
     if search.best[i] is None:
         yield last
 
 
-def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str) -> str:
-    """Why a cost is not to be taken for the optimum; empty where it is."""
+def _reason_to_reject(best: Candidate | None, replayed: Candidate | None, given: Candidate | None, reason: str) -> str:
+    """The reason why a cost is not accepted as the optimum; empty if it is accepted."""
     if best is None:
         return reason
     if replayed is None or abs(replayed.cost - best.cost) > SAME * abs(best.cost) + 1e-9:
@@ -268,12 +271,12 @@ def _doubt(best: Candidate | None, replayed: Candidate | None, given: Candidate 
 
 
 class _IterationLimit(casadi.Callback):
-    """Ends IPOPT after a number of iterations that each call may choose, as CasADi has no such parameter.
+    """Stops IPOPT after a number of iterations that each call may choose; CasADi has no such parameter.
 
-    IPOPT reports each iteration, and the start of a restoration phase too, which counts as one.
+    IPOPT calls it at each iteration, and at the start of a restoration phase, which counts as an iteration.
 
     Args:
-        sizes: numbers in the variables x, the constraints g and the parameters p.
+        sizes: the sizes of the variables x, the constraints g and the parameters p.
     """
 
     def __init__(self, sizes: Mapping[str, int]):
@@ -282,11 +285,11 @@ class _IterationLimit(casadi.Callback):
         self.construct("iteration_limit", {})
 
     def start(self, most: int) -> None:
-        """Count from here."""
-        self.done, self.most = -1, most  # the start is reported too
+        """Restart the count."""
+        self.done, self.most = -1, most  # -1: IPOPT also calls it before the first iteration
 
     def is_reached(self) -> bool:
-        return self.done > self.most  # the last one may be the minimum
+        return self.done > self.most  # >: the last allowed iteration may be the minimum
 
     def get_n_in(self) -> int:
         return casadi.nlpsol_n_out()
@@ -304,9 +307,9 @@ class _IterationLimit(casadi.Callback):
 
 
 def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> tuple[_IterationLimit, casadi.Function]:
-    """IPOPT for the transcribed task, with exact sparse derivatives, and what limits its iterations.
+    """The iteration limit, and IPOPT for the transcribed task with exact sparse derivatives.
 
-    Variables are (u, x) in units of their scales, parameters x₀, what J is divided by, and those scales.
+    The variables are the scaled (u, x); the parameters are x₀, the scale of J, and the scales of x and u.
     """
     n, m = task.step.size1_in(0), task.step.size1_in(1)
     x0, scaled_x, scaled_u = casadi.MX.sym("x0", n), casadi.MX.sym("x", n, steps), casadi.MX.sym("u", m, steps)
@@ -317,10 +320,9 @@ def _solver(task: CasadiTask, steps: int, iterations: int, limited: bool) -> tup
     variables, zero = casadi.veccat(scaled_u, scaled_x), casadi.vec(casadi.diag(1 / of_x) @ (following - x))
     held = zero if task.inside is None else casadi.veccat(zero, task.inside.map(steps)(x))
     problem = {"x": variables, "p": casadi.vertcat(x0, scale, of_x, of_u), "f": J / scale, "g": held}
-    # so exact that an unstable system does not make another path of the controls, nor the barrier another J; and within
-    # the limits themselves
+    # tight: an unstable system amplifies errors of the controls, and the barrier changes J; limits are not relaxed
     exact = {"ipopt.tol": 1e-10, **({"ipopt.bound_relax_factor": 0.0} if limited else {})}
-    # where rounding or a kink ends it before: a rollout confirms the cost, or nothing is found
+    # looser, if rounding or a kink stops IPOPT earlier; a rollout then has to confirm the cost
     enough = {"tol": ACCEPTABLE, "constr_viol_tol": ACCEPTABLE, "compl_inf_tol": ACCEPTABLE, "dual_inf_tol": 1e-4}
     acceptable = {f"ipopt.acceptable_{name}": value for name, value in enough.items()}
     quiet = {"print_time": False, "show_eval_warnings": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}

@@ -1,4 +1,4 @@
-"""What a problem charges: a running cost and a terminal cost."""
+"""Costs: a running cost and a terminal cost."""
 
 from lyapnet.task.cost.base import Cost
 from lyapnet.task.cost.goal import goal_in_words, reason_for_no_goal, spread

@@ -1,4 +1,4 @@
-"""What every cost is: a running cost along the way, and a terminal cost."""
+"""The base class of costs: a running cost and a terminal cost."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -13,27 +13,27 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, solve
 from lyapnet.base.types import Control, ControlMatrix, Matrix, PerState, State
 
-BUFFERS = ("goal", "rest", "R_constant", "R_inverse")  # facts of a cost, which may be None
+BUFFERS = ("goal", "rest", "R_constant", "R_inverse")  # properties of a cost; each may be None
 
 
 class Cost(nn.Module, ABC):
-    """ℓ(x, u) = q(x) + uᵀR(x)u in cost per second along the way, and φ(x) at the end.
+    """The running cost ℓ(x, u) = q(x) + uᵀR(x)u in cost per second, and the terminal cost φ(x).
 
-    q and φ are smooth, R(x) is symmetric positive definite. A subclass writes `state`, `R` and `terminal` with torch
-    operations on tensors of any leading shape. What it knows of `goal` and the other facts below it says in its body,
-    as in `goal = [1.0, 0.0]`, or in `__init__`. About a target, u is counted from what holds it there (TargetCost).
-    Where q and φ vanish at a goal and are nowhere negative, V is a distance to it; a profit or a harvest has none.
+    q and φ are smooth, R(x) is symmetric positive definite. A subclass implements `state`, `R` and `terminal` with
+    torch operations on tensors of any leading shape. It may set `goal` and the other properties below in its body, as
+    in `goal = [1.0, 0.0]`, or in `__init__`. With a target, u − u* replaces u, see TargetCost. If q and φ vanish at a
+    goal and are nowhere negative, V measures the distance to it; a profit or a harvest has no goal.
     """
 
-    goal: Float[Tensor, " n"] | None  # where q and φ vanish, if they do; None: the origin
+    goal: Float[Tensor, " n"] | None  # state at which q and φ vanish, if there is one; None: the origin
     rest: Float[Tensor, " m"] | None  # u*, the control that costs nothing; None: zero
-    R_constant: Matrix | None  # R and R⁻¹, where they are the same at every state
-    R_inverse: Matrix | None
+    R_constant: Matrix | None  # R, if it is the same at every state
+    R_inverse: Matrix | None  # its inverse
 
-    _declared: ClassVar[Mapping[str, Any]] = {}  # of the buffers below, what a class says of them in its body
+    _declared: ClassVar[Mapping[str, Any]] = {}  # values of these buffers that are set in the body of a class
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Take `goal = torch.tensor(…)` in the body of a class as the value of that buffer, which it would hide."""
+        """Turn `goal = torch.tensor(…)` in the body of a class into the value of that buffer."""
         super().__init_subclass__(**options)
         values = {name: vars(cls)[name] for name in BUFFERS if name in vars(cls)}
         values = {name: value for name, value in values.items() if not hasattr(value, "__get__")}  # no property
@@ -41,11 +41,11 @@ class Cost(nn.Module, ABC):
             delattr(cls, name)
         cls._declared = {**cls._declared, **values}
 
-    # Not persistent, here and in sets and systems: facts of the problem come from its config, never from a checkpoint.
+    # Buffers of costs, sets and systems are not persistent: the problem comes from the config, not from a checkpoint.
     def __init__(self):
         super().__init__()
         for name in BUFFERS:
-            if not hasattr(type(self), name):  # as a property has it
+            if not hasattr(type(self), name):  # unless it is a property
                 value = self._declared.get(name)
                 as_tensor = None if value is None else torch.as_tensor(value, dtype=torch.get_default_dtype()).clone()
                 self.register_buffer(name, as_tensor, persistent=False)
@@ -63,11 +63,11 @@ class Cost(nn.Module, ABC):
         """φ(x)."""
 
     def from_goal(self, x: State) -> State:
-        """x − x*; of a family x* is the target of each member, and its parameters count as zero."""
+        """x − x*; in a family x* is the target of each member, and the parameters' entries are zero."""
         return x if self.goal is None else x - self.goal.to(x)
 
     def terminal_gradient(self, x: State) -> State:
-        """φ_x(x); by automatic differentiation unless a subclass knows better."""
+        """φ_x(x), by automatic differentiation unless a subclass overrides it."""
         recording = torch.is_grad_enabled()
         with torch.enable_grad():
             x = x if recording and x.requires_grad else x.detach().requires_grad_()
@@ -79,7 +79,7 @@ class Cost(nn.Module, ABC):
         return quadratic_form(self.R(x), u if self.rest is None else u - self.rest)
 
     def about_rest(self, R: ControlMatrix, b: Control) -> Control:
-        """b − 2Ru*, with which uᵀRu + (b − 2Ru*)ᵀu is (u − u*)ᵀR(u − u*) + bᵀu, but for a constant."""
+        """b − 2Ru*, so that uᵀRu + (b − 2Ru*)ᵀu equals (u − u*)ᵀR(u − u*) + bᵀu up to a constant."""
         return b if self.rest is None else b - 2 * apply(R, self.rest)
 
     def running(self, x: State, u: Control) -> PerState:
@@ -91,9 +91,9 @@ class Cost(nn.Module, ABC):
         return solve(self.R(x), v[..., None])[..., 0] if self.R_inverse is None else apply(self.R_inverse, v)
 
     def ignores(self, i: int, n: int) -> bool:
-        """Whether neither q nor φ depends on x_i, of n states; R is not asked.
+        """Whether neither q nor φ depends on x_i, of n states; R may depend on it.
 
-        Not a number in x_i makes nan of all that is computed with it, unless q or φ jumps there.
+        This is tested with NaN as x_i, which makes every result NaN that depends on it, unless q or φ jumps.
         """
         own, x = copy.deepcopy(self).double().cpu(), _nan_at(i, n)
         return not bool(own.state(x).isnan() | own.terminal(x).isnan())
@@ -103,14 +103,14 @@ class Cost(nn.Module, ABC):
         return not bool(copy.deepcopy(self).double().cpu().terminal(_nan_at(i, n)).isnan())
 
     def restricted_to(self, kept: Sequence[int], n: int) -> "Cost":
-        """q and φ as functions of some of n states alone, the others at zero."""
+        """The cost as a function of some of the n states, with the others at zero; for q and φ only."""
         return _RestrictedCost(self, kept, n)
 
     def check(self, x: State) -> None:
-        """Refuse a cost that breaks its contract at some state of a batch (b, n).
+        """Check the contract of the cost at a batch of states (b, n).
 
         Raises:
-            UsageError: naming the first state at which q, φ or R(x) is not what it has to be.
+            UsageError: q or φ is not finite, or R(x) is not symmetric positive definite; names the first such state.
         """
         for name, value in (("q(x)", self.state(x)), ("φ(x)", self.terminal(x))):
             bad = torch.nonzero(~value.isfinite()).flatten()
@@ -131,7 +131,7 @@ class Cost(nn.Module, ABC):
 
 
 class _RestrictedCost(Cost):
-    """A cost of some states, the others at zero; for q and φ alone."""
+    """A cost as a function of some states, with the others at zero; for q and φ only."""
 
     kept: Tensor
 

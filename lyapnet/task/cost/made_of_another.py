@@ -1,4 +1,4 @@
-"""Costs made of another: about a target, with angles that go round, less dear far away, with obstacles."""
+"""Costs composed of another cost: with a target, periodic angles, slower growth far away, or obstacles."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from lyapnet.task.cost.quadratic import is_quadratic
 
 
 class MadeOfAnother(Cost):
-    """A cost that is another one until a subclass says otherwise: its goal, R(x), q and φ."""
+    """A cost that passes everything on to another cost; subclasses change its goal, R(x), q or φ."""
 
     cost: Cost
-    words: str = ""  # what is made of the other, in words
+    words: str = ""  # a description of the change
 
     def __init__(self, cost: Cost):
         super().__init__()
@@ -45,12 +45,12 @@ class MadeOfAnother(Cost):
 
 
 class TargetCost(MadeOfAnother):
-    """Another cost about a target: q(x − d) + (u − u*)ᵀR(x)(u − u*) and φ(x − d), d = x* − the goal of that cost.
+    """Another cost moved to a target: q(x − d) + (u − u*)ᵀR(x)(u − u*) and φ(x − d), d = x* − goal of that cost.
 
     Args:
         cost: q, R and φ.
         target: x*, (n,).
-        rest: u*, (m,), the control that costs nothing; what holds x* where something does.
+        rest: u*, (m,), the control that costs nothing; it holds x*, if any control does.
     """
 
     goal: Float[Tensor, " n"]
@@ -78,7 +78,7 @@ class TargetCost(MadeOfAnother):
 
 
 def is_quadratic_about_target(cost: Cost) -> bool:
-    """Whether q and φ are quadratic forms of x − x*, by matrices alone, or of x."""
+    """Whether q and φ are quadratic forms of x or x − x*, determined by their matrices."""
 
     def own(name: str) -> bool:
         return getattr(getattr(cost, name), "__func__", None) is getattr(TargetCost, name)
@@ -89,16 +89,16 @@ def is_quadratic_about_target(cost: Cost) -> bool:
 
 
 class PeriodicCost(MadeOfAnother):
-    """Another cost in which the distance δ of some angles from the goal counts as 2 sin(δ/2), δ² as 2(1 − cos δ).
+    """Another cost made 2π-periodic in some angles: their distance δ from the goal is replaced by 2 sin(δ/2).
 
-    So an angle costs as little after a whole turn as before, and near the goal what it did.
+    δ² becomes 2(1 − cos δ), which agrees with δ² near the goal.
 
     Args:
-        cost: q and φ, even in each of these angles.
-        angles: their indices.
+        cost: the other cost; q and φ must be even in each of these angles.
+        angles: indices of the angles.
     """
 
-    turns: Float[Tensor, " n"]  # 1 for an angle that goes round, 0 for any other state
+    turns: Float[Tensor, " n"]  # 1 for a periodic angle, 0 for any other state
 
     def __init__(self, cost: Cost, angles: Sequence[int], n: int):
         super().__init__(cost)
@@ -119,10 +119,10 @@ class PeriodicCost(MadeOfAnother):
 
 
 class PseudoHuberCost(MadeOfAnother):
-    """Another cost whose q counts as h(q) = 2δ²(√(1 + q/δ²) − 1), and φ likewise.
+    """Another cost with q replaced by h(q) = 2δ²(√(1 + q/δ²) − 1), and φ likewise.
 
-    As dear as before where √q is far below δ, and 2δ√q where it is far above: of a quadratic q, a norm. So what is far
-    away does not outweigh what is near, and V spans fewer orders of magnitude.
+    h(q) ≈ q for √q far below δ, and h(q) ≈ 2δ√q far above it, a norm if q is quadratic. States far away then weigh
+    less, and V spans fewer orders of magnitude.
 
     Args:
         cost: q, R and φ.
@@ -142,18 +142,18 @@ class PseudoHuberCost(MadeOfAnother):
         self.words: str = f"q and φ as pseudo-Huber losses, δ = {delta:g}"
 
     def state(self, x: State) -> PerState:
-        return self._less(self.cost.state(x))
+        return self._pseudo_huber(self.cost.state(x))
 
     def terminal(self, x: State) -> PerState:
-        return self._less(self.cost.terminal(x))
+        return self._pseudo_huber(self.cost.terminal(x))
 
-    def _less(self, q: PerState) -> PerState:
-        """h(q) as 2q/(√(1 + q/δ²) + 1), without cancellation near 0."""
+    def _pseudo_huber(self, q: PerState) -> PerState:
+        """h(q), computed as 2q/(√(1 + q/δ²) + 1) to avoid cancellation near 0."""
         return 2 * q / (torch.sqrt(1 + q / self.delta**2) + 1)
 
 
 class RegulatorTail(MadeOfAnother):
-    """Another cost whose φ is (x − x*)ᵀP(x − x*), what a linear-quadratic regulator goes on to pay from x for ever.
+    """Another cost with φ(x) = (x − x*)ᵀP(x − x*), the infinite-horizon cost of a linear-quadratic regulator from x.
 
     Args:
         cost: q and R.
@@ -181,14 +181,14 @@ class RegulatorTail(MadeOfAnother):
 
 
 class ObstacleCost(MadeOfAnother):
-    """Another cost, and w exp(−2 d²/r²) per second, d the distance of some states from a centre: a smooth bump.
+    """Another cost plus w exp(−2 d²/r²) per second, a smooth bump with d the distance of some states from a centre.
 
-    At the edge, d = r, it is 0.14 w, at 2r 0.0003 w.
+    At the radius, d = r, the bump is 0.14 w; at 2r it is 0.0003 w.
 
     Args:
-        cost: what is paid besides.
-        states: indices of the states that the obstacle has a place in, (k,).
-        centre: (k,), in their units.
+        cost: the other cost.
+        states: indices of these states, (k,).
+        centre: (k,), in units of the states.
         radius: r.
         weight: w, in cost per second.
 
@@ -223,7 +223,7 @@ class ObstacleCost(MadeOfAnother):
 
 
 def innermost(cost: Cost) -> Cost:
-    """What a cost is made of in the end, if each step is one of these; else the cost itself."""
+    """The innermost cost of a composition of TargetCost, PeriodicCost and ObstacleCost."""
     while isinstance(cost, MadeOfAnother) and type(cost) in (TargetCost, PeriodicCost, ObstacleCost):
         cost = cost.cost
     return cost

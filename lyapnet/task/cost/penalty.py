@@ -1,4 +1,4 @@
-"""The price of coming close to what constraints exclude, which training pays in their place."""
+"""The penalty that replaces constraints in training."""
 
 from collections.abc import Sequence
 
@@ -12,25 +12,25 @@ from lyapnet.task.cost.made_of_another import MadeOfAnother
 
 
 def closeness(constraints: nn.Module, margin: Tensor, x: State) -> PerState:
-    """Σ_j max(0, 1 + h_j(x)/m_j)³: 1 at h = 0 of a single constraint, zero from h_j = −m_j on."""
+    """Σ_j max(0, 1 + h_j(x)/m_j)³: for a single constraint 1 at h = 0, and 0 for h ≤ −m."""
     return (torch.relu(1 + constraints(x) / margin) ** 3).sum(-1)
 
 
 class PenaltyCost(MadeOfAnother):
-    """Another cost, and w Σ_j max(0, 1 + h_j(x)/m_j)³ per second for constraints h(x) ≤ 0: w at h_j = 0, 0 below −m_j.
+    """Another cost plus a penalty w Σ_j max(0, 1 + h_j(x)/m_j)³ per second for constraints h(x) ≤ 0.
 
-    The last state pays for one step more, for which it would stay. The penalty is twice continuously differentiable, as
-    the value function then is. With w large enough for the task the
-    optimum keeps within h ≤ 0, at less cost than if h ≤ −m were asked for.
+    The penalty is w at h_j = 0 and 0 for h_j ≤ −m_j. The terminal cost includes the penalty of one step. It is twice
+    continuously differentiable, and so is the value function. With sufficiently large w the optimum satisfies h ≤ 0,
+    at a lower cost than with the constraint h ≤ −m.
 
     Args:
-        cost: what is paid besides.
+        cost: the other cost.
         constraints: h, x ↦ (*batch, k).
         margin: m of all h_j, or m_j of each, in the unit of h.
-        weight: w.
+        weight: w, in cost per second.
         step: Δt, in s.
 
-    Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalties), with the constraint moved by m.
+    Source: Nocedal, Wright, Numerical Optimization, 2006, ch. 17 (penalty methods), with the constraint shifted by m.
     """
 
     constraints: nn.Module
@@ -58,7 +58,7 @@ class PenaltyCost(MadeOfAnother):
         return self.cost.terminal(x) + self.step * self.penalty(x)
 
     def penalty(self, x: State) -> PerState:
-        """What a state pays per second for being close to constraints."""
+        """The penalty of a state, in cost per second."""
         return self.weight * closeness(self.constraints, self.margin, x)
 
     def ignores(self, i: int, n: int) -> bool:

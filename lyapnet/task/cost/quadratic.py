@@ -1,4 +1,4 @@
-"""The quadratic cost, of which much is known by its matrices alone."""
+"""The quadratic cost, which is determined by its matrices."""
 
 from collections.abc import Callable, Sequence
 from typing import TypeGuard
@@ -62,7 +62,7 @@ class QuadraticCost(Cost):
         return 2 * apply(self.Q_T, x)
 
     def __init_subclass__(cls) -> None:
-        """Refuse another q, R or φ: much is known of a quadratic cost by its matrices alone."""
+        """Refuse a subclass with another q, R or φ, because other code relies on the matrices alone."""
         super().__init_subclass__()
         changed = [name for name in ("state", "R", "terminal") if name in vars(cls)]
         if changed:
@@ -82,13 +82,13 @@ class QuadraticCost(Cost):
 
 
 def is_quadratic(cost: Cost) -> TypeGuard[QuadraticCost]:
-    """Whether a cost is what its matrices say: no class or object put another function in the place of one of it."""
+    """Whether a cost is determined by its matrices: no subclass or instance replaces one of its functions."""
     own = ("state", "R", "terminal", "control", "running", "ignores")
     return all(getattr(getattr(cost, name), "__func__", None) is getattr(QuadraticCost, name) for name in own)
 
 
 def _symmetric(name: str, rows: Sequence[Sequence[float]] | Tensor, *, definite: bool) -> Tensor:
-    """The matrix as a tensor, or a ValueError that says what is wrong with it."""
+    """The matrix as a tensor; raises ValueError if it is not symmetric and (semi)definite."""
     try:
         if not isinstance(rows, Tensor) and any(type(entry) not in (int, float) for row in rows for entry in row):
             raise TypeError("booleans, or no numbers")

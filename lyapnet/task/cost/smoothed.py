@@ -1,4 +1,4 @@
-"""A cost with a kink at its goal, whose roots, norms and absolute values are rounded there."""
+"""A smoothed cost: roots, norms and absolute values with a kink at the goal are rounded there."""
 
 import copy
 import math
@@ -18,20 +18,20 @@ from lyapnet.task.cost.made_of_another import MadeOfAnother
 
 
 class SmoothedCost(MadeOfAnother):
-    """Another cost in which each √a, |a| and ‖v‖ that vanishes at the goal is √(a + ε²) − ε, √(a² + ε²) − ε and
-    √(‖v‖² + ε²) − ε.
+    """Another cost in which each √a, |a| and ‖v‖ that vanishes at the goal is replaced by a smooth function:
+    √(a + ε²) − ε, √(a² + ε²) − ε and √(‖v‖² + ε²) − ε.
 
-    They vanish where they did, with a curvature of 1/ε, and are less by ε at the most. ε is a share of what the call
-    gives in the mean of some states; calls are told apart by their order.
+    These have the same zeros, curvature 1/ε there, and are smaller by at most ε. ε is proportional to the mean result
+    of the call on some states; calls are identified by their order.
 
     Args:
-        cost: whose `state` and `terminal` are rounded.
-        x: states (b, n) of the usual size, by which ε is measured.
+        cost: the cost to smooth.
+        x: states (b, n) of typical size, which determine ε.
         goal: (n,).
-        share: of that size.
+        share: ε relative to the mean result of the call on x.
     """
 
-    widths: dict[str, list[float]]  # ε of each call by q and by φ; 0 where it is left as it is
+    widths: dict[str, list[float]]  # ε of each call in q and in φ; 0 for calls that remain unchanged
 
     def __init__(self, cost: Cost, x: Float[Tensor, "b n"], goal: Float[Tensor, " n"], share: float):
         super().__init__(cost)
@@ -53,7 +53,7 @@ class SmoothedCost(MadeOfAnother):
 
 
 class _Rounding(TorchFunctionMode):
-    """Exchange roots, norms and absolute values, in the order of calls, for rounded ones; keep the others' results."""
+    """Replaces roots, norms and absolute values, in the order of calls, by smooth ones; stores the other results."""
 
     def __init__(self, widths: Iterable[float] = ()):
         super().__init__()
@@ -61,7 +61,7 @@ class _Rounding(TorchFunctionMode):
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         named = kwargs or {}
-        squared = _squared(func, args, named)
+        squared = _square_of_result(func, args, named)
         if squared is None:
             return func(*args, **named)
         if width := next(self.widths, 0.0):
@@ -72,21 +72,21 @@ class _Rounding(TorchFunctionMode):
 
 @torch.no_grad()
 def _calls(function: Callable[[State], PerState], x: State) -> list[Tensor]:
-    """The results of the roots, norms and absolute values that a function computes."""
+    """The results of all roots, norms and absolute values in a function."""
     with _Rounding() as mode:
         function(x)
     return mode.found
 
 
 def _width(share: float, usual: Tensor, at_goal: Tensor) -> float:
-    """ε of a call, 0 where it does not vanish at the goal."""
+    """ε of a call; 0 if its result does not vanish at the goal."""
     finite = usual[usual.isfinite()].abs()
     width = share * float(finite.mean()) if len(finite) else 0.0
     return width if math.isfinite(width) and bool((at_goal.abs() <= width).any()) else 0.0
 
 
-def _squared(func: Any, args: Any, named: Any) -> Tensor | None:
-    """The square of what a root, an absolute value or a 2-norm gives, None of another function."""
+def _square_of_result(func: Any, args: Any, named: Any) -> Tensor | None:
+    """The square of the result of a root, an absolute value or a 2-norm; None for another function."""
     name = getattr(func, "__name__", "").removeprefix("linalg_")
     if not args or not isinstance(args[0], Tensor) or named.get("out") is not None or named.get("dtype") is not None:
         return None

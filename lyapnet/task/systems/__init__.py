@@ -1,4 +1,4 @@
-"""The registered systems; a new one is a subclass and one line here, or `module:Class` in a config."""
+"""The registered systems. A new one is a subclass and one line in SYSTEMS, or `module:Class` in a config."""
 
 from lyapnet.task.systems.acrobot import Acrobot
 from lyapnet.task.systems.base import ControlAffineSystem, MechanicalSystem

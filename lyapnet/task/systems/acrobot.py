@@ -9,7 +9,7 @@ from lyapnet.task.systems.base import MechanicalSystem, require_positive
 
 
 class Acrobot(MechanicalSystem):
-    """Two equal rods in a vertical plane, driven at the elbow alone; θ = 0 is both upright.
+    """Two equal rods in a vertical plane with a torque at the elbow only; at θ = 0 both are upright.
 
     With each rod's mass m, length l and inertia I about its end, and c = ½ m l²:
 
@@ -19,10 +19,10 @@ class Acrobot(MechanicalSystem):
     Args:
         mass: m in kg.
         length: l in m; the rods are uniform, I = m l²/3.
-        damping: in N·m·s/rad, at each joint.
+        damping: at each joint, in N·m·s/rad.
         gravity: g in m/s².
 
-    Source: Tedrake, Underactuated Robotics, ch. 3, with angles from upright.
+    Source: Tedrake, Underactuated Robotics, ch. 3, with angles measured from upright.
     """
 
     state_names = ("shoulder angle", "elbow angle", "shoulder velocity", "elbow velocity")

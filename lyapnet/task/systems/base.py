@@ -1,4 +1,4 @@
-"""What a system is: dynamics affine in the control, and facts about its coordinates."""
+"""The base classes of systems: control-affine dynamics with named coordinates."""
 
 import inspect
 import math
@@ -19,9 +19,9 @@ from lyapnet.base.types import Control, ControlMatrix, Coordinates, InputMatrix,
 class ControlAffineSystem(nn.Module, ABC):
     """ẋ = f(x) + g(x)u with n states and m controls.
 
-    A subclass writes f and g with torch operations on tensors of any leading shape, and declares its coordinates.
-    Physical parameters are constructor arguments; they stay Python floats or become buffers. One that has an energy may
-    say so in a method `energy(x)` of shape (*batch,), in J: constant along u = 0 without friction.
+    A subclass implements f and g with torch operations on tensors of any leading shape, and declares its coordinates.
+    Physical parameters are constructor arguments, stored as Python floats or buffers. A subclass may have a method
+    `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction.
     """
 
     state_names: Sequence[str] = ()
@@ -29,7 +29,7 @@ class ControlAffineSystem(nn.Module, ABC):
     control_names: Sequence[str] = ()
     control_units: Sequence[str] = ()
     angles: Sequence[int] = ()  # indices of the states that are angles in rad, unwrapped
-    constants: Sequence[int] = ()  # indices of the states that stay what they are: the parameters of a family
+    constants: Sequence[int] = ()  # indices of constant states, the parameters of a family
 
     @abstractmethod
     def f(self, x: State) -> State:
@@ -44,21 +44,21 @@ class ControlAffineSystem(nn.Module, ABC):
         return self.f(x) + apply(self.g(x), u)
 
     def holding_control(self, x: State) -> tuple[Control, State]:
-        """u that holds a state (n,), f(x) + g(x)u = 0, and the ẋ that stays: by least squares, of least norm."""
+        """The u that holds a state (n,), f(x) + g(x)u = 0, as the least squares solution of least norm; and its ẋ."""
         f, g = self.f(x), self.g(x)
         u = -apply(torch.linalg.pinv(g), f)
         return u, f + apply(g, u)
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> Sequence[Shape]:
-        """What it looks like in a state (n,) under a control (m,): shapes in a plane, in metres; here none.
+        """The shapes of the system in a state (n,) under a control (m,), in a plane in metres; by default none.
 
-        `lyapnet animate` moves them; of a system without shapes it shows the plane of two states.
+        `lyapnet animate` shows them; for a system without shapes it shows a plane of two states.
         """
         return ()
 
     @property
     def title(self) -> str:
-        """What it is called in tables."""
+        """The name of the system in tables."""
         return type(self).__name__
 
     @property
@@ -72,11 +72,10 @@ class ControlAffineSystem(nn.Module, ABC):
         return len(self.control_names)
 
     def check_coordinates(self) -> None:
-        """Refuse names and units that are no lists of as many strings, angles that are no states, and attributes that
-        hide what every system has, as g = 9.81 hides g(x).
+        """Check names, units and angles, and that no attribute hides a method, as g = 9.81 would hide g(x).
 
         Raises:
-            UsageError: naming the attribute.
+            UsageError: an attribute is wrong; names it.
         """
         name = type(self).__name__
         self._refuse_hidden_names()
@@ -178,7 +177,7 @@ class MechanicalSystem(ControlAffineSystem):
         return torch.cat([torch.zeros_like(MinvB), MinvB], -2)
 
     def dynamics(self, x: State, u: Control) -> State:
-        # One solve instead of the three of f + g u; a test holds the two equal.
+        # One linear solve instead of the three of f + g u; a test compares both.
         q, qdot = self._split(x)
         return self._accelerate(q, qdot, self.forces(q, qdot) + apply(self.B, u))
 
@@ -189,7 +188,7 @@ class MechanicalSystem(ControlAffineSystem):
 
     def _solve_actuation(self, q: Coordinates) -> Tensor:
         """M⁻¹B, (*batch, d, m)."""
-        # expanded: torch would take a (d, d) B beside a batch of d matrices for a batch of vectors
+        # expanded, because torch would treat a (d, d) B with a batch of d matrices as a batch of vectors
         return solve(self.mass_matrix(q), self.B.expand(*q.shape[:-1], *self.B.shape))
 
 
@@ -198,7 +197,7 @@ def _with_units(names: Sequence[str], units: Sequence[str]) -> list[str]:
 
 
 def require_positive(**parameters: float) -> None:
-    """Refuse physical parameters that are not positive, naming the first one."""
+    """Raise ValueError for the first physical parameter that is not positive."""
     for name, value in parameters.items():
         if not (isinstance(value, int | float) and 0 < value < math.inf):
             raise ValueError(f"Expected {name} > 0, got {value!r}; give it in SI units.")

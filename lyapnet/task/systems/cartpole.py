@@ -9,11 +9,11 @@ from lyapnet.task.systems.base import MechanicalSystem, require_positive
 
 
 class Cartpole(MechanicalSystem):
-    """A pole (point mass on a massless rod) hinged on a cart; θ = 0 is upright, θ grows towards +cart.
+    """A pole (point mass on a massless rod) hinged on a cart; θ = 0 is upright, θ > 0 leans towards positive x.
 
     M(q) = [[m_c + m_p, m_p l cos θ], [m_p l cos θ, m_p l²]],
     M q̈ = (u + m_p l θ̇² sin θ − b_c ẋ, m_p g l sin θ − b_p θ̇).
-    The angle is unwrapped: θ = 2π is another state than the goal, on purpose, since V is a function on ℝⁿ.
+    The angle is unwrapped: θ = 2π is another state than the goal, because V is a function on ℝⁿ.
 
     Args:
         cart_mass: m_c in kg.
@@ -59,7 +59,7 @@ class Cartpole(MechanicalSystem):
         return self.kinetic_energy(q, qdot) + self.pole_mass * self.gravity * self.length * torch.cos(q[..., 1])
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
-        """The force is drawn as long as the pole where it equals the weight of both."""
+        """A force that equals the total weight is drawn as long as the pole."""
         length, cart = self.length, np.array([x[0], 0.0])
         pole = cart + chain([length], [np.pi / 2 - x[1]])
         push = (x[0] + length * u[0] / (self.gravity * (self.cart_mass + self.pole_mass)), 0.0)

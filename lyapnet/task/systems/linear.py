@@ -1,4 +1,4 @@
-"""Linear systems, the double integrator and its longer kin."""
+"""Linear systems, with the double integrator and chains of integrators."""
 
 from collections.abc import Sequence
 from typing import TypeGuard
@@ -20,7 +20,7 @@ class Linear(ControlAffineSystem):
         B: (n, m).
 
     Raises:
-        ValueError: A is not square, or B has other rows.
+        ValueError: A is not square, or B has another number of rows.
     """
 
     A: Float[Tensor, "n n"]
@@ -52,7 +52,7 @@ class Linear(ControlAffineSystem):
 
 
 def is_linear(system: ControlAffineSystem) -> TypeGuard[Linear]:
-    """Whether a system is Linear, and no subclass gave it another f or g."""
+    """Whether a system is Linear and no subclass overrides f, g or dynamics."""
     return isinstance(system, Linear) and all(
         getattr(type(system), name) is getattr(Linear, name) for name in ("f", "g", "dynamics")
     )

@@ -7,14 +7,14 @@ from lyapnet.task.systems.base import ControlAffineSystem, require_positive
 
 
 class PathTracking(ControlAffineSystem):
-    """A kinematic bicycle at constant speed beside a circle: ė = v sin θ, θ̇ = (v/L) u − cos θ / (r/v − sin θ).
+    """A kinematic bicycle at constant speed along a circle: ė = v sin θ, θ̇ = (v/L) u − cos θ / (r/v − sin θ).
 
-    e is the distance from the path, θ the heading against it, u the tangent of the steering angle; u = L/r holds e = 0.
+    e is the distance from the path, θ the heading error, u the tangent of the steering angle; u = L/r holds e = 0.
 
     Args:
         speed: v in m/s.
-        length: L in m, between the axles.
-        radius: r in m, of the path; more than v · 1 s.
+        length: wheelbase L in m.
+        radius: radius r of the path in m; more than v · 1 s.
     """
 
     state_names, state_units = ("distance", "heading"), ("m", "rad")

@@ -9,7 +9,7 @@ from lyapnet.task.systems.base import MechanicalSystem, require_positive
 
 
 class Pendulum(MechanicalSystem):
-    """A point mass on a massless rod, driven at its hinge; θ = 0 is upright, and hanging down is θ = π.
+    """A point mass on a massless rod with a torque at its hinge; θ = 0 is upright, θ = π is hanging down.
 
     m l² θ̈ = u + m g l sin θ − b θ̇.
 

@@ -9,7 +9,7 @@ from lyapnet.task.systems.base import ControlAffineSystem, require_positive
 
 
 class PlanarQuadrotor(ControlAffineSystem):
-    """A rigid body in a vertical plane with two rotors; controls are their thrusts beyond those of hovering.
+    """A rigid body in a vertical plane with two rotors; the controls are their thrusts minus the hover thrusts.
 
     With F = m g + u₁ + u₂:   m ẍ = −F sin θ,   m z̈ = F cos θ − m g,   I θ̈ = r (u₁ − u₂).
 
@@ -19,7 +19,7 @@ class PlanarQuadrotor(ControlAffineSystem):
         arm: r in m, from the centre to each rotor.
         gravity: g in m/s².
 
-    Source: Tedrake, Underactuated Robotics, ch. 3, with thrusts measured from those of hovering.
+    Source: Tedrake, Underactuated Robotics, ch. 3, with thrusts relative to hovering.
     """
 
     state_names = ("x", "z", "pitch", "x velocity", "z velocity", "pitch velocity")
@@ -52,7 +52,7 @@ class PlanarQuadrotor(ControlAffineSystem):
         return torch.stack([push + turn, push - turn, push - turn, push + turn], -1).unflatten(-1, (2, 2))
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
-        """A thrust that carries the weight alone is drawn twice as long as an arm."""
+        """A thrust that equals the weight is drawn twice as long as an arm."""
         along, up = np.array([np.cos(x[2]), np.sin(x[2])]), np.array([-np.sin(x[2]), np.cos(x[2])])
         rotors = x[:2] + self.arm * np.stack([along, -along])
         shares = (u / (self.mass * self.gravity) + 0.5)[:, None] * up

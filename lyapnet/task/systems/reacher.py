@@ -7,7 +7,7 @@ from lyapnet.base.shapes import Disk, Line, Shape, chain
 from lyapnet.base.types import Coordinates, MassMatrix, PerState, State
 from lyapnet.task.systems.base import MechanicalSystem, require_positive
 
-DRAWN = (0.3, 0.33)  # m: the links of Li and Todorov, which a₁, a₂ and a₃ leave open
+DRAWN = (0.3, 0.33)  # lengths of the drawn links in m, from Li and Todorov; a₁, a₂ and a₃ do not determine them
 
 
 class Reacher(MechanicalSystem):
@@ -20,14 +20,14 @@ class Reacher(MechanicalSystem):
         a1: I₁ + I₂ + m l₁² in kg·m²; 0.025 + 0.045 + 1.4·0.3² with the arm constants of Li and Todorov.
         a2: m₂ l₁ s₂ in kg·m²; 1·0.3·0.16.
         a3: I₂ in kg·m².
-        damping: b in N·m·s/rad, at each joint.
+        damping: b at each joint, in N·m·s/rad.
 
     Raises:
         ValueError: a parameter is not positive, or M(q) would not be positive definite for every q:
             det M = a₃(a₁ − a₃) − a₂² cos² q₂.
 
     Source: Li and Todorov, "Iterative linear quadratic regulator design for nonlinear biological movement
-    systems", ICINCO 2004. One a₂ serves M and the Coriolis force; two different ones would create energy.
+    systems", ICINCO 2004. M and the Coriolis force have the same a₂; two different ones would create energy.
     """
 
     state_names = ("shoulder angle", "elbow angle", "shoulder velocity", "elbow velocity")

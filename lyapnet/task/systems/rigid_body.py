@@ -1,11 +1,11 @@
-"""Rigid bodies in space, with their attitude in Euler angles η = (φ, θ, ψ) = (roll, pitch, yaw).
+"""Rigid bodies in space with Euler angles η = (φ, θ, ψ) = (roll, pitch, yaw).
 
-With sφ = sin φ and so on, S(w)v = −w × v, and the rotation into the body's frame and the rates of the angles
+With sφ = sin φ and so on and S(w)v = −w × v, the rotation into the body frame and the rates of the angles are
 
     R(η) = [[cθcψ, cθsψ, −sθ], [sφsθcψ − cφsψ, sφsθsψ + cφcψ, sφcθ], [cφsθcψ + sφsψ, cφsθsψ − sφcψ, cφcθ]],
     η̇ = E(η)w,   E(η) = [[1, sφ tan θ, cφ tan θ], [0, cφ, −sφ], [0, sφ/cθ, cφ/cθ]],
 
-which is singular at θ = ±π/2.
+where E is singular at θ = ±π/2.
 """
 
 import math
@@ -43,25 +43,25 @@ def attitude_rates(attitude: Tensor, w: Tensor) -> Tensor:
     return torch.stack([w[..., 0] + torch.tan(pitch) * along, across, along / torch.cos(pitch)], -1)
 
 
-def seen(points: Sequence[Sequence[float]], attitude: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Points (k, 3) in a body's frame as they look on paper, (k, 2)."""
+def project_points(points: Sequence[Sequence[float]], attitude: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Project points (k, 3) in the body frame onto the drawing plane, (k, 2)."""
     R = to_body_frame(torch.as_tensor(attitude)).numpy()
     return oblique(np.asarray(points) @ R + position)
 
 
 def rotorcraft(attitude: np.ndarray, position: np.ndarray, lift: float) -> list[Shape]:
-    """Four arms of 0.3 m, a thrust upwards as long as an arm where lift is 1, and a line to the level z = 0."""
-    arms = seen([(0.3, 0, 0), (-0.3, 0, 0), (0, 0.3, 0), (0, -0.3, 0)], attitude, position)
-    center, thrust = seen([(0, 0, 0), (0, 0, 0.3 * lift)], attitude, position)
+    """Four arms of 0.3 m, an upward thrust that is as long as an arm for lift = 1, and a line to the level z = 0."""
+    arms = project_points([(0.3, 0, 0), (-0.3, 0, 0), (0, 0.3, 0), (0, -0.3, 0)], attitude, position)
+    center, thrust = project_points([(0, 0, 0), (0, 0, 0.3 * lift)], attitude, position)
     below = oblique(np.stack([position, position * (1, 1, 0)]))
     return [Line(below, width=0.8, faint=True), Line(arms[:2]), Line(arms[2:]), Arrow(center, thrust)]
 
 
-def three(name: str, values: Sequence[float]) -> Tensor:
-    """A physical parameter with a number for each axis.
+def per_axis(name: str, values: Sequence[float]) -> Tensor:
+    """A physical parameter with one number for each axis.
 
     Raises:
-        ValueError: there are not three, or one is not finite.
+        ValueError: there are not three numbers, or one is not finite.
     """
     if len(values) != 3 or not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise ValueError(f"Expected three numbers as {name}, got {values!r}; give one for each axis, in SI units.")
@@ -75,7 +75,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 class Satellite(ControlAffineSystem):
-    """A satellite with three wheels of total angular momentum h (in the inertial frame):
+    """A satellite with three reaction wheels of total angular momentum h (in the inertial frame):
 
         η̇ = E(η)w,   J ẇ = S(w)R(η)h + B u.
 
@@ -98,8 +98,8 @@ class Satellite(ControlAffineSystem):
         super().__init__()
         require_positive(**{f"inertia[{i}]": value for i, value in enumerate(inertia)})
         B = torch.tensor([[1, 1 / 20, 1 / 10], [1 / 15, 1, 1 / 10], [1 / 10, 1 / 15, 1]])
-        self.register_buffer("inertia", three("inertia", inertia), persistent=False)
-        self.register_buffer("momentum", three("momentum", momentum), persistent=False)
+        self.register_buffer("inertia", per_axis("inertia", inertia), persistent=False)
+        self.register_buffer("momentum", per_axis("momentum", momentum), persistent=False)
         self.register_buffer("torques", B.to(self.inertia), persistent=False)
 
     def f(self, x: State) -> State:
@@ -112,22 +112,22 @@ class Satellite(ControlAffineSystem):
         return torch.cat([torch.zeros_like(turning), turning]).expand(*x.shape[:-1], 6, 3)
 
     def draw(self, x: np.ndarray, u: np.ndarray) -> list[Shape]:
-        """A cube of 1 m with two panels, and its own axes 1, 2 and 3."""
+        """A cube of 1 m with two panels, and the body axes 1, 2 and 3."""
         face = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5), (-0.5, -0.5)]
         here = np.zeros(3)
-        edges = [seen([(side, *corner) for corner in face], x[:3], here) for side in (-0.5, 0.5)]
+        edges = [project_points([(side, *corner) for corner in face], x[:3], here) for side in (-0.5, 0.5)]
         across = [np.stack(pair) for pair in zip(*edges, strict=True)][:4]
         panels = [[(-0.3, s, 0), (0.3, s, 0), (0.3, 3 * s, 0), (-0.3, 3 * s, 0)] for s in (-0.6, 0.6)]
-        center, *axes = seen([(0, 0, 0), (1.2, 0, 0), (0, 1.2, 0), (0, 0, 1.2)], x[:3], here)
+        center, *axes = project_points([(0, 0, 0), (1.2, 0, 0), (0, 1.2, 0), (0, 0, 1.2)], x[:3], here)
         return [
-            *(Polygon(seen(panel, x[:3], here)) for panel in panels),
+            *(Polygon(project_points(panel, x[:3], here)) for panel in panels),
             *(Line(edge, width=1.5) for edge in (*edges, *across)),
             *(Arrow(center, axis) for axis in axes),
         ]
 
 
 class BodyFrameQuadrotor(ControlAffineSystem):
-    """A quadrotor with its velocity v and rates w in its own frame; thrust beyond that of hovering, and torques:
+    """A quadrotor with velocity v and angular velocity w in the body frame; u is the thrust minus m g, and torques:
 
         ṗ = R(η)ᵀv,   v̇ = S(w)v − R(η)(0, 0, g) + (0, 0, g + u₁/m),   η̇ = E(η)w,   J ẇ = S(w)J w + (u₂, u₃, u₄).
 
@@ -153,7 +153,7 @@ class BodyFrameQuadrotor(ControlAffineSystem):
         super().__init__()
         require_positive(mass=mass, gravity=gravity, **{f"inertia[{i}]": value for i, value in enumerate(inertia)})
         self.mass, self.gravity = mass, gravity
-        self.register_buffer("inertia", three("inertia", inertia), persistent=False)
+        self.register_buffer("inertia", per_axis("inertia", inertia), persistent=False)
 
     def f(self, x: State) -> State:
         v, attitude, w = x[..., 3:6], x[..., 6:9], x[..., 9:]
@@ -174,20 +174,20 @@ class BodyFrameQuadrotor(ControlAffineSystem):
 
 
 class Quadrotor(ControlAffineSystem):
-    """A quadrotor that is a point for its thrust, and three double integrators for its attitude:
+    """A quadrotor as a point mass with a thrust F, and its attitude as three double integrators:
 
         ṗ = v,   v̇ = F/m · b(η) − (0, 0, g),   η̇ = w,   ẇ = τ,   b(η) = R(η)ᵀ(0, 0, 1),
 
-    the direction of its thrust F. Controls are F beyond a share of the weight, and τ as accelerations.
+    where b is the direction of F. The controls are F minus a share of the weight, and the angular accelerations τ.
 
     Args:
         mass: m in kg.
         gravity: g in m/s².
-        carried: the share of the weight m g that is carried at u = 0; with 0 the first control is F itself, and the
-            goal is no equilibrium.
+        carried: the share of the weight m g that F carries at u = 0; with 0 the first control is F itself, and the goal
+            is no equilibrium.
 
     Source: Onken et al., "A neural network approach for real-time high-dimensional optimal control", IEEE Transactions
-    on Control Systems Technology 2022, with the angles in another order.
+    on Control Systems Technology 2022, with another order of the angles.
     """
 
     state_names = ("x", "y", "z", *ATTITUDE, "x velocity", "y velocity", "z velocity", *RATES)

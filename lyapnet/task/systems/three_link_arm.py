@@ -1,4 +1,4 @@
-"""The planar arm of three links."""
+"""The planar three-link arm."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from lyapnet.task.systems.base import MechanicalSystem, require_positive
 
 
 class ThreeLinkArm(MechanicalSystem):
-    """Three equal rods in the horizontal plane, in absolute angles, with torques at the joints:
+    """Three equal rods in the horizontal plane with absolute angles and torques at the joints:
 
     M_ij = c_ij cos(θ_i − θ_j),   h_i = −Σ_j c_ij sin(θ_i − θ_j) θ̇_j²,
 
@@ -20,7 +20,7 @@ class ThreeLinkArm(MechanicalSystem):
     Args:
         mass: m of each rod in kg.
         length: l of each in m.
-        damping: in N·m·s/rad, on each absolute rate.
+        damping: on each absolute rate, in N·m·s/rad.
     """
 
     state_names = ("first angle", "second angle", "third angle", "first rate", "second rate", "third rate")

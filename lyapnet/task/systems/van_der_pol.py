@@ -7,9 +7,9 @@ from lyapnet.task.systems.base import ControlAffineSystem
 
 
 class VanDerPol(ControlAffineSystem):
-    """An oscillator that feeds small swings and damps large ones: ẋ₁ = x₂, ẋ₂ = −x₁ + μ (1 − x₁²) x₂ + u.
+    """The van der Pol oscillator ẋ₁ = x₂, ẋ₂ = −x₁ + μ (1 − x₁²) x₂ + u: small oscillations grow, large ones decay.
 
-    Without control the origin is unstable, and every other state goes to a limit cycle around it.
+    Without control the origin is unstable, and every other state converges to a limit cycle around it.
 
     Args:
         damping: μ.

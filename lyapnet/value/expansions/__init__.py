@@ -1,4 +1,4 @@
-"""Optimal trajectories, and the value function to second order around them."""
+"""Optimal trajectories, and second order expansions of the value function around them."""
 
 from lyapnet.value.expansions.dynamic_programming import (
     FLOOR,

@@ -1,13 +1,13 @@
-"""Optimal trajectories of the discretised problem, and the value function to second order around them.
+"""Differential dynamic programming: optimal trajectories, and second order expansions of V around them.
 
-The problem is J_N = Σ_{n<N} l(x_n, u_n) + φ(x_N) along x_{n+1} = F(x_n, u_n), both of them `Problem.step`: with Euler
-F = x + Δt(f + gu) and l = Δt ℓ. With Q(x, u) = l + V_{n+1}(F(x, u)), backwards from V_N = φ and to second order in
-(x, u),
+The discretised problem is J_N = Σ_{n<N} l(x_n, u_n) + φ(x_N) along x_{n+1} = F(x_n, u_n), with F and l from
+`Problem.step`; with Euler steps F = x + Δt(f + gu) and l = Δt ℓ. With Q(x, u) = l + V_{n+1}(F(x, u)), the backward pass
+from V_N = φ is, to second order in (x, u),
 
     k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
 
-Along an optimal trajectory k = 0, and V_n is the value function to second order. Around a state that stays where it is,
-with F linearised and q, φ quadratic, it is the Riccati solution; of an affine system, if f does not vanish there.
+Along an optimal trajectory k = 0, and V_n is the value function to second order. At a constant state, with F linearised
+and q, φ quadratic, it is the Riccati solution; of an affine system if f does not vanish there.
 
 Source: Jacobson, Mayne, Differential Dynamic Programming, 1970; the line search as in Tassa, Mansard, Todorov,
 "Control-limited differential dynamic programming", ICRA 2014.
@@ -31,13 +31,15 @@ from lyapnet.value.expansions.laws import Expansion, greedy_law
 from lyapnet.value.expansions.paths import Path, cheapest, exchanged, in_float64, path_of, path_under
 from lyapnet.value.expansions.step_programs import StepPrograms
 
-STEP_SIZES = tuple(0.5**k for k in range(10))
-FLOOR = 0.1  # least eigenvalue of Q_uu, as a share of that of the control cost
-NEAR = 1e-3  # share of J_N of which no more is expected or gained when the second derivatives of F join
-SETTLED, OPTIMAL = 1e-9, 1e-12  # with them: share that the last search gains, and that is left of an optimum
-HOPELESS, GRACE = 2.0, 20  # times the cost of a settled rival; iterations for which that is not asked
-ROUNDING = 1e-12  # of the largest eigenvalue of Q_uu, below which the others are lost in it
-TRIES = 9  # failures in a row, each with ten times the damping, after which a trajectory is left as it is
+STEP_SIZES = tuple(0.5**k for k in range(10))  # α of the line search
+FLOOR = 0.1  # smallest allowed eigenvalue of Q_uu, relative to that of the control cost
+ROUGH_TOLERANCE = 1e-3  # relative gain, made or expected, at which the phase without second derivatives of F ends
+GAIN_TOLERANCE = 1e-9  # relative gain of a line search at which the phase with second derivatives ends
+EXPECTED_TOLERANCE = 1e-12  # relative expected gain at which it ends
+HOPELESS_COST_RATIO = 2.0  # cost relative to a settled rival, from which on a trajectory is given up
+GRACE_ITERATIONS = 20  # first iterations in which none is given up
+ROUNDING = 1e-12  # eigenvalues of Q_uu below this share of the largest are only rounding errors
+TRIES = 9  # consecutive failed line searches, each with ten times the damping, after which a trajectory is given up
 
 
 class Optimum(NamedTuple):
@@ -45,43 +47,43 @@ class Optimum(NamedTuple):
 
     path: Path
     expansion: Expansion
-    mended: PerState  # at how many of the nodes of each some derivative does not exist, and is taken beside them
+    replaced: PerState  # number of nodes at which a missing derivative was replaced, see `steps_along`
 
     def member(self, rows: Tensor) -> "Optimum":
-        """Those with some indices."""
-        return Optimum(self.path.member(rows), self.expansion.member(rows), self.mended[rows])
+        """The trajectories with some indices."""
+        return Optimum(self.path.member(rows), self.expansion.member(rows), self.replaced[rows])
 
 
 class _Backward(NamedTuple):
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
     expansion: Expansion
-    mended: Tensor  # (N + 1, *batch) the nodes with a derivative that does not exist
+    replaced: Tensor  # (N + 1, *batch), whether a missing derivative was replaced
 
     def member(self, rows: Tensor) -> "_Backward":
-        """Those with some indices."""
-        return _Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.mended[:, rows])
+        """The trajectories with some indices."""
+        return _Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.replaced[:, rows])
 
 
 def riccati(problem: Problem) -> Expansion:
-    """The value function of the problem linearised at its goal, x̄ = x*: F to first order, q, R and φ to second.
+    """The value function of the problem linearised at its goal x̄ = x*: F to first order; q, R and φ to second order.
 
-    Limits of the controls are left out: near a goal that needs no control none is active.
+    Control limits are ignored: they are not active near a goal that needs no control.
     """
     return _at_goal(problem).expansion
 
 
 def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
-    """(ū, K) of the law ū_n + K_n(x − x*) whose value `riccati` is: the linear-quadratic regulator of N steps.
+    """(ū, K) of the linear-quadratic regulator ū_n + K_n(x − x*) over N steps, whose value is `riccati`.
 
-    ū_n (N, m) is the control that holds x*, or what is least dear where none does; K is (N, m, n).
+    ū_n (N, m) is the control that holds x*, or the optimal one if none does; K is (N, m, n).
     """
     backward = _at_goal(problem)
     return problem.rest.double().cpu() + backward.k, backward.K
 
 
 def _at_goal(problem: Problem) -> "_Backward":
-    """The backward pass around x*, without limits."""
+    """The backward pass at x*, without control limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
     return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False)
@@ -96,18 +98,19 @@ def optimal_trajectories(
     progress: Callable[[int, int], None] = lambda done, total: None,
     seconds: float = math.inf,
 ) -> Optimum:
-    """Locally optimal trajectories from a batch of states (b, n), from controls (N, b, m) on, all at once.
+    """Locally optimal trajectories from a batch of states (b, n), with controls (N, b, m) as initial guess.
 
-    First without the second derivatives of F, which far from an optimum point anywhere, then with them. Steps of higher
-    order begin with what Euler steps lead to, where that is cheaper than the controls that are given: far from an
-    optimum those are as good a guide, and less work. Where the controls lead nowhere finite the cost is infinite.
+    The first phase ignores the second derivatives of F, which are misleading far from an optimum; the second phase
+    includes them. For integrators of higher order a phase with Euler steps comes first, because these are cheaper and
+    equally good far from an optimum; its result is used if it improves the initial guess. The cost is infinite if the
+    controls lead to a non-finite trajectory.
 
     Args:
-        iterations: of each of the two kinds, at the most.
-        rivals: the controls are guesses from one state, of which only the best counts: once one has settled, those
-            that still cost HOPELESS times as much are left as they are.
-        progress: is told how many trajectories are done, of how many, each descent counting for its share.
-        seconds: of this thread's work, after which trajectories are left as they are then.
+        iterations: largest number of iterations of each phase.
+        rivals: whether the controls are guesses from one state, of which only the best counts. Once one has settled,
+            those that cost HOPELESS_COST_RATIO times as much are given up.
+        progress: called with the number of finished trajectories and their total, averaged over the phases.
+        seconds: CPU seconds of this thread after which the descent stops.
     """
     until = time.thread_time() + seconds
     problem = in_float64(problem)
@@ -116,7 +119,7 @@ def optimal_trajectories(
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
         return path_under(problem, lambda n, _: controls[n], x0)
 
-    def descended(programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
+    def descend(programs: StepPrograms, now: Path, curved: bool, kind: int) -> "_Descent":
         descent = _Descent(programs, now, curved)
         descent.run(iterations, rivals, lambda count: progress((kind * b + count) // kinds, b), until)
         return descent
@@ -126,48 +129,50 @@ def optimal_trajectories(
     if higher_order:
         roughly = problem.in_steps(method="euler")
         rough = StepPrograms(roughly, STEP_SIZES)
-        euler = descended(rough, under(u, roughly), curved=False, kind=0).now
+        euler = descend(rough, under(u, roughly), curved=False, kind=0).now
         now = cheapest([now, under(euler.u)])
     programs = StepPrograms(problem, STEP_SIZES)
-    now = descended(programs, now, curved=False, kind=kinds - 2).now
-    descent = descended(programs, now, curved=True, kind=kinds - 1)
-    if not programs.agrees(descent.now) and programs.forget():  # its numbers changed since programs were written
+    now = descend(programs, now, curved=False, kind=kinds - 2).now
+    descent = descend(programs, now, curved=True, kind=kinds - 1)
+    if not programs.agrees(descent.now) and programs.forget():  # the problem's constants have changed
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
     return descent.optimum()
 
 
 def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
-    """Where each of a batch of states is led by the law that an expansion of its own asks for.
+    """The closed loops from a batch of states, each under the greedy law of its own expansion.
 
     Args:
         problem: in float64, on the CPU.
-        expansion: one for each state of x0 (b, n).
+        expansion: one expansion for each state of x0 (b, n).
     """
     if not len(x0):
         return path_under(problem, greedy_law(problem, expansion), x0)
     programs = StepPrograms(problem, STEP_SIZES)
     path = path_of(problem, *programs.follow(expansion, x0))
-    if not programs.agrees(path) and programs.forget():  # its numbers changed since programs were written
+    if not programs.agrees(path) and programs.forget():  # the problem's constants have changed
         return follow_expansions(problem, expansion, x0)
     return path
 
 
 class _Descent:
-    """Line searches until no trajectory gains, or is expected to gain, more than a share of its cost.
+    """One phase of the descent: line searches until the relative gain of each trajectory, made or expected, is small.
 
-    What a pass without damping expects is its V_0(x₀) beside J_N: to second order what the full step leads to. Each
-    trajectory has its own damping.
+    The expected gain is J_N − V_0(x₀) of a backward pass without damping, the gain of the full step to second order.
+    Each trajectory has its own damping.
 
     Args:
-        programs: of the problem's steps.
-        now: trajectories to begin with.
-        curved: with the second derivatives of F.
+        programs: compiled steps of the problem.
+        now: the initial trajectories.
+        curved: whether to include the second derivatives of F.
     """
 
     def __init__(self, programs: StepPrograms, now: Path, curved: bool):
         self.programs, self.curved = programs, curved
-        self._gained, self._expected = (SETTLED, OPTIMAL) if curved else (NEAR, NEAR)
-        self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (rows, the pass that expected no more of them)
+        self._gained, self._expected = (
+            (GAIN_TOLERANCE, EXPECTED_TOLERANCE) if curved else (ROUGH_TOLERANCE, ROUGH_TOLERANCE)
+        )
+        self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (settled rows, their last backward pass)
 
     def run(self, iterations: int, rivals: bool, progress: Callable[[int], None], until: float) -> None:
         """Iterate; see optimal_trajectories."""
@@ -178,27 +183,27 @@ class _Descent:
             progress(len(settled) - len(rows))
             if not len(rows) or time.thread_time() > until:
                 break
-            was, backward = self._pass(rows, damping[rows])
-            expected = (was.cost - backward.expansion.value[0]).abs()
-            unsettled = (damping[rows] > 0) | ~(expected <= self._expected * was.cost.abs())
+            previous, backward = self._pass(rows, damping[rows])
+            expected = (previous.cost - backward.expansion.value[0]).abs()
+            unsettled = (damping[rows] > 0) | ~(expected <= self._expected * previous.cost.abs())
             if not unsettled.all():
                 self._passes.append((rows[~unsettled], backward.member(~unsettled)))
                 settled[rows[~unsettled]] = True
-                rows, was, backward = rows[unsettled], was.member(unsettled), backward.member(unsettled)
+                rows, previous, backward = rows[unsettled], previous.member(unsettled), backward.member(unsettled)
             if len(rows):
-                tried = _line_search(self.programs.problem, self.programs, was, backward)
-                better = tried.cost < was.cost
-                gain = torch.where(better, was.cost - tried.cost, 0)
+                tried = _line_search(self.programs.problem, self.programs, previous, backward)
+                better = tried.cost < previous.cost
+                gain = torch.where(better, previous.cost - tried.cost, 0)
                 self.now = exchanged(self.now, rows[better], tried.member(better))
                 failures[rows] = torch.where(better, 0, failures[rows] + 1)
                 damping[rows] = torch.where(better, damping[rows] / 10, (10 * damping[rows]).clamp_min(1e-3))
-                settled[rows] = better & (gain <= self._gained * was.cost.abs()) | (failures[rows] > TRIES)
-            if rivals and (self.curved or k >= GRACE) and settled.any():
+                settled[rows] = better & (gain <= self._gained * previous.cost.abs()) | (failures[rows] > TRIES)
+            if rivals and (self.curved or k >= GRACE_ITERATIONS) and settled.any():
                 least = self.now.cost[settled].min()
-                settled |= self.now.cost > least + (HOPELESS - 1) * least.abs()
+                settled |= self.now.cost > least + (HOPELESS_COST_RATIO - 1) * least.abs()
 
     def optimum(self) -> Optimum:
-        """The trajectories, with V around each; one without a kept pass gets its pass now."""
+        """The trajectories with their expansions; those without a stored backward pass get one now."""
         has_no_pass = torch.ones_like(self.now.cost, dtype=torch.bool)
         for rows, _ in self._passes:
             has_no_pass[rows] = False
@@ -207,17 +212,17 @@ class _Descent:
             passes = [*passes, (others, self._pass(others)[1])]
         order = torch.cat([rows for rows, _ in passes]).argsort()
         parts = zip(*(backward.expansion for _, backward in passes), strict=True)
-        mended = torch.cat([backward.mended for _, backward in passes], 1)[:, order].sum(0)
-        return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), mended)
+        replaced = torch.cat([backward.replaced for _, backward in passes], 1)[:, order].sum(0)
+        return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), replaced)
 
     def _pass(self, rows: Tensor, damping: Tensor | None = None) -> tuple[Path, _Backward]:
-        """Some of the trajectories, and the pass backwards along them."""
+        """Some of the trajectories, and the backward pass along them."""
         path = self.now.member(rows)
         return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved)
 
 
 def sizes(problem: Problem, cost: PerState) -> PerState:
-    """What differences of the costs of some trajectories are held against: each cost; without a goal their spread."""
+    """The scale of cost differences of some trajectories: the cost of each; without a goal the spread of the costs."""
     finite = cost[cost.isfinite()]
     if problem.has_goal or not len(finite):
         return cost
@@ -225,7 +230,7 @@ def sizes(problem: Problem, cost: PerState) -> PerState:
 
 
 def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Tensor]:
-    """What states pay in one step for being close to constraints, to second order; zero where nothing is relaxed."""
+    """The constraint penalty of one step at some states, to second order; zero without a penalty."""
     if not isinstance(problem.cost, PenaltyCost):
         return torch.zeros_like(x[..., 0]), torch.zeros_like(x), torch.zeros_like(x[..., None] * x[..., None, :])
     with torch.enable_grad():
@@ -236,13 +241,13 @@ def penalty_of_one_step(problem: Problem, x: State) -> tuple[PerState, State, Te
 
 
 def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
-    """What is left of an expansion of V without what each state pays in one step for being close to constraints."""
+    """An expansion of V minus the constraint penalty of one step at each state."""
     value, gradient, hessian = penalty_of_one_step(in_float64(problem), expansion.x)
     return Expansion(expansion.x, expansion.value - value, expansion.gradient - gradient, expansion.hessian - hessian)
 
 
 def _line_search(problem: Problem, programs: StepPrograms, now: Path, backward: _Backward) -> Path:
-    """The best of u + αk + K(x' − x) over step sizes α, of each trajectory."""
+    """The cheapest closed loop under u + αk + K(x' − x) over the step sizes α, for each trajectory."""
     tried = path_of(problem, *programs.search(now.x, now.u, backward.k, backward.K))
     best, each = tried.cost.argmin(0), torch.arange(now.x.shape[1])
     return Path(tried.x[:, best, each], tried.u[:, best, each], tried.cost[best, each])
@@ -256,18 +261,18 @@ def _backward(
     damping: Tensor | None = None,
     curved: bool = True,
 ) -> _Backward:
-    """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded where F(x_n, u_n) lands.
+    """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded at F(x_n, u_n).
 
-    The second derivatives of F enter as those of pᵀF, n + m derivatives of one sum and not of each component. p is the
-    costate of the controls as they are: V_x where k = 0. A pass without second derivatives would give another p, where
-    it meets negative eigenvalues of Q_uu that the task does not have.
+    The second derivatives of F enter as those of pᵀF, which needs only n + m derivatives of a single sum. p is the
+    costate under the current controls, equal to V_x if k = 0. The V_x of a pass without second derivatives would differ
+    from it, and lead to negative eigenvalues of Q_uu that the task does not have.
 
-    Derivatives that do not exist at a node are those beside it (`steps_along`).
+    Derivatives that do not exist at a node are replaced, see `steps_along`.
 
     Args:
-        derivatives: of the problem's steps.
+        derivatives: derivatives of the problem's steps.
         damping: added to Q_uu, in units of the control cost.
-        curved: with the second derivatives of F.
+        curved: whether to include the second derivatives of F.
     """
     steps = steps_along(derivatives, problem.cost.terminal, x, u)
     if curved:
@@ -276,7 +281,7 @@ def _backward(
 
 
 def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None) -> _Backward:
-    """V_n(δ) = ½ (1, δ)ᵀW_n(1, δ), W = [[2c, pᵀ], [p, H]], from W_N on: one matrix holds all that is known of V."""
+    """The recursion of V_n(δ) = ½ (1, δ)ᵀW_n(1, δ) backwards from W_N, with c, p and H in W = [[2c, pᵀ], [p, H]]."""
     n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
     one = torch.eye(1, 1 + steps.z.shape[-1]).to(x).expand(*steps.paid.shape, 1, -1)
@@ -287,15 +292,15 @@ def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, dam
     for k in reversed(range(len(M))):
         Q = L[k] + M[k].mT @ W @ M[k]
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
-        raised = _raised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
-        gain = _gains(problem, u[k], raised, Q_ua)
+        regularised = _regularised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
+        gain = _gains(problem, u[k], regularised, Q_ua)
         W = Q[..., : 1 + n, : 1 + n] + gain.mT @ (Q_ua + Q_uu @ gain) + Q_ua.mT @ gain
         W = (W + W.mT) / 2
         nodes.append(W)
         gains.append(gain)
     W, gain = torch.stack(nodes[::-1]), torch.stack(gains[::-1])
     expansion = Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:])
-    return _Backward(gain[..., 0], gain[..., 1:], expansion, steps.mended)
+    return _Backward(gain[..., 0], gain[..., 1:], expansion, steps.replaced)
 
 
 def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:
@@ -305,8 +310,7 @@ def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:
 
 
 def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
-    """(k, K) from Q_ua = (Q_u, Q_ux): k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U; controls that a limit holds have
-    no part in K.
+    """(k, K) from Q_ua = (Q_u, Q_ux): k = argmin of ½ kᵀQ_uu k + Q_uᵀk over u + k ∈ U; K = 0 for controls at a limit.
 
     Source: Tassa, Mansard, Todorov, "Control-limited differential dynamic programming", ICRA 2014.
     """
@@ -317,22 +321,22 @@ def _gains(problem: Problem, u: Control, Q_uu: Tensor, Q_ua: Tensor) -> Tensor:
     k = to - u
     slope = Q_u + (Q_uu @ k[..., None])[..., 0]
     further = problem.controls.project(to - slope.sign() * (1 + to.abs()))
-    share = ((further != to) | (slope == 0)).to(Q_uu)  # 1 for a control that is free, 0 for one that a limit holds
+    share = ((further != to) | (slope == 0)).to(Q_uu)  # 1 for a free control, 0 for one at a limit
     A = share[..., :, None] * Q_uu * share[..., None, :] + torch.diag_embed(1 - share)
     return torch.cat([k[..., None], -torch.linalg.solve(A, share[..., None] * Q_ux)], -1)
 
 
-def _raised(Q_uu: Tensor, floor: Tensor, damping: Tensor | None) -> Tensor:
-    """Q_uu with eigenvalues of no less than a floor, and with damping added; what overflowed is zero."""
+def _regularised(Q_uu: Tensor, floor: Tensor, damping: Tensor | None) -> Tensor:
+    """Q_uu with eigenvalues raised to at least a floor, plus damping; non-finite entries become zero."""
     Q_uu, one = Q_uu.where(Q_uu.isfinite(), 0), torch.eye(Q_uu.shape[-1]).to(Q_uu)
     least = floor.maximum(ROUNDING * Q_uu.diagonal(0, -2, -1).sum(-1))
     if Q_uu.shape[-1] == 1:
-        raised = Q_uu.maximum(floor[..., None, None])
+        regularised = Q_uu.maximum(floor[..., None, None])
     elif is_positive_definite(Q_uu - one * least[..., None, None]).all():
-        raised = Q_uu
+        regularised = Q_uu
     else:
         values, vectors = torch.linalg.eigh(Q_uu)
         values = values.clamp_min(0).maximum(floor[..., None])
         values = values.maximum(ROUNDING * values[..., -1:])
-        raised = (vectors * values[..., None, :]) @ vectors.mT
-    return raised if damping is None else raised + one * damping[..., None, None]
+        regularised = (vectors * values[..., None, :]) @ vectors.mT
+    return regularised if damping is None else regularised + one * damping[..., None, None]

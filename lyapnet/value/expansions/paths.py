@@ -1,4 +1,4 @@
-"""Trajectories step by step: under a law, and of what is known of them."""
+"""Trajectories of the discretised problem, computed step by step."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -13,20 +13,20 @@ from lyapnet.task.problem import Problem
 
 
 class Path(NamedTuple):
-    """Trajectories step by step; J_N is infinite where one is not finite, and x is then finite all the same."""
+    """A batch of trajectories. If one is not finite, its J_N is infinite, and x and u have numbers instead of NaN."""
 
     x: StatePath
     u: ControlPath
     cost: PerState
 
     def member(self, rows: Tensor) -> "Path":
-        """Those with some indices."""
+        """The trajectories with some indices."""
         return Path(self.x[:, rows], self.u[:, rows], self.cost[rows])
 
 
 @torch.no_grad()
 def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """Where a law (n, x_n) ↦ u_n leads from a batch of states, whatever becomes of it."""
+    """The closed loops of a law (n, x_n) ↦ u_n from a batch of states; they may diverge."""
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
@@ -37,9 +37,9 @@ def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State
 
 
 def path_of(problem: Problem, x: StatePath, u: ControlPath, running_cost: PerState) -> Path:
-    """A path of which states and controls at the nodes and ∫ℓ over all of it are known, whatever they are.
+    """The path with given states and controls at the nodes and given ∫ℓ.
 
-    If it leaves the domain, or jumps over a pole of f, g, q or φ, as no trajectory does, its cost is infinite.
+    Its cost is infinite if it is not finite, leaves the domain, or jumps over a pole of f, g, q or φ.
     """
     J, x = (running_cost + problem.cost.terminal(x[-1])).nan_to_num(torch.inf, torch.inf), x.nan_to_num()
     if (poles := _poles_of(problem)) is not None:
@@ -50,7 +50,7 @@ def path_of(problem: Problem, x: StatePath, u: ControlPath, running_cost: PerSta
 
 
 def _poles_of(problem: Problem) -> Poles | None:
-    """Where f, g, q and φ of a problem divide by zero, sought once."""
+    """The poles of f, g, q and φ, where they divide by zero; searched once for each problem."""
     if "poles" not in problem.findings:
         own = in_float64(problem)
         f, g, cost = own.system.f, own.system.g, own.cost
@@ -61,14 +61,14 @@ def _poles_of(problem: Problem) -> Poles | None:
 
 
 def cheapest(paths: Sequence[Path]) -> Path:
-    """Of each state, that of several trajectories which costs least."""
+    """The cheapest of several trajectories for each initial state."""
     x, u, cost = (torch.stack(parts) for parts in zip(*paths, strict=True))
     best, each = cost.argmin(0), torch.arange(cost.shape[1])
     return Path(x[best, :, each].movedim(0, 1), u[best, :, each].movedim(0, 1), cost[best, each])
 
 
 def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
-    """Some trajectories exchanged for others."""
+    """Replace some trajectories by others."""
     return Path(
         path.x.index_copy(1, rows, others.x),
         path.u.index_copy(1, rows, others.u),
@@ -77,5 +77,5 @@ def exchanged(path: Path, rows: Tensor, others: Path) -> Path:
 
 
 def in_float64(problem: Problem) -> Problem:
-    """A copy of a problem for what is computed before training: on the CPU, without gradients of its parameters."""
+    """A float64 copy of a problem on the CPU without gradients of its parameters, for computations before training."""
     return copied(problem).requires_grad_(False)

@@ -1,4 +1,4 @@
-"""Closed loops along expansions and line searches, and derivatives of steps, as programs of lyapnet's kernel."""
+"""Compiled closed loops of expansions and line searches, and compiled derivatives of steps."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,16 +18,16 @@ from lyapnet.value.derivatives import StepDerivatives
 from lyapnet.value.expansions.laws import Expansion, held_control
 from lyapnet.value.expansions.paths import Path
 
-TRAJECTORIES, ROWS = 16, 512  # in one call of a program: of closed loops, and of derivatives
+LOOPS_PER_CALL, ROWS_PER_CALL = 16, 512  # closed loops, and rows of derivatives, in one call of a program
 Kernel = NumberKernel | ScanKernel
 
 
 class StepPrograms(StepDerivatives):
-    """What differential dynamic programming asks of the steps of a problem, for batches of any size.
+    """The compiled steps of a problem and their derivatives for differential dynamic programming, any batch size.
 
-    What cannot be traced, or has an operation that the kernel lacks, is run by torch, to the same result. Programs are
-    written once for a problem and its copies; the tensors that a problem is made of are read at each call, but other
-    numbers are as they were when it was traced: `agrees` tells.
+    Torch runs functions that cannot be traced or use operations that the kernel lacks, with the same result. Programs
+    are compiled once for a problem and its copies. They read the problem's tensors at each call, but other numbers are
+    those of the time of tracing; `agrees` checks them.
 
     Args:
         problem: in float64, on the CPU.
@@ -38,27 +38,27 @@ class StepPrograms(StepDerivatives):
         super().__init__(problem.step, problem.system.n)
         self.problem = problem
         self._search = _SearchStep(problem, step_sizes)
-        self._first = _OfProblem(problem, super().first)
-        self._curvature = _OfProblem(problem, super().curvature)
-        self._facts = self._written_for()
+        self._first = _FunctionOfProblem(problem, super().first)
+        self._curvature = _FunctionOfProblem(problem, super().curvature)
+        self._facts = self._cache_key()
 
     def search(self, x: StatePath, u: ControlPath, k: ControlPath, K: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Closed loops from x̄_0 (b, n) under u = ū + αk + K(x − x̄), kept to U, for each step size α.
+        """Closed loops from x̄_0 (b, n) under u = ū + αk + K(x − x̄), projected onto U, for each step size α.
 
         Args:
             x, u: x̄ (N + 1, b, n) and ū (N, b, m).
             k, K: (N, b, m) and (N, b, m, n).
 
         Returns:
-            x (N + 1, sizes, b, n), u (N, sizes, b, m), and ∫ℓ over all of it (sizes, b).
+            x (N + 1, sizes, b, n), u (N, sizes, b, m), and ∫ℓ over the horizon (sizes, b).
         """
-        start = _without_cost(x[0]).expand(len(self._search.step_sizes), -1, -1)
-        return self._along("search", self._search, [x[:-1], u, k, K], start)
+        start = _append_zero_cost(x[0]).expand(len(self._search.step_sizes), -1, -1)
+        return self._run_loops("search", self._search, [x[:-1], u, k, K], start)
 
     def follow(self, expansion: Expansion, x0: State) -> tuple[StatePath, ControlPath, PerState]:
-        """Closed loops from x₀ (b, n) under the held controls for V as the expansion of each has it: x, u and ∫ℓ."""
+        """Closed loops (x, u, ∫ℓ) from x₀ (b, n), each under the held controls for V from its own expansion."""
         columns = [expansion.x[1:], expansion.gradient[1:], expansion.hessian[1:]]
-        return self._along("follow", _FollowStep(self.problem), columns, _without_cost(x0))
+        return self._run_loops("follow", _FollowStep(self.problem), columns, _append_zero_cost(x0))
 
     def first(self, z: Tensor) -> list[Tensor]:
         return self._in_slices("first", self._first, z)
@@ -68,7 +68,7 @@ class StepPrograms(StepDerivatives):
         return bends
 
     def agrees(self, path: Path) -> bool:
-        """Whether steps and costs of finite paths are those of the problem as it is, up to a third of the digits."""
+        """Whether finite paths have the steps and costs of the current problem, up to a third of the digits."""
         finite = path.cost.isfinite()
         x, u, cost = path.x[:, finite], path.u[:, finite], path.cost[finite]
         with torch.no_grad():
@@ -77,36 +77,42 @@ class StepPrograms(StepDerivatives):
         return are_close(x[1:], following, THIRD) and are_close(cost, total, THIRD)
 
     def forget(self) -> bool:
-        """Run by torch from now on what programs were written for, here and for all copies of the problem.
+        """Discard all programs of the problem and its copies; torch runs these functions from now on.
 
         Returns:
-            Whether there were any.
+            Whether there were any programs.
         """
         known = self.problem.findings.programs
         some = any(program is not None for program in known.values())
         known.update(dict.fromkeys(known))
         return some
 
-    def _along(self, name: str, step: nn.Module, columns: list[Tensor], start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(x, u, ∫ℓ) of steps (*columns (N, b, …) at its time, y (…, b, n + 1)) ↦ (y', y', u), for slices of b."""
+    def _run_loops(
+        self, name: str, step: nn.Module, columns: list[Tensor], start: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """(x, u, ∫ℓ) of N steps (columns at time n, y) ↦ (y', y', u), with columns (N, b, …) and y (…, b, n + 1)."""
 
         def slice_of(rows: Tensor) -> list[Tensor]:
-            return [*(_filled(each, rows, 1, TRAJECTORIES) for each in columns), _filled(start, rows, -2, TRAJECTORIES)]
+            return [
+                *(_padded_rows(each, rows, 1, LOOPS_PER_CALL) for each in columns),
+                _padded_rows(start, rows, -2, LOOPS_PER_CALL),
+            ]
 
-        b, one = start.shape[-2], slice_of(torch.arange(min(TRAJECTORIES, start.shape[-2])))
+        b, one = start.shape[-2], slice_of(torch.arange(min(LOOPS_PER_CALL, start.shape[-2])))
         kernel = self._kernel(name, lambda: _scan_kernel(step, one))
         if kernel is None:
             y, u = Scan(lambda: (), step, 0).loop(*columns, start)
         else:
             state = state_of(step)
-            parts = in_threads(lambda rows: kernel(*state, *slice_of(rows)), torch.arange(b).split(TRAJECTORIES))
+            parts = in_threads(lambda rows: kernel(*state, *slice_of(rows)), torch.arange(b).split(LOOPS_PER_CALL))
             y, u = (torch.cat(parts, -2)[..., :b, :] for parts in zip(*parts, strict=True))
         return torch.cat([start[None, ..., :-1], y[..., :-1]]), u, y[-1, ..., -1]
 
-    def _in_slices(self, name: str, module: "_OfProblem", *columns: Tensor) -> list[Tensor]:
-        """The results of a function of the rows of some columns, for all rows."""
+    def _in_slices(self, name: str, module: "_FunctionOfProblem", *columns: Tensor) -> list[Tensor]:
+        """Apply a function of rows to all rows of some columns, in slices."""
         slices = [
-            [_filled(column, rows, 0, ROWS) for column in columns] for rows in torch.arange(len(columns[0])).split(ROWS)
+            [_padded_rows(column, rows, 0, ROWS_PER_CALL) for column in columns]
+            for rows in torch.arange(len(columns[0])).split(ROWS_PER_CALL)
         ]
         state = state_of(module)
         examples = [*state, *slices[0]]
@@ -123,8 +129,8 @@ class StepPrograms(StepDerivatives):
             known[key] = kernel_or_none(write)
         return known[key]
 
-    def _written_for(self) -> tuple[Any, ...]:
-        """What programs are for: problems with the same findings may differ in their steps and controls."""
+    def _cache_key(self) -> tuple[Any, ...]:
+        """The key of the programs: problems with the same findings may differ in horizon and controls."""
         controls, m = self.problem.controls, self.problem.system.m
         sizes = torch.tensor([0.1, 1.0, 10.0, 1e4], dtype=torch.float64)
         tried = sizes[:, None, None] * torch.randn(4, 4, m, generator=torch.Generator().manual_seed(0)).double()
@@ -134,7 +140,7 @@ class StepPrograms(StepDerivatives):
 
 
 class _SearchStep(nn.Module):
-    """(x̄, ū, k, K, y) ↦ (y', y', u), y = (x, ∫ℓ): one step under u = ū + αk + K(x − x̄), kept to U."""
+    """(x̄, ū, k, K, y) ↦ (y', y', u), y = (x, ∫ℓ): one step under u = ū + αk + K(x − x̄), projected onto U."""
 
     def __init__(self, problem: Problem, step_sizes: Sequence[float]):
         super().__init__()
@@ -145,11 +151,11 @@ class _SearchStep(nn.Module):
     def forward(self, along: Tensor, u: Tensor, k: Tensor, K: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Control]:
         x = y[..., :-1]
         u = self.problem.controls.project(u + self.alpha * k + apply(K, x - along))
-        return _moved(self.problem, y, u)
+        return _advance(self.problem, y, u)
 
 
 class _FollowStep(nn.Module):
-    """(x̄', p', H', y) ↦ (y', y', u), y = (x, ∫ℓ): one step under the held control for V' of an expansion."""
+    """(x̄', p', H', y) ↦ (y', y', u), y = (x, ∫ℓ): one step under the held control for V' from an expansion."""
 
     def __init__(self, problem: Problem):
         super().__init__()
@@ -160,11 +166,11 @@ class _FollowStep(nn.Module):
         x = y[..., :-1]
         free = self.problem.response(x)
         u = held_control(self.problem, free, p + apply(H, free.x - center), H)
-        return _moved(self.problem, y, u)
+        return _advance(self.problem, y, u)
 
 
-class _OfProblem(nn.Module):
-    """A function of tensors, made of a problem."""
+class _FunctionOfProblem(nn.Module):
+    """A function of tensors that depends on a problem."""
 
     def __init__(self, problem: Problem, function: Callable[..., Any]):
         super().__init__()
@@ -175,15 +181,15 @@ class _OfProblem(nn.Module):
         return (result,) if isinstance(result, Tensor) else tuple(result)
 
 
-def _moved(problem: Problem, y: Tensor, u: Control) -> tuple[Tensor, Tensor, Control]:
-    """(y', y', u): y = (x, ∫ℓ) after one step, to be carried on and to be kept."""
+def _advance(problem: Problem, y: Tensor, u: Control) -> tuple[Tensor, Tensor, Control]:
+    """(y', y', u) with y' = (x, ∫ℓ) after one step, as the carried state and as the output of a scan."""
     following, paid = problem.step(y[..., :-1], u)
     y = torch.cat([following, y[..., -1:] + paid[..., None]], -1)
     return y, y, u
 
 
 def _scan_kernel(step: nn.Module, arguments: list[Tensor]) -> ScanKernel:
-    """The steps of one slice as a program."""
+    """Compile the steps of one slice."""
     *columns, y = arguments
     state, moving = state_of(step), len(columns)
     middle = [column[len(column) // 2] for column in columns]
@@ -192,11 +198,11 @@ def _scan_kernel(step: nn.Module, arguments: list[Tensor]) -> ScanKernel:
     return ScanKernel(prepare, repeated, [*state, *arguments], moving)
 
 
-def _without_cost(x: State) -> Tensor:
+def _append_zero_cost(x: State) -> Tensor:
     """(x, 0)."""
     return torch.cat([x, torch.zeros_like(x[..., :1])], -1)
 
 
-def _filled(column: Tensor, rows: Tensor, axis: int, count: int) -> Tensor:
-    """Some rows along an axis, the last of them repeated until they are as many as a program takes."""
+def _padded_rows(column: Tensor, rows: Tensor, axis: int, count: int) -> Tensor:
+    """Some rows along an axis, with the last one repeated up to the batch size of a program."""
     return column.index_select(axis, torch.cat([rows, rows[-1:].expand(count - len(rows))]))

@@ -1,4 +1,4 @@
-"""Networks for V(t, x); a new one is a ValueFunction that takes `scaling` and options, and one line here.
+"""Networks for V(t, x). A new one is a ValueFunction with arguments `scaling` and options, and one line in NETWORKS.
 
 The options are the fields of the config's network section that the constructor names.
 """

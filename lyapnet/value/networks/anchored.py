@@ -1,4 +1,4 @@
-"""Guarantees by construction: V tied to the terminal cost at t = T, and to zero at the goal."""
+"""Networks with guarantees by construction: V(T, x) = φ(x), and V = 0 at the goal."""
 
 from collections.abc import Sequence
 
@@ -16,11 +16,11 @@ from lyapnet.value.networks.icnn import PartiallyConvexNetwork
 class TerminalAnchor(ValueFunction):
     """V(t, x) = φ(x) + (1 − t/T) N(t, x), so that V(T, x) = φ(x) for any network N.
 
-    Where N is convex in x, so is V; where N(t, 0) = 0, so is V(t, 0). With N ≥ 0, as an AnchoredNetwork is, V ≥ φ at
-    every t: an upper bound of the cost-to-go still fits, the cost-to-go itself need not.
+    If N is convex in x, so is V; if N(t, 0) = 0, then V(t, 0) = 0. If N ≥ 0, as for an AnchoredNetwork, V ≥ φ at every
+    t: such a V can represent upper bounds of the cost-to-go, but not every cost-to-go.
 
     Raises:
-        ValueError: N has an expansion of its own, which ends in φ.
+        ValueError: N is an ExpansionNetwork, which equals φ at T already.
     """
 
     def __init__(self, network: ValueFunction, cost: Cost, duration: float):
@@ -42,8 +42,8 @@ class TerminalAnchor(ValueFunction):
 class GoalAnchor(ValueFunction):
     """V(t, x) = N(t, x) − N(t, 0) − N_x(t, 0)ᵀx + ε‖x‖²: the Bregman divergence of N from the goal, plus ε‖x‖².
 
-    For N convex in x: V is convex in x, V ≥ ε‖x‖², V(t, 0) = 0 and V_x(t, 0) = 0 at every t. This closes the
-    hole through which c(t) + ε‖x‖², with c falling fast, satisfies the Lyapunov condition without control.
+    For N convex in x: V is convex in x, V ≥ ε‖x‖², V(t, 0) = 0 and V_x(t, 0) = 0 at every t. This excludes the trivial
+    solution c(t) + ε‖x‖² with fast decreasing c, which satisfies the Lyapunov condition without control.
 
     Args:
         network: N, convex in x.
@@ -65,7 +65,7 @@ class GoalAnchor(ValueFunction):
         """V and V_x = N_x(t, x) − N_x(t, 0) + 2εx."""
         joined = _join_goal(t, x)
         both = self.network.value_and_state_gradient(t, joined)
-        (value, value_at_goal), (slope, slope_at_goal) = (_part_goal(y, t, x) for y in both)
+        (value, value_at_goal), (slope, slope_at_goal) = (_split_goal(y, t, x) for y in both)
         value = self._divergence(value, value_at_goal, slope_at_goal, x)
         return value, slope - slope_at_goal + 2 * self.epsilon * x
 
@@ -74,7 +74,7 @@ class AnchoredNetwork(GoalAnchor):
     """A partially convex network inside a GoalAnchor: a Lyapunov candidate for any weights.
 
     Args:
-        scaling, hidden, activation: of the PartiallyConvexNetwork.
+        scaling, hidden, activation: arguments of the PartiallyConvexNetwork.
         epsilon: ε > 0, in cost per squared state unit.
     """
 
@@ -89,14 +89,14 @@ class AnchoredNetwork(GoalAnchor):
 
 
 def _join_goal(t: Time, x: State) -> Tensor:
-    """The states and the goal, for a network to meet in one call: a small one costs per call, not per state."""
+    """Append the goal to the states for one common call: the time of a small network is mostly per call."""
     if _is_row(t, x):
         return torch.cat([x, x.new_zeros(*x.shape[:-2], 1, x.shape[-1])], -2)
     return torch.stack([x, torch.zeros_like(x)])
 
 
-def _part_goal(joined: Tensor, t: Time, x: State) -> tuple[Tensor, Tensor]:
-    """What a function of the joined states gives at the states, and at the goal."""
+def _split_goal(joined: Tensor, t: Time, x: State) -> tuple[Tensor, Tensor]:
+    """Split the result of a function of the joined states into those at the states and at the goal."""
     if not _is_row(t, x):
         return joined[0], joined[1]
     row = x.ndim - 2
@@ -104,5 +104,5 @@ def _part_goal(joined: Tensor, t: Time, x: State) -> tuple[Tensor, Tensor]:
 
 
 def _is_row(t: Time, x: State) -> bool:
-    """Whether a row of states shares one time: the goal then joins the row."""
+    """Whether all states of a row share one time, so that the goal can be appended to the row."""
     return x.ndim > 1 and (t.ndim == 0 or t.shape[-1] == 1)

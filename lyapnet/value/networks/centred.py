@@ -1,4 +1,4 @@
-"""V as a function of how far the goal is."""
+"""V as a function of the distance x − x* from the goal."""
 
 import torch
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from lyapnet.value.calculus import ValueFunction
 
 
 class CentredNetwork(ValueFunction):
-    """V(t, x) = N(t, x − x*): what a network guarantees or resolves about the origin, about a goal that is elsewhere.
+    """V(t, x) = N(t, x − x*): moves a network's guarantees and resolution from the origin to another goal.
 
     Args:
         network: N.
-        goal: x*, of the states that N has.
+        goal: x*, in the states of N.
     """
 
     goal: Float[Tensor, " n"]

@@ -1,4 +1,4 @@
-"""A network on top of what is known of V before training: its expansion to second order around a trajectory."""
+"""A network added to an expansion of V to second order around a trajectory, known before training."""
 
 from collections.abc import Sequence
 
@@ -15,49 +15,48 @@ from lyapnet.value.networks.base import Scaling
 from lyapnet.value.networks.fcn import FCN
 from lyapnet.value.networks.near_borders import NearBorders
 
-FEW = 4  # states for which a narrower network is enough
-SINGULAR = 1e-6  # of the greatest curvature, below which there is no valley to follow
-ROUGHLY = 1e-6  # of a state's magnitude, below which it does not spread
-ROUNDING = 1e-12  # of s: V at a goal that is an equilibrium but for rounding
-NODES = 65  # of the piecewise linear curves in time; an expansion with more of them keeps those that matter
+NARROW_STATES = 4  # largest number of states for which narrow layers are sufficient
+SINGULAR_SHARE = 1e-6  # curvature relative to the largest, below which a direction counts as flat
+MIN_SPREAD = 1e-6  # spread relative to a state's magnitude, below which it counts as zero
+ROUNDING = 1e-12  # V at the goal relative to s, below which it counts as zero
+NODES = 65  # nodes of the piecewise linear curves in time; expansions with more nodes are thinned out
 
 
 def standard_widths(n: int) -> list[int]:
     """The widths of the hidden layers for n states."""
-    return [64 if n <= FEW else 128] * 2
+    return [64 if n <= NARROW_STATES else 128] * 2
 
 
 class ExpansionNetwork(ValueFunction):
-    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s ρ(ξ) N(t, ξ), ξ = Cᵀδ, δ = x − x̄(t); N is zero until it is trained.
+    """V(t, x) = c(t) + p(t)ᵀδ + ½ δᵀH(t)δ + s ρ(ξ) N(t, ξ), ξ = Cᵀδ, δ = x − x̄(t); N is zero before training.
 
-    Where c = 0, around a goal that is an equilibrium, ρ = ‖ξ‖²/(1 + ‖ξ‖²), so that V and V_x stay zero there, and what
-    costs little has a V that is off by little; elsewhere ρ = 1. C are the coordinates in which the expansion curves
-    equally in every direction: H ≈ 2s CCᵀ. A correction that is small in V is then small in u = −½R⁻¹gᵀV_x too; in
-    units of X₀ it can be huge along a direction in which V is flat and g is large. Without an expansion, V = s N and
-    C = diag(1/scale), or, once optima are known, diag(1/spread) about a centre x̄.
-
-    Constant states p, the parameters of a family, are told apart from the others, y: ξ is (Cᵀ(δy + Sδp), δp / spread),
-    S = H_yy⁻¹H_yp, so that V's valley lies along ξ_y = 0, and p counts for N even where V is flat in it; ρ is that of
-    ξ_y.
-
-    Where f, g, q or φ end at borders of some states, the logarithms of distances from these are further inputs of N.
-
-    Where the expansion is φ at T, N is multiplied by 1 − t/T: V(T, ·) = φ for any weights, and close to T, where hardly
-    anything is left to pay and to learn from, V is what the Riccati equation or the optimum says.
+    * ρ: if c = 0, around a goal that is an equilibrium, ρ = ‖ξ‖²/(1 + ‖ξ‖²), so that V and V_x remain zero there and
+      errors of V are small near the goal. Otherwise ρ = 1.
+    * C: in the coordinates ξ the expansion has equal curvature in all directions, H ≈ 2s CCᵀ. A small correction of V
+      then changes u = −½R⁻¹gᵀV_x only a little. In units of X₀ this change can be huge, along a direction in which V is
+      flat and g is large. Without an expansion V = s N and C = diag(1/scale), or diag(1/spread) about a centre x̄ once
+      optima are known.
+    * Constant states p, the parameters of a family, are separate from the other states y: ξ is
+      (Cᵀ(δy + Sδp), δp / spread) with S = H_yy⁻¹H_yp, so that V's valley is ξ_y = 0, and N depends on p even where the
+      expansion is flat in it. ρ depends on ξ_y only.
+    * If f, g, q or φ are undefined beyond borders of some states, the logarithms of the distances to these borders are
+      further inputs of N.
+    * If the expansion equals φ at T, N is multiplied by 1 − t/T. Then V(T, ·) = φ for any weights, and V is close to
+      the expansion near T, where the remaining cost is too small to learn from.
 
     Args:
-        scaling: of the task, for what starts without an expansion.
-        hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
-        constants: indices of the states that stay what they are.
-        borders: of the domain, with the indices of their states.
-        smooth: whether c, p, x̄ and H are smooth in time, as a sound certificate wants them, or piecewise linear.
+        scaling: magnitudes of the task, for a network without expansion.
+        hidden, activation: layers of the FCN N; None: two layers of 64, or of 128 for five states and more.
+        constants: indices of the constant states.
+        borders: borders of the domain, with the indices of their states.
+        smooth: whether c, p, x̄ and H are smooth in time, as sound certificates require, or piecewise linear.
     """
 
     scale: Float[Tensor, ""]  # s, in units of cost
     coordinates: Float[Tensor, "n n"]  # C
     at_goal: Float[Tensor, ""]  # 1 or 0: ρ = 1 − at_goal / (1 + ‖ξ‖²)
     moves: Float[Tensor, " n"]  # 0 for a constant state, 1 for any other
-    ends: Float[Tensor, ""]  # 1 where the expansion is φ at T, else 0
+    ends: Float[Tensor, ""]  # 1 if the expansion is φ at T, else 0
 
     def __init__(
         self,
@@ -110,11 +109,11 @@ class ExpansionNetwork(ValueFunction):
         return value, p + curved + self.scale * rest_x
 
     def _inputs(self, x: State, xi: State) -> Tensor:
-        """ξ, and the logarithms."""
+        """The inputs of N: ξ, and the logarithms of distances to borders."""
         return xi if self.near_borders is None else torch.cat([xi, self.near_borders(x)], -1)
 
     def _fading(self, t: Time, rho: PerState) -> PerState:
-        """ρ, or its slope, of which nothing is left at T where the expansion is φ there."""
+        """ρ or its slope, times 1 − t/T if the expansion is φ at T."""
         return rho * (1 - self.ends * t / self.duration)
 
     def _near(self, xi: State) -> PerState:
@@ -135,9 +134,9 @@ class ExpansionNetwork(ValueFunction):
         H = parts[..., 1 + 2 * n : 1 + 2 * n + n * n].unflatten(-1, (n, n))
         return parts[..., 0], parts[..., 1 : 1 + n], H, x - parts[..., 1 + n : 1 + 2 * n]
 
-    def _take_curves(self, t: Tensor, parts: Tensor, exact_end: bool = False) -> None:
-        """Curves through the nodes; with H symmetric to the last bit, as V_x wants it, where they are fitted."""
-        self.expansion.take(t, parts)
+    def _fit_curves(self, t: Tensor, parts: Tensor, exact_end: bool = False) -> None:
+        """Fit the curves to the nodes; H is made exactly symmetric, as the formula of V_x assumes."""
+        self.expansion.fit(t, parts)
         self.ends.fill_(float(exact_end))
         if isinstance(self.expansion, SmoothCurve):
             for fitted in (self.expansion.end, self.expansion.weights):
@@ -145,28 +144,26 @@ class ExpansionNetwork(ValueFunction):
                 H.copy_((H + H.mT) / 2)
 
     @torch.no_grad()
-    def take_nothing(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
-        """Start a new network from V = 0, with what is known of its size: N is in units of a spread around a centre.
-
-        V is not held at zero at a goal then.
+    def start_from_zero(self, t: Tensor, centre: Tensor, curvature: Tensor, spread: Tensor, value: float) -> None:
+        """Initialise at V = 0, with the inputs of N scaled by a spread around a centre; training may change V(x*).
 
         Args:
             t: the nodes (K,).
             centre: x̄ (n,), the same at all times.
-            curvature: what stands for V_xx in control laws, (K, n, n), symmetric positive semidefinite.
-            spread: of each state, (n,).
+            curvature: model of V_xx for control laws, (K, n, n), symmetric positive semidefinite.
+            spread: spread of each state, (n,).
             value: s.
         """
         none = torch.zeros(len(t), 1 + self.n).to(centre)
         parts = [none, centre.expand(len(t), -1), torch.zeros_like(curvature).flatten(1), curvature.flatten(1)]
-        self._take_curves(t, torch.cat(parts, 1))
+        self._fit_curves(t, torch.cat(parts, 1))
         self.at_goal.fill_(0)
         self.scale.fill_(value)
         magnitude = 1 / self.coordinates.diagonal()
-        self.coordinates.copy_(torch.diag(1 / spread.where(spread > ROUGHLY * magnitude, magnitude)))
+        self.coordinates.copy_(torch.diag(1 / spread.where(spread > MIN_SPREAD * magnitude, magnitude)))
 
     @torch.no_grad()
-    def take(
+    def start_from_expansion(
         self,
         t: Tensor,
         x: Tensor,
@@ -177,25 +174,25 @@ class ExpansionNetwork(ValueFunction):
         spread: Tensor,
         exact_end: bool = False,
     ) -> None:
-        """Start from an expansion at the nodes t (K,), whose parts are (K, …), for deviations δ of some spread.
+        """Initialise from an expansion at the nodes t (K,), with parts (K, …).
 
         Args:
-            exact_end: whether it is φ at the last node, at any x.
-            curvature: what stands for H in control laws, (K, n, n), symmetric positive semidefinite.
-            spread: deviations δ from x̄(0), (k, n): their mean ½ δᵀHδ is s, times the number of states.
+            exact_end: whether the expansion is φ at the last node, for any x.
+            curvature: model of H for control laws, (K, n, n), symmetric positive semidefinite.
+            spread: sample of deviations δ from x̄(0), (k, n); s is their mean ½ δᵀHδ divided by the number of states.
         """
         parts = [value[:, None], gradient, x, hessian.flatten(1), curvature.flatten(1)]
-        self._take_curves(t, torch.cat(parts, 1), exact_end)
+        self._fit_curves(t, torch.cat(parts, 1), exact_end)
         y, p = [i for i in range(self.n) if i not in self.constants], self.constants
         early = slice(max(1, 3 * len(curvature) // 4))
         values, vectors = torch.linalg.eigh(curvature[early][:, y][..., y].mean(0) / 2)
         values = values.clamp_min(1e-9 * float(curvature.diagonal(dim1=1, dim2=2).max()))
-        inverse = (vectors * values.reciprocal().where(values > SINGULAR * values.max(), 0)) @ vectors.mT
+        inverse = (vectors * values.reciprocal().where(values > SINGULAR_SHARE * values.max(), 0)) @ vectors.mT
         S = inverse @ hessian[early][:, y][..., p].mean(0) / 2
         along = apply(vectors.mT, spread[:, y] + spread[:, p] @ S.mT)
         s = (along**2 * values).sum(-1).mean() / len(y)
         self.at_goal.fill_(float(value.abs().max() <= ROUNDING * s))
-        s = s.clamp_min(1e-6 * float(value.abs().max()))  # no spread: X₀ is a point
+        s = s.clamp_min(1e-6 * float(value.abs().max()))  # for X₀ of a single point
         if s > 0:
             self.scale.copy_(s)
             C, reach = vectors * (values / s).sqrt(), spread[:, p].abs().amax(0)

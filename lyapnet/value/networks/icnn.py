@@ -1,6 +1,6 @@
 """Input-convex networks: jointly in (t, x) as in the paper, and in x alone.
 
-Source of both constructions: Amos, Xu, Kolter, "Input convex neural networks", ICML 2017.
+Source of both: Amos, Xu, Kolter, "Input convex neural networks", ICML 2017.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class NonNegativeLinear(nn.Module):
 
     @property
     def weight(self) -> Tensor:
-        """The effective weights, all positive; of mean order 1/fan_in, so that depth does not inflate the output."""
+        """The positive weights; scaled by 1/fan_in, so that depth does not enlarge the output."""
         return nn.functional.softplus(self.raw_weight) / self.raw_weight.shape[1]
 
     def forward(self, z: Tensor) -> Tensor:
@@ -35,7 +35,7 @@ class ICNN(ValueFunction):
     """V(t, x) = s · N(τ, ξ) + ε‖x‖², with N convex in (t, x) jointly: the paper's Lyapunov network.
 
     z₁ = σ(A₁y + b₁), z_k = σ(W_k z_{k−1} + A_k y + b_k), N = W z_K + Ay + b with y = (τ, ξ), W ≥ 0 and σ convex
-    and nondecreasing. V(t, 0) is not zero: the anchored network is the one that guarantees it.
+    and nondecreasing. V(t, 0) need not be zero, unlike that of the anchored network.
 
     Args:
         scaling: magnitudes of the inputs and of V.
@@ -99,7 +99,7 @@ class PartiallyConvexNetwork(ValueFunction):
 
     Args:
         scaling: magnitudes of the inputs and of V.
-        hidden: widths of the convex layers; the time features h have the first one.
+        hidden: widths of the convex layers; h has the width of the first.
         activation: a convex, nondecreasing key of ACTIVATIONS.
     """
 

@@ -1,4 +1,4 @@
-"""V that does not depend on some of the states."""
+"""A V that does not depend on some of the states."""
 
 from collections.abc import Sequence
 
@@ -12,13 +12,13 @@ from lyapnet.value.networks.with_penalty import learned_part
 
 
 class IgnoringStates(ValueFunction):
-    """V(t, x) = N(t, x_kept): the same whatever the other states are.
+    """V(t, x) = N(t, x_kept), independent of the other states.
 
-    Where neither dynamics nor cost depends on them either, so does the cost-to-go, and nothing is lost.
+    The cost-to-go has this form if neither dynamics nor cost depend on the other states.
 
     Args:
-        network: N, of the kept states.
-        kept: their indices, in increasing order.
+        network: N, a function of the kept states.
+        kept: indices of the kept states, in increasing order.
         n: the number of states.
     """
 
@@ -33,7 +33,7 @@ class IgnoringStates(ValueFunction):
         return self.network(t, x[..., self.kept])
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
-        """V, and V_x with zeros for the states that are ignored."""
+        """V, and V_x with zeros for the ignored states."""
         value, gradient = self.network.value_and_state_gradient(t, x[..., self.kept])
         return value, torch.zeros_like(x).index_add(-1, self.kept, gradient)
 
@@ -46,6 +46,6 @@ class IgnoringStates(ValueFunction):
 
 
 def kept_states(V: ValueFunction, n: int) -> list[int]:
-    """The indices of the states, of n, on which a V depends."""
+    """The indices of the states on which V depends, out of n."""
     V = learned_part(V)
     return V.kept.tolist() if isinstance(V, IgnoringStates) else list(range(n))

@@ -1,4 +1,4 @@
-"""Inputs of a network that tell how close states are to the borders of their domain."""
+"""Network inputs for the distance of states to the borders of their domain."""
 
 from collections.abc import Sequence
 
@@ -9,18 +9,18 @@ from torch import Tensor, nn
 from lyapnet.base.types import State
 from lyapnet.task.domain import Border
 
-ROOM = 1e-9  # of the spread of a state, up to which it is told apart from its border
-SPREAD = 0.35  # of how far something spreads along optima, which counts as 1 for an input of a network
+MIN_DISTANCE = 1e-9  # smallest resolved distance to a border, relative to the largest distance
+SPREAD = 0.35  # share of a quantity's standard deviation along optima that a network input counts as 1
 
 
 class NearBorders(nn.Module):
     """λ = (log d − m)/s for the distances d = ±(x_i − b) of some states from borders b: (*batch, n) ↦ (*batch, k).
 
-    A volume that falls from 10⁴ to 10⁻² beside its border 0 is close to 0 all the time in units of X₀; V often depends
-    on its order of magnitude. m and s come from states where the task leads.
+    V often depends on the order of magnitude of a distance. For example, a volume that falls from 10⁴ to 10⁻² towards
+    its border 0 would be almost 0 in units of X₀. m and s come from states on trajectories of the task.
 
     Args:
-        borders: with their states as indices.
+        borders: borders with the indices of their states.
     """
 
     states: Int[Tensor, " k"]
@@ -36,24 +36,24 @@ class NearBorders(nn.Module):
         self.register_buffer("states", torch.tensor([i for i, _ in borders], dtype=torch.long), persistent=False)
         self.register_buffer("borders", torch.tensor([border.value for _, border in borders]), persistent=False)
         self.register_buffer("sides", torch.tensor(sides), persistent=False)
-        for name, value in (("least", ROOM), ("mean", 0.0), ("spread", 1.0)):
+        for name, value in (("least", MIN_DISTANCE), ("mean", 0.0), ("spread", 1.0)):
             self.register_buffer(name, torch.full((len(borders),), value))
 
     def forward(self, x: State) -> Float[Tensor, "*batch k"]:
         return (self._distances(x).log() - self.mean) / self.spread
 
     def pull_back(self, x: State, gradient: Float[Tensor, "*batch k"]) -> State:
-        """A gradient in λ as one in x; none beyond the borders."""
+        """Convert a gradient in λ to one in x; zero beyond the borders."""
         distances = self._distances(x)
         slope = self.sides * gradient / (self.spread * distances)
         return torch.zeros_like(x).index_add(-1, self.states, slope.where(distances > self.least, 0))
 
     @torch.no_grad()
-    def take(self, x: State) -> None:
-        """Measure m and s on states (b, n) where the task leads."""
+    def fit(self, x: State) -> None:
+        """Set m and s from states (b, n) on trajectories of the task."""
         distances = (self.sides * (x.to(self.mean)[:, self.states] - self.borders)).clamp_min(0)
         size = distances.amax(0)
-        self.least.copy_(ROOM * size.where(size > 0, 1))
+        self.least.copy_(MIN_DISTANCE * size.where(size > 0, 1))
         logarithms = distances.maximum(self.least).log()
         self.mean.copy_(logarithms.mean(0))
         deviation = SPREAD * logarithms.std(0, correction=0)

@@ -1,4 +1,4 @@
-"""V as a quadratic form of the state whose matrix moves with time."""
+"""V as a quadratic form of the state with a time-varying matrix."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -41,12 +41,12 @@ class QuadraticForm(ValueFunction):
         n, widths = self.inputs.features, [1, *hidden]
         self.hidden = cast(Sequence[nn.Linear], nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths)))
         self.output = nn.Linear(widths[-1], n * n)
-        with torch.no_grad():  # V = s‖ξ‖²/n at first, but for small random parts
+        with torch.no_grad():  # initially V = s‖ξ‖²/n, up to small random terms
             self.output.weight.div_(n)
             self.output.bias.copy_(torch.eye(n).flatten() / n**0.5)
 
     def _factor(self, t: Time) -> Tensor:
-        """L, (*t's shape, n, n)."""
+        """L, (*shape of t, n, n)."""
         z, n = self.inputs.time(t), self.inputs.features
         for layer in self.hidden:
             z = self.activation.function(layer(z))
@@ -64,7 +64,7 @@ class QuadraticForm(ValueFunction):
 
 
 def _apply(A: Tensor, v: Tensor) -> Tensor:
-    """Av; one product for all states that share a time."""
+    """Av, as a single product if all states share one time."""
     if A.ndim > 2 and A.shape[-3] == 1 and v.ndim > 1:
         return v @ A.squeeze(-3).mT
     return apply(A, v)

@@ -1,4 +1,4 @@
-"""V(x) without time, of a regulator that never ends: right at the goal by construction, positive everywhere else."""
+"""V(x) without time, for infinite-horizon regulation: exact at the goal by construction, positive elsewhere."""
 
 from collections.abc import Sequence
 
@@ -16,16 +16,16 @@ from lyapnet.value.networks.fcn import FCN
 class StationaryNetwork(ValueFunction):
     """V(x) = s h(w) e^{ρ(w) N(η)} with w = ‖ξ‖², ξ = Cᵀ(x − x*), h(w) = 2(√(1 + w) − 1) and ρ = w/(1 + w).
 
-    C and s are such that s w = ½ δᵀHδ is the value of the regulator linearised at the goal. So V(x*) = 0, V > 0
-    elsewhere, and V_xx(x*) = H for any weights: around the goal V is a Lyapunov function, and u is the regulator's. Far
-    away s h grows as a norm, which e^N bends to whatever V is; what it misses of V is relative. s is where the
-    regulator ceases to be right, and may lie far below what V is on X₀; so that N sees both, its inputs are compressed,
-    η_i = ξ_i / (1 + ξ_i²)^¼, and joined by (sin θ, cos θ) of chosen angles.
+    C and s are such that s w = ½ δᵀHδ is the value of the regulator linearised at the goal. Hence V(x*) = 0, V > 0
+    elsewhere, and V_xx(x*) = H for any weights: around the goal V is a Lyapunov function, and u is the regulator's.
+    Far away s h grows like a norm and e^N corrects it, so that errors of V are relative. s is the value up to
+    which the regulator is accurate; it may be much smaller than V on X₀. To resolve both scales the inputs of N are
+    compressed, η_i = ξ_i / (1 + ξ_i²)^¼; (sin θ, cos θ) of chosen angles are further inputs.
 
     Args:
-        scaling: of the task, for what starts without a regulator.
-        hidden, activation: of N, an FCN; None: two layers of 64, from five states on of 128.
-        embedded_angles: indices of the states whose sine and cosine join the inputs of N.
+        scaling: magnitudes of the task, for a network without regulator.
+        hidden, activation: layers of the FCN N; None: two layers of 64, or of 128 for five states and more.
+        embedded_angles: indices of the states whose sine and cosine are further inputs of N.
     """
 
     goal: Float[Tensor, " n"]
@@ -64,10 +64,12 @@ class StationaryNetwork(ValueFunction):
         along = 2 * (self.scale / root + known * N / root**4)[..., None] * xi
         xi_2 = 1 + xi**2
         along = along + (known * share)[..., None] * slope[..., : self.n] * (1 + xi_2) / (2 * xi_2 * xi_2.sqrt().sqrt())
-        return known * bend, bend[..., None] * (along @ self.coordinates.mT + self._turning(x, known * share, slope))
+        return known * bend, bend[..., None] * (
+            along @ self.coordinates.mT + self._angle_gradient(x, known * share, slope)
+        )
 
     def curvature(self, t: Time) -> Tensor:
-        """H = 2s CCᵀ, that of the regulator."""
+        """H = 2s CCᵀ, the curvature of the regulator's value."""
         return 2 * self.scale * (self.coordinates @ self.coordinates.mT).expand(*t.shape, -1, -1)
 
     def _around(self, x: State) -> tuple[State, PerState, PerState]:
@@ -77,19 +79,19 @@ class StationaryNetwork(ValueFunction):
         return xi, torch.sqrt(1 + w), w / (1 + w)
 
     def _regulator(self, xi: State, root: PerState) -> PerState:
-        """s h(w), as 2w/(√(1 + w) + 1), which does not cancel near the goal."""
+        """s h(w), computed as 2sw/(√(1 + w) + 1) to avoid cancellation near the goal."""
         return 2 * self.scale * (xi**2).sum(-1) / (root + 1)
 
     def _inputs(self, x: State, xi: State) -> Tensor:
-        """η, and the sines and cosines."""
+        """The inputs of N: η, and the sines and cosines."""
         eta = xi / (1 + xi**2).sqrt().sqrt()
         if not len(self.angles):
             return eta
         theta = x[..., self.angles]
         return torch.cat([eta, torch.sin(theta), torch.cos(theta)], -1)
 
-    def _turning(self, x: State, weight: PerState, slope: Tensor) -> State | float:
-        """What the sines and cosines have in V_x."""
+    def _angle_gradient(self, x: State, weight: PerState, slope: Tensor) -> State | float:
+        """The contribution of the sines and cosines to V_x."""
         if not len(self.angles):
             return 0.0
         theta, (sine, cosine) = x[..., self.angles], slope[..., self.n :].chunk(2, -1)
@@ -97,11 +99,12 @@ class StationaryNetwork(ValueFunction):
         return torch.zeros_like(x).index_add(-1, self.angles, turning)
 
     @torch.no_grad()
-    def take(self, goal: State, hessian: Tensor, scale: float) -> None:
-        """Start from the value ½ δᵀHδ of the regulator at the goal, taken for right up to about a scale s.
+    def start_from_regulator(self, goal: State, hessian: Tensor, scale: float) -> None:
+        """Initialise from the regulator's value ½ δᵀHδ at the goal.
 
         Args:
             hessian: H (n, n), symmetric positive semidefinite.
+            scale: s, the value up to which the regulator is used.
         """
         values, vectors = torch.linalg.eigh(hessian / 2)
         values = values.clamp_min(1e-9 * float(values.max()))
@@ -111,7 +114,7 @@ class StationaryNetwork(ValueFunction):
 
 
 class Timeless(ValueFunction):
-    """V(t, x) = N(0, x): of any network, a stationary V.
+    """V(t, x) = N(0, x), a stationary V from any network.
 
     Args:
         network: N.

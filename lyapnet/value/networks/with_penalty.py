@@ -1,4 +1,4 @@
-"""V where closed loops pay for coming close to what constraints exclude."""
+"""V with the constraint penalty of one step."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,10 +14,10 @@ from lyapnet.value.calculus import ValueFunction, gradients
 
 
 class WithPenalty(ValueFunction):
-    """V(t, x) = N(t, x) + Δt w Σ_j max(0, 1 + h_j(x)/m_j)³: what the state pays in one step, as `PenaltyCost` has it.
+    """V(t, x) = N(t, x) + Δt w Σ_j max(0, 1 + h_j(x)/m_j)³, with the penalty of `PenaltyCost` for one step.
 
-    It is steep and known. What is left for a network is what is paid from the next state on, which a law that looks
-    ahead keeps off the constraints, where one step is enough for that: it is smooth there.
+    This penalty is steep but known. The network learns the rest, the cost from the next state on. It is smooth wherever
+    the lookahead law can avoid the constraints within one step.
 
     Args:
         network: N.
@@ -36,9 +36,9 @@ class WithPenalty(ValueFunction):
         super().__init__()
         self.network, self.step = network, step
         self.register_buffer("margin", torch.tensor(margin, dtype=torch.float64), persistent=False)
-        self._constraints = [constraints]  # the task's own, of which V has no part
+        self._constraints = [constraints]  # in a list, so that the task's constraints are no submodule of V
         self.register_buffer("weight", torch.tensor(0.0))
-        self.register_load_state_dict_pre_hook(_named_as_network)
+        self.register_load_state_dict_pre_hook(_rename_to_network)
 
     def forward(self, t: Time, x: State) -> PerState:
         return self.network(t, x) + self._penalty(t, x)
@@ -56,12 +56,12 @@ class WithPenalty(ValueFunction):
 
 
 def learned_part(V: ValueFunction) -> ValueFunction:
-    """V without the penalty of one step, where it has one."""
+    """V without the penalty of one step, if it has one."""
     return V.network if isinstance(V, WithPenalty) else V
 
 
-def _named_as_network(module: WithPenalty, state: dict[str, Any], prefix: str, *others: Any) -> None:
-    """Take the weights of a V without penalty, as of a task without constraints, for those of N."""
+def _rename_to_network(module: WithPenalty, state: dict[str, Any], prefix: str, *others: Any) -> None:
+    """Rename the weights of a V without penalty, from a task without constraints, to those of N."""
     if f"{prefix}weight" not in state:
         for name in [name for name in state if name.startswith(prefix)]:
             state[f"{prefix}network.{name.removeprefix(prefix)}"] = state.pop(name)

@@ -83,9 +83,9 @@ class Block(lyapnet.ControlAffineSystem):
 
 
 def test_training_begins_with_a_note(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 12)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 130, 70)
-    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF", 10)
+    monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
     config = {
         "experiment": "block", "logs": str(tmp_path), "loggers": ["csv"], "rollout": {"compile": "off"},
         "system": {"name": f"{__name__}:Block"}, "cost": {"Q": [1, 1], "R": 1, "Q_T": [1, 1]},

@@ -137,7 +137,7 @@ def test_what_does_not_suit_a_region_is_refused(overrides, message):
 
 @pytest.mark.gate
 def test_training_for_it_makes_the_region_larger(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.start.OPTIMA", 24)
+    monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 24)
     shorten_fits(monkeypatch, 200, 100)
     (learner,) = build_module(config_from_plain(OWN | OSCILLATOR, ["pointwise.points=128"])).members
     choose_start([learner])

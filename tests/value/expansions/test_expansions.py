@@ -189,7 +189,7 @@ def test_what_is_not_finite_says_so_and_leaves_the_others_alone():
 
 
 def test_of_guesses_at_one_optimum_the_hopeless_are_left_once_one_has_settled(monkeypatch):
-    monkeypatch.setattr("lyapnet.value.expansions.dynamic_programming.GRACE", 0)
+    monkeypatch.setattr("lyapnet.value.expansions.dynamic_programming.GRACE_ITERATIONS", 0)
     problem = hanging(steps=40)
     x0, best = problem.initial_states.center.expand(3, -1), problem.initial_states.center[None]
     settled = optimal_trajectories(problem, best, still(problem, 1)).path

@@ -15,9 +15,9 @@ def network_of(x, borders=((0, LOWER), (2, UPPER))):
     """One that begins from nothing known, about states x (b, 3)."""
     torch.manual_seed(0)
     V = ExpansionNetwork(Scaling([1.0] * 3, 2.0, 1.0), [16], borders=borders).double()
-    V.take_nothing(TIMES, x.mean(0), torch.zeros(3, 3, 3).double(), x.std(0), 1.0)
+    V.start_from_zero(TIMES, x.mean(0), torch.zeros(3, 3, 3).double(), x.std(0), 1.0)
     if V.near_borders is not None:
-        V.near_borders.take(x)
+        V.near_borders.fit(x)
     return V
 
 

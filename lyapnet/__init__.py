@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from lyapnet.claims.certificates import Certificate
     from lyapnet.claims.certify import certify
     from lyapnet.claims.claim import Claim, Run, option
+    from lyapnet.claims.everywhere import Everywhere
     from lyapnet.claims.kinds import Funnel, LowerBound, Region, Sampled, Statistical, Tube
     from lyapnet.controller.controller import ArrayTrajectory, Controller
     from lyapnet.controller.loading import load
@@ -47,6 +48,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "claims.certificates": ["Certificate"],
     "claims.certify": ["certify"],
     "claims.claim": ["Claim", "Run", "option"],
+    "claims.everywhere": ["Everywhere"],
     "claims.kinds": ["Funnel", "LowerBound", "Region", "Sampled", "Statistical", "Tube"],
     "prover.branch_and_bound": ["Budget"],
     "evaluation.measurement": ["evaluate"],
@@ -85,6 +87,7 @@ __all__ = [
     "ControlSet",
     "Controller",
     "Cost",
+    "Everywhere",
     "Funnel",
     "HJBPolicy",
     "Horizon",

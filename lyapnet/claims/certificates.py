@@ -4,11 +4,13 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 from lyapnet.base.files import plain
 from lyapnet.base.types import State
 from lyapnet.claims import figures
+from lyapnet.claims.report import require_writable, write_outputs
 from lyapnet.claims.tables import rows_of, table_of, text_of
 from lyapnet.controller.controller import Controller
 from lyapnet.prover.verdict import Verdict
@@ -52,6 +54,17 @@ class Certificate(ABC):
     def table(self, title: str) -> Any:
         """Title, kind, verdict and numbers, for a terminal."""
         return table_of(f"{title}\n{self.kind}: {self.verdict}", self.rows)
+
+    def write(self, folder: str | Path, checkpoint: str | Path | None = None) -> list[Path]:
+        """Write report.md, report.json and the figure into a folder; their paths.
+
+        Args:
+            checkpoint: of the controller, whose hash and config the report has; None: it was made from parts.
+        """
+        require_writable(None, Path(folder))
+        given = repr(str(checkpoint)) if checkpoint else "controller"
+        call = f"lyapnet.certify({', '.join([given, *map(repr, self.claims)])}, seed={self.options['seed']})"
+        return list(write_outputs(self, Path(checkpoint) if checkpoint else None, call, None, Path(folder)))
 
     def __str__(self) -> str:
         return text_of(self.table(repr(self.controller)))

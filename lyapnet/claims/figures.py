@@ -242,6 +242,19 @@ def two_sided(
     return figure
 
 
+def margins(t: Tensor, c: Tensor, found: Counterexample | None, headline: str) -> Figure:
+    """c over time at random points (t, x), with 0, which it must not exceed, and where it does."""
+    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    panel = figure.subplots()
+    panel.plot(numpy_of(t), numpy_of(c), ".", color=BLUE, markersize=2, rasterized=True)
+    panel.axhline(0, color=GREY, linewidth=0.8)
+    if found is not None:
+        panel.plot(found.t, found.condition, "x", color=VERMILION)
+    panel.set(xlabel="t (s)", ylabel="c(t, x), at most 0 where the claim holds")
+    panel.set_title(headline, fontsize=8)
+    return figure
+
+
 # Slices
 
 

@@ -24,10 +24,12 @@ class Certificate(ABC):
 
     Args:
         claim: what was found, of the kind.
-        options: all that the claim was made with, as plain data by the names of the command line; `seed` among them.
+        options: as plain data; `seed` among them.
     """
 
     kind: str
+    controller: Controller
+    options: Mapping[str, Any]  # all that the claim was made with, by the names of the command line
     picture: str = "claim.png"  # what a report calls the file of its figure
     labels: ClassVar[Mapping[str, str]]  # key of `result` ↦ what a table calls it, in the table's order
     claim: Any

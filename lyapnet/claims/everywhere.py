@@ -113,7 +113,7 @@ class EverywhereCertificate(Certificate):
 
     def __init__(self, controller: Controller, claim: Margins, options: Mapping[str, Any]):
         super().__init__(controller, claim, options)
-        self.kind = claim.claim.kind
+        self.kind: str = claim.claim.kind
 
     def numbers(self) -> dict[str, Any]:
         proof, D, found = self.claim.proof, self.claim.states, self.claim.proof.counterexample

@@ -21,7 +21,8 @@ from lyapnet.prover.verdict import Verdict, time_spent
 class LowerBoundCertificate(Certificate):
     """What any control costs at least, and how far what is guaranteed of a controller lies above it."""
 
-    kind, picture = "lower", "lower_bound.png"
+    kind: str = "lower"
+    picture: str = "lower_bound.png"
     labels: ClassVar[Mapping[str, str]] = {
         "lower_reason": "why not from below",
         "lower_set": "D from below",

@@ -30,7 +30,8 @@ class RegionCertificate(Certificate):
     disturbance, to a smaller set around the goal, which none leaves. With plants, that is so for each of them.
     """
 
-    kind, picture = "region", "region.png"
+    kind: str = "region"
+    picture: str = "region.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "set": "D",

@@ -15,7 +15,8 @@ from lyapnet.task.constraints import names_of
 class SampledCertificate(Certificate):
     """The share of some states whose closed loop succeeds."""
 
-    kind, picture = "sampled", "states.png"
+    kind: str = "sampled"
+    picture: str = "states.png"
     labels: ClassVar[Mapping[str, str]] = {
         "samples": "states",
         "tolerances": "tolerances",
@@ -89,7 +90,7 @@ class SampledCertificate(Certificate):
 class StatisticalCertificate(SampledCertificate):
     """A share of X₀ that succeeds, with a confidence."""
 
-    kind = "statistical"
+    kind: str = "statistical"
     claim: BoundedShare
     caveat: str | None = None  # why the draw is not on record
 

@@ -21,9 +21,9 @@ from lyapnet.prover.condition import DecreaseCondition
 class SoundCertificate(CostCertificate):
     """A funnel that no closed loop leaves, and its cost."""
 
-    kind = "sound"
-    picture = "funnel.png"
-    picture_of_both = "two_sided.png"
+    kind: str = "sound"
+    picture: str = "funnel.png"
+    picture_of_both: ClassVar[str] = "two_sided.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "alpha": "α",

@@ -21,7 +21,9 @@ from lyapnet.claims.tubes.tube import ProvedTube
 class TubeCertificate(CostCertificate):
     """The tube of all closed loops from X₀, and their cost in it."""
 
-    kind, picture, picture_of_both = "tube", "tube.png", "two_sided_tube.png"
+    kind: str = "tube"
+    picture: str = "tube.png"
+    picture_of_both: ClassVar[str] = "two_sided_tube.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "states_left_out": "states that nothing depends on",

@@ -173,7 +173,8 @@ class Claim(ABC):
     @property
     def options(self) -> dict[str, Any]:
         """Its fields as plain data, by their names on the command line: numbers, texts as they are written there."""
-        return {flag: _plain(getattr(self, f.name)) for flag, f in flags_of(type(self))}
+        given = {flag: (f.name, getattr(self, f.name)) for flag, f in flags_of(type(self))}
+        return {flag: _plain(name, value) for flag, (name, value) in given.items()}
 
 
 def flags_of(claim: type) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
@@ -184,13 +185,13 @@ def flags_of(claim: type) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
             yield flag, f
 
 
-def _plain(value: Any) -> Any:
-    """A number, None, or what the command line takes: "-1:1,-2:2" for a box, ["mass=0.9:1.1"] for a mapping."""
+def _plain(name: str, value: Any) -> Any:
+    """A number, None, or what the command line takes: "-1:1,-2:2" for states, ["mass=0.9:1.1"] for a mapping."""
     if isinstance(value, Mapping):
         return [f"{name}={_written(entry)}" for name, entry in value.items()] or None
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    return ",".join(_written(ends) for ends in zip(*sides_of(value), strict=True))
+    return ",".join(_written(ends) for ends in zip(*sides_of(value), strict=True)) if name == "states" else repr(value)
 
 
 def _written(value: Any) -> str:

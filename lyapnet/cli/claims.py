@@ -12,7 +12,7 @@ from rich.console import Console
 from lyapnet.base.errors import UsageError
 from lyapnet.base.sizes import THREADS
 from lyapnet.claims.claim import option
-from lyapnet.cli.options import Given
+from lyapnet.cli.options import Given, read_pushes
 
 TwoSided = Annotated[bool, typer.Option("--two-sided", help="Bound the optimum from below, too.")]
 Value = Annotated[
@@ -122,8 +122,6 @@ def pushes_of_one_state(named: list[str]) -> tuple[str, list[float]]:
     Raises:
         UsageError: more than one state is pushed, or what is named is no number ≥ 0.
     """
-    from lyapnet.cli.options import read_pushes
-
     if len(named) != 1:
         raise UsageError(
             f"Expected one --disturbance STATE=W,W,… where it has several values, got {len(named)} of them; push one "

@@ -62,6 +62,13 @@ def test_its_set_is_an_option(effort, controller):
     assert lyapnet.certify(controller, inside, budget=30).verdict == "certified"
 
 
+@pytest.mark.gate
+def test_workers_prove_the_same(effort, controller):
+    claim = effort.Effort(limit=1.01 * largest_effort(controller))
+    certificate = lyapnet.certify(controller, claim, budget=lyapnet.Budget(60, workers=2))
+    assert certificate.verdict == "certified"
+
+
 def test_it_is_shown_and_reported_like_any_other(effort, controller, tmp_path):
     certificate = lyapnet.certify(controller, effort.Effort(limit=20), budget=30, keep=tmp_path / "kept.proof")
     assert "effort: certified" in str(certificate)

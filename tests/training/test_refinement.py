@@ -200,8 +200,8 @@ def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
 def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
     controller = lyapnet.load(best(region_run))
     claim = partial(
-        ProvedRegion, 0.01, Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1, contraction=None,
-        slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
+        ProvedRegion, decay=0.01, states=Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1,
+        contraction=None, slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
     )  # fmt: skip
     assert RegionCertificate(controller, claim(rho=1.9999), {"seed": 0}).complete
     assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).complete

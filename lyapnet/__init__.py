@@ -17,10 +17,18 @@ if TYPE_CHECKING:
     from lyapnet.base.errors import LyapnetError
     from lyapnet.base.interpolation import Table
     from lyapnet.base.linear_algebra import norm
+    from lyapnet.claims.certificates import Certificate
+    from lyapnet.claims.certify import certify
+    from lyapnet.claims.claim import Claim, Run, option
+    from lyapnet.claims.everywhere import Everywhere
+    from lyapnet.claims.kinds import Funnel, LowerBound, Region, Sampled, Statistical, Tube
     from lyapnet.controller.controller import ArrayTrajectory, Controller
     from lyapnet.controller.loading import load
+    from lyapnet.evaluation.measurement import evaluate
+    from lyapnet.exchange.export import export
     from lyapnet.loop.programs import LyapunovProgram, Program, Tolerances, ValueProgram
     from lyapnet.loop.rollout import Rollout, Trajectory
+    from lyapnet.prover.branch_and_bound import Budget
     from lyapnet.task.constraints import AllOf, Ball, Constraints, StateLimits
     from lyapnet.task.cost import Cost, ObstacleCost, PeriodicCost, PseudoHuberCost, QuadraticCost, TargetCost
     from lyapnet.task.horizon import Horizon
@@ -37,6 +45,14 @@ if TYPE_CHECKING:
 _HOMES = {  # imported when they are first asked for: torch and Lightning take seconds
     "value.calculus": ["ValueFunction"],
     "task.constraints": ["AllOf", "Ball", "Constraints", "StateLimits"],
+    "claims.certificates": ["Certificate"],
+    "claims.certify": ["certify"],
+    "claims.claim": ["Claim", "Run", "option"],
+    "claims.everywhere": ["Everywhere"],
+    "claims.kinds": ["Funnel", "LowerBound", "Region", "Sampled", "Statistical", "Tube"],
+    "prover.branch_and_bound": ["Budget"],
+    "evaluation.measurement": ["evaluate"],
+    "exchange.export": ["export"],
     "controller.controller": ["ArrayTrajectory", "Controller"],
     "task.cost": ["Cost", "ObstacleCost", "PeriodicCost", "PseudoHuberCost", "QuadraticCost", "TargetCost"],
     "base.errors": ["LyapnetError"],
@@ -62,16 +78,22 @@ __all__ = [
     "ArrayTrajectory",
     "Ball",
     "Box",
+    "Budget",
+    "Certificate",
+    "Claim",
     "Constraints",
     "ControlAffineSystem",
     "ControlBox",
     "ControlSet",
     "Controller",
     "Cost",
+    "Everywhere",
+    "Funnel",
     "HJBPolicy",
     "Horizon",
     "InitialStateDataModule",
     "LookaheadPolicy",
+    "LowerBound",
     "LyapnetError",
     "LyapunovProgram",
     "ObstacleCost",
@@ -81,21 +103,30 @@ __all__ = [
     "Program",
     "PseudoHuberCost",
     "QuadraticCost",
+    "Region",
     "Rollout",
+    "Run",
+    "Sampled",
     "SampledPolicy",
     "SontagPolicy",
     "StateLimits",
+    "Statistical",
     "Table",
     "TargetCost",
     "Tolerances",
     "Trajectory",
+    "Tube",
     "Unbounded",
     "ValueFunction",
     "ValueModule",
     "ValueProgram",
     "__version__",
+    "certify",
+    "evaluate",
+    "export",
     "load",
     "norm",
+    "option",
     "train",
 ]
 

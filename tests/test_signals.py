@@ -34,7 +34,7 @@ def test_a_certificate_stops_with_its_proof_kept(number, tmp_path, few_seconds_f
 
     controller = untrained("double_integrator", "network.hidden=[8]")
     with pytest.raises(Interrupted, match=f"the proof so far is kept in {kept}") as stop:
-        funnel.sound_claim(controller.closed_loop, controller.problem, budget=Budget(60), report=progress, keep=kept)
+        funnel.prove_funnel(controller.closed_loop, controller.problem, budget=Budget(60), report=progress, keep=kept)
     assert stop.value.exit_status == 130
     assert time.monotonic() - reports[0] < 2
     assert kept.stat().st_size > 0
@@ -85,6 +85,6 @@ def test_seconds_hold_for_all_of_a_certificate(seconds):
     """For a condition that no budget decides."""
     controller = untrained("cartpole_balancing")
     started = time.monotonic()
-    claim = funnel.sound_claim(controller.closed_loop, controller.problem, budget=Budget(seconds))
+    claim = funnel.prove_funnel(controller.closed_loop, controller.problem, budget=Budget(seconds))
     assert time.monotonic() - started < 1.1 * seconds + 1
     assert claim.verdict != "certified"

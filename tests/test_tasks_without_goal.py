@@ -8,8 +8,6 @@ from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import UsageError
-from lyapnet.claims.sampling_certificates import sampled_certificate, statistical_certificate
-from lyapnet.claims.sound_certificate import sound_certificate
 from lyapnet.cli import main
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.optimality import in_spreads
@@ -230,10 +228,10 @@ def test_a_program_about_a_goal_says_that_it_needs_one(program):
     assert Learner(problem, V, Rollout(problem, lyapnet.SampledPolicy(problem, V)), ValueProgram(relative=True))
 
 
-@pytest.mark.parametrize("certificate", [sound_certificate, sampled_certificate, statistical_certificate])
-def test_a_certificate_about_a_goal_says_that_it_needs_one(certificate):
+@pytest.mark.parametrize("claim", [lyapnet.Funnel(), lyapnet.Sampled(), lyapnet.Statistical()])
+def test_a_certificate_about_a_goal_says_that_it_needs_one(claim):
     with pytest.raises(UsageError, match="Expected a task with a goal, towards which V falls"):
-        certificate(lyapnet.Controller(far(), Exact()))
+        lyapnet.certify(lyapnet.Controller(far(), Exact()), claim)
 
 
 def test_nothing_holds_a_goal_that_is_not_there():

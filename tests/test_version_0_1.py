@@ -70,7 +70,7 @@ def test_checkpoint_is_measured_as_by_version_0_1(path):
 def test_checkpoint_is_certified_as_by_version_0_1(kind, capsys):
     folder = FIXTURES / "certified"
     expected = json.loads((folder / f"certify_{kind}.json").read_text())
-    main(["certify", str(folder / "checkpoints/best.ckpt"), "--kind", kind, *OPTIONS[kind], "--json", "--debug"])
+    main(["certify", kind, str(folder / "checkpoints/best.ckpt"), *OPTIONS[kind], "--json", "--debug"])
     found = json.loads(capsys.readouterr().out)
     assert found.pop("seconds", 0) >= 0
     found.pop("fingerprint", None)  # of what was bounded: 0.1 did not name it

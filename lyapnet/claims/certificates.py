@@ -4,10 +4,14 @@ import shlex
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 from lyapnet.base.files import plain
+from lyapnet.base.types import State
 from lyapnet.claims import figures
+from lyapnet.claims.report import require_writable, write_outputs
+from lyapnet.claims.tables import rows_of, table_of, text_of
 from lyapnet.controller.controller import Controller
 from lyapnet.prover.verdict import Verdict
 
@@ -19,14 +23,17 @@ class Certificate(ABC):
     """A claim about a controller. Each kind is a class of its own, the only place that knows it.
 
     Args:
-        claim: of the kind.
-        options: all that the claim was made with, as plain data by the names of the command line; `seed` among them.
+        claim: what was found, of the kind.
+        options: as plain data; `seed` among them.
     """
 
-    kind: ClassVar[str]
-    picture: ClassVar[str]  # what a report calls the file of its figure
+    kind: str
+    controller: Controller
+    options: Mapping[str, Any]  # all that the claim was made with, by the names of the command line
+    picture: str = "claim.png"  # what a report calls the file of its figure
     labels: ClassVar[Mapping[str, str]]  # key of `result` ↦ what a table calls it, in the table's order
     claim: Any
+    claims: Sequence[Any] = ()  # those that lyapnet.certify was asked for
 
     def __init__(self, controller: Controller, claim: Any, options: Mapping[str, Any]):
         self.controller, self.claim, self.options = controller, claim, options
@@ -40,6 +47,29 @@ class Certificate(ABC):
     def result(self) -> dict[str, Any]:
         """What `lyapnet certify --json` prints: plain data, None where there is no finite number."""
         return plain({"kind": self.kind, "verdict": self.verdict, **self.numbers(), "seed": self.options["seed"]})
+
+    @property
+    def rows(self) -> list[tuple[str, str]]:
+        """Its numbers, and what a table calls them."""
+        return rows_of(self.result, self.labels)
+
+    def table(self, title: str) -> Any:
+        """Title, kind, verdict and numbers, for a terminal."""
+        return table_of(f"{title}\n{self.kind}: {self.verdict}", self.rows)
+
+    def write(self, folder: str | Path, checkpoint: str | Path | None = None) -> list[Path]:
+        """Write report.md, report.json and the figure into a folder; their paths.
+
+        Args:
+            checkpoint: of the controller, whose hash and config the report has; None: it was made from parts.
+        """
+        require_writable(None, Path(folder))
+        given = repr(str(checkpoint)) if checkpoint else "controller"
+        call = f"lyapnet.certify({', '.join([given, *map(repr, self.claims)])}, seed={self.options['seed']})"
+        return list(write_outputs(self, Path(checkpoint) if checkpoint else None, call, None, Path(folder)))
+
+    def __str__(self) -> str:
+        return text_of(self.table(repr(self.controller)))
 
     @abstractmethod
     def numbers(self) -> dict[str, Any]:
@@ -80,3 +110,19 @@ class Certificate(ABC):
         options = [f"--{name}" if value is True else f"--{name}={value}" for name, value in each]
         options += [f"--at={each}" for each in at]
         return shlex.join(["lyapnet", "certify", self.kind, checkpoint, *options])
+
+
+def named_pushes(w: State | None, names: Sequence[str]) -> dict[str, float]:
+    """The disturbed states and how much their derivatives are pushed at most."""
+    return {} if w is None else {names[i]: float(w[i]) for i in range(len(w)) if w[i] > 0}
+
+
+def however_pushed(pushes: Mapping[str, float]) -> str:
+    """What a claim says of disturbances."""
+    each = ", ".join(f"of at most {w!r} on d({name})/dt" for name, w in pushes.items())
+    return f"whatever pushes there are, {each}"
+
+
+def listed(x: Sequence[float]) -> str:
+    """A state in a sentence."""
+    return f"({', '.join(f'{entry:.6g}' for entry in x)})"

@@ -14,15 +14,16 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import plain
 from lyapnet.base.types import State
-from lyapnet.claims.funnel import sound_claim
+from lyapnet.claims.from_below import LowerBoundCertificate
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
-from lyapnet.claims.least_cost import DEGREE, RiseCondition, lower_claim
+from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.plants import plants_of
 from lyapnet.claims.preconditions import over_time
-from lyapnet.claims.region import region_claim
+from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
-from lyapnet.claims.two_sided_certificate import TwoSidedCertificate
+from lyapnet.claims.two_sided import TwoSidedCertificate, labels_of_both
 from lyapnet.controller.controller import Controller
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
@@ -59,7 +60,8 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
 
 def labels_of(result: Mapping[str, Any]) -> dict[str, str]:
     """What a table calls the numbers of a check."""
-    labels = {"region": RegionCertificate, "two-sided": TwoSidedCertificate}.get(result["of"], SoundCertificate).labels
+    kinds = {"region": RegionCertificate.labels, "two-sided": labels_of_both(SoundCertificate)}
+    labels = kinds.get(result["of"], SoundCertificate.labels)
     return {"of": "of", **labels, "share_of_search": "seconds for the leaves / for their search"}
 
 
@@ -134,7 +136,7 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
 
 def _funnel(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
     kept = kept_funnel(controller, path)
-    claim = sound_claim(
+    claim = prove_funnel(
         controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
         path, True, kept.degree, kept.disturbance,
     )  # fmt: skip
@@ -150,11 +152,13 @@ def _both_sides(controller: Controller, path: Path, budget: Budget, report: Repo
             "another."
         )
     loop, problem, numbers = controller.closed_loop, controller.problem, (above.alpha, above.delta)
-    upper = sound_claim(
+    upper = prove_funnel(
         loop, problem, *numbers, above.states, budget, _generator(), report, path, True, above.degree
     )  # fmt: skip
-    lower = lower_claim(loop, problem, *numbers, below.states, budget, _generator(), report, path, True)
-    certificate = TwoSidedCertificate(controller, upper, lower, {})
+    lower = prove_lower_bound(loop, problem, *numbers, below.states, budget, _generator(), report, path, True)
+    certificate = TwoSidedCertificate(
+        SoundCertificate(controller, upper, {}), LowerBoundCertificate(controller, lower, {}), {}
+    )  # fmt: skip
     reason = None if certificate.verdict == "certified" else f"{NOT_PROVED}, or one side misses some of X₀"
     seconds = upper.proof_seconds + lower.proof_seconds
     return Checked(certificate.proved(), reason, seconds, above.seconds + below.seconds)
@@ -168,7 +172,7 @@ def _region(controller: Controller, path: Path, budget: Budget, report: Report) 
             f"certify region CKPT --keep {shlex.quote(str(path))} and the same options."
         )
     plants = plants_of(controller, kept.parameters) if kept.parameters else None
-    claim = region_claim(
+    claim = prove_region(
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
         kept.disturbance, plants,
     )  # fmt: skip

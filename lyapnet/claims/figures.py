@@ -15,13 +15,16 @@ from torch import Tensor
 
 from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
 from lyapnet.base.types import State, Value
-from lyapnet.claims import Counterexample, RegionClaim, SampledClaim, SoundClaim
+from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.region import ProvedRegion
+from lyapnet.claims.statistical import CountedSuccesses
 from lyapnet.claims.tables import floored
 from lyapnet.evaluation.figures import widest_axes
+from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 
-Slices = SoundClaim | RegionClaim  # what is drawn in slices
+Slices = ProvedFunnel | ProvedRegion  # what is drawn in slices
 
 NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
 
@@ -29,7 +32,7 @@ NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one
 # Sampled states
 
 
-def sampled_states(claim: SampledClaim, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
+def sampled_states(claim: CountedSuccesses, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
     """Which sampled states of X₀ succeed, and in what the others fail, in the plane of its two widest components.
 
     The other components of the states are left out: a projection. With one free component, numbers of states in bins.
@@ -71,7 +74,7 @@ def sampled_states(claim: SampledClaim, initial_states: Box, labels: Sequence[st
     return figure
 
 
-def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
+def _outcomes(claim: CountedSuccesses) -> list[tuple[Tensor, str, str, str]]:
     """(states, what became of them, colour, marker), successes first so that failures are drawn over them.
 
     A state that fails in more than one event counts for the first of them.
@@ -95,7 +98,7 @@ def _outcomes(claim: SampledClaim) -> list[tuple[Tensor, str, str, str]]:
 
 
 def funnel(
-    claim: SoundClaim,
+    claim: ProvedFunnel,
     V: Value,
     initial_states: Box,
     goal: State,
@@ -132,7 +135,7 @@ def funnel(
 
 
 def region(
-    claim: RegionClaim,
+    claim: ProvedRegion,
     V: Value,
     initial_states: Box,
     goal: State,
@@ -172,7 +175,7 @@ def region(
 
 
 def _draw_over_state(
-    panel: Axes, claim: RegionClaim, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    panel: Axes, claim: ProvedRegion, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
     levels: Sequence["Level"], handles: dict[str, Artist],
 ) -> None:  # fmt: skip
     """V(0, ·) over the one state that a claim is about, with levels and X₀."""
@@ -191,7 +194,7 @@ def _draw_over_state(
     panel.set(xlim=x[[0, -1]], xlabel=labels[i], ylabel="V(0, x)")
 
 
-def _levels_of_region(claim: RegionClaim) -> list["Level"]:
+def _levels_of_region(claim: ProvedRegion) -> list["Level"]:
     """The region, where it ends with a disturbance, and the level that is wanted where it is higher."""
     name = "V(0, x) ≤ ρ: never left" + (", and attracted" if claim.disturbance is None else "")
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
@@ -205,12 +208,13 @@ def _levels_of_region(claim: RegionClaim) -> list["Level"]:
 
 
 def two_sided(
-    value: Tensor, guaranteed: Tensor, least: Tensor, optimum: Tensor | None, headline: str, whose: str = "any control"
-) -> Figure:
+    value: Tensor, guaranteed: Tensor | None, least: Tensor, optimum: Tensor | None, headline: str,
+    whose: str = "any control",
+) -> Figure:  # fmt: skip
     """Both bounds over V(0, x₀), relative to it, with the optima between them.
 
     Args:
-        value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,).
+        value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,); None where there is none.
         optimum: of the first few of them.
         whose: of which controls the bound from below is.
     """
@@ -218,9 +222,10 @@ def two_sided(
     panel = figure.subplots()
     order = value.argsort()
     order = order[(value > 0)[order] & least.isfinite()[order]]
-    V, upper, lower = (numpy_of(y[order]) for y in (value, guaranteed, least))
-    panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
-    panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
+    V, upper, lower = (numpy_of(y[order]) for y in (value, value if guaranteed is None else guaranteed, least))
+    if guaranteed is not None:
+        panel.fill_between(V, lower / V, upper / V, color=BLUE, alpha=0.15, linewidth=0)
+        panel.plot(V, upper / V, color=BLUE, linewidth=1.2, label="guaranteed: the controller costs at most")
     panel.plot(V, lower / V, color=VERMILION, linewidth=1.2, label=f"least: {whose} costs at least")
     if optimum is not None:
         first = order[order < len(optimum)]
@@ -234,6 +239,19 @@ def two_sided(
     panel.set(xlabel="V(0, x₀)", ylabel="cost / V(0, x₀)")
     panel.set_title(headline, fontsize=8)
     legend_below(figure, panel, columns=2)
+    return figure
+
+
+def margins(t: Tensor, c: Tensor, found: Counterexample | None, headline: str) -> Figure:
+    """c over time at random points (t, x), with 0, which it must not exceed, and where it does."""
+    figure = Figure(figsize=(5.6, 4.2), layout="constrained")
+    panel = figure.subplots()
+    panel.plot(numpy_of(t), numpy_of(c), ".", color=BLUE, markersize=2, rasterized=True)
+    panel.axhline(0, color=GREY, linewidth=0.8)
+    if found is not None:
+        panel.plot(found.t, found.condition, "x", color=VERMILION)
+    panel.set(xlabel="t (s)", ylabel="c(t, x), at most 0 where the claim holds")
+    panel.set_title(headline, fontsize=8)
     return figure
 
 
@@ -312,7 +330,7 @@ def _draw_excluded(panel: Axes, grid: Sequence[np.ndarray], worst: np.ndarray, h
         handles.setdefault(name, Patch(facecolor="none", edgecolor="black", hatch="////", label=name))
 
 
-def _draw_violation(panel: Axes, claim: SoundClaim, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
+def _draw_violation(panel: Axes, claim: ProvedFunnel, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
     """Where the closed loop begins that violates a constraint."""
     if claim.violation is not None:
         name = f"a closed loop from here violates one, t = {claim.violation.t:.3g} s"
@@ -321,7 +339,7 @@ def _draw_violation(panel: Axes, claim: SoundClaim, pair: tuple[int, int], handl
         handles.setdefault(name, point)
 
 
-def _levels(claim: SoundClaim, fine: bool) -> list[Level]:
+def _levels(claim: ProvedFunnel, fine: bool) -> list[Level]:
     """The funnel at some times, and the level that is wanted."""
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
@@ -344,7 +362,7 @@ def _draw_sublevel(
 
 
 def _draw_over_time(
-    panel: Axes, claim: SoundClaim, V: Value, initial_states: Box, label: str, handles: dict[str, Artist]
+    panel: Axes, claim: ProvedFunnel, V: Value, initial_states: Box, label: str, handles: dict[str, Artist]
 ) -> None:
     low, high = float(claim.states.lower[0]), float(claim.states.upper[0])
     t, x = (torch.linspace(*ends, 201).to(initial_states.lower) for ends in ((0, claim.duration), (low, high)))

@@ -1,22 +1,28 @@
-"""What a bound of the optimum from below says in a certificate, beside a bound of the controller's cost from above."""
+"""Certificates of what any control costs at least, alone or beside a bound of the controller's cost from above."""
 
 import math
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor
 
-from lyapnet.base.types import PerState
-from lyapnet.claims.certificates import FROZEN
-from lyapnet.claims.least_cost import LowerClaim
-from lyapnet.claims.sound_certificate import listed
+from lyapnet.base.random_streams import CERTIFICATION, stream
+from lyapnet.claims import figures
+from lyapnet.claims.arguments import COMPARED
+from lyapnet.claims.certificates import FROZEN, Certificate, listed
+from lyapnet.claims.costs import Inside, optima_of
+from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.prover.verdict import Verdict, time_spent
 
 
-class FromBelow:
-    """The bound from below in numbers, words and formulas, and how far what is guaranteed lies above it."""
+class LowerBoundCertificate(Certificate):
+    """What any control costs at least, and how far what is guaranteed of a controller lies above it."""
 
+    kind: str = "lower"
+    picture: str = "lower_bound.png"
     labels: ClassVar[Mapping[str, str]] = {
         "lower_reason": "why not from below",
         "lower_set": "D from below",
@@ -36,18 +42,7 @@ class FromBelow:
         "lower_fingerprint": "fingerprint from below",
     }
 
-    def __init__(self, claim: LowerClaim):
-        self.claim = claim
-
-    @classmethod
-    def labels_after(cls, above: Mapping[str, str]) -> dict[str, str]:
-        """The labels of both sides; those of seconds and fingerprints at the end."""
-        return {**{key: label for key, label in above.items() if key not in cls.labels}, **cls.labels}
-
-    def verdict(self, above: Verdict) -> Verdict:
-        """On both sides."""
-        both = above, self.claim.verdict
-        return "falsified" if "falsified" in both else "unknown" if "unknown" in both else "certified"
+    claim: ProvedLowerBound
 
     @property
     def holds_for(self) -> str:
@@ -58,6 +53,21 @@ class FromBelow:
     def whose(self) -> str:
         """The same, in a figure."""
         return "any control" if self.claim.everywhere else "any control that stays in D"
+
+    def numbers(self) -> dict[str, Any]:
+        claim, inside = self.claim, self.inside
+        optimum = optima_of(self.controller, inside.x0, max(1.0, 0.1 * self.options["seconds"]))
+        return {
+            "beta": claim.beta, "delta": claim.delta, **self.proved(), "seconds": claim.seconds,
+            **self.around(inside, optimum),
+        }  # fmt: skip
+
+    @cached_property
+    def inside(self) -> Inside:
+        """States of X₀, with no bound from above."""
+        x0 = self.controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
+        value = self.controller.value(0.0, x0).double()
+        return Inside(x0, value, torch.full_like(value, torch.inf))
 
     def proved(self) -> dict[str, Any]:
         claim, proved = self.claim, self.claim.level > -math.inf
@@ -70,9 +80,9 @@ class FromBelow:
             "lower_counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
         }  # fmt: skip
 
-    def against(self, value: PerState, guaranteed: PerState) -> dict[str, Any]:
+    def against(self, inside: Inside) -> dict[str, Any]:
         """What the two bounds say of some states; nothing where one of them says nothing."""
-        least = self.claim.least_cost(value)
+        least, guaranteed = self.claim.least_cost(inside.value), inside.guaranteed
         if not len(least) or not bool(least.isfinite().all()) or not (mean := float(least.mean())) > 0:
             return {}
         return {
@@ -80,10 +90,10 @@ class FromBelow:
             "certified_gap": float((guaranteed - least).max()) / mean,
         }
 
-    def around_optima(self, value: PerState, guaranteed: PerState, optimum: Tensor | None) -> dict[str, Any]:
+    def around(self, inside: Inside, optimum: Tensor | None) -> dict[str, Any]:
         """How the two bounds lie around the optima of the first of these states, as far as an oracle knows them."""
-        least = self.claim.least_cost(value)
-        if optimum is None or not len(value) or not bool(least.isfinite().all()):
+        least, guaranteed = self.claim.least_cost(inside.value), inside.guaranteed
+        if optimum is None or not len(least) or not bool(least.isfinite().all()):
             return {}
         some, known = slice(len(optimum)), optimum.isfinite()
         between = (least[some] <= optimum) & (optimum <= guaranteed[some])
@@ -102,12 +112,17 @@ class FromBelow:
             return "V rises faster than a control pays for: claim less of V, allow more --delta, or train its residual"
         return f"{time_spent(claim.set_up)}: allow more"
 
-    def in_words(self) -> str:
+    def in_words(self, before: str = "") -> str:
+        """The same as of any certificate.
+
+        Args:
+            before: how it goes on from a bound from above.
+        """
         claim = self.claim
         if claim.level == -math.inf:
             return "Nothing is proved of the optimum from below."
         return (
-            f"And from below: {self.holds_for} cost at least min(β V(0, x₀) − δT, c) − e, with "
+            f"{before}{self.holds_for} cost at least min(β V(0, x₀) − δT, c) − e, with "
             f"β = {claim.beta!r}, c = {claim.level!r} and e = {claim.excess!r}, from each x₀ ∈ D. It is about the "
             f"operations that f, g, ℓ, R and V were traced to; {FROZEN}"
         )
@@ -122,14 +137,21 @@ class FromBelow:
             f"∫ℓ dt + φ(x(T)) ≥ min({beta} V(0, x₀) − {delta} · {T}, {c}) − {e}  for {self.holds_for}",
         ]
 
-    def of_the_verdict(self) -> str:
+    def of_the_verdict(self, before: str = "The verdict is") -> str:
         found = self.claim.counterexample
         where = "" if found is None else f" At t = {found.t:.6g} s, x = {listed(found.x)} the second fails."
         below = {"certified": "it does", "falsified": "it does not", "unknown": "undecided within the budget"}
-        return f"And on the claim that the bound from below holds on all of X₀: {below[self.claim.verdict]}.{where}"
+        return (
+            f"{before} on the claim that the bound from below holds on all of X₀: {below[self.claim.verdict]}.{where}"
+        )
 
     def headline(self, verdict: Verdict, ratio: float | None, numbers: str) -> str:
         """The title of a figure of both sides."""
         means = "" if ratio is None else f": from above / from below {ratio:.3f}, means over states of X₀"
         whose = f"; {self.holds_for}" if self.claim.level > -math.inf else ""
         return f"{verdict}{means}\n{numbers}{whose}"
+
+    def figure(self) -> figures.Figure:
+        claim, value = self.claim, self.inside.value
+        headline = self.headline(self.verdict, None, f"β = {claim.beta:g}, δ = {claim.delta:.3g}")
+        return figures.two_sided(value, None, claim.least_cost(value), None, headline, self.whose)

@@ -46,8 +46,8 @@ KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same c
 NOT_KEPT = "Stopped while certifying: nothing is kept without --keep FILE."
 
 
-@dataclass(frozen=True)
-class SoundClaim:
+@dataclass(frozen=True, kw_only=True)
+class ProvedFunnel:
     """With W(t, x) = V(t, x) − δt: at every (t, x) in [0, T] × D with W ≤ ρ, in continuous time and for this model,
 
         V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
@@ -119,7 +119,7 @@ class SoundClaim:
         return torch.where(value <= self.rho, bound, torch.inf)
 
 
-def sound_claim(
+def prove_funnel(
     closed_loop: ClosedLoop,
     problem: Problem,
     alpha: float = 0.95,
@@ -132,7 +132,7 @@ def sound_claim(
     replay: bool = False,
     degree: int = 2,
     disturbance: State | None = None,
-) -> SoundClaim:
+) -> ProvedFunnel:
     """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
 
     Args:
@@ -174,10 +174,13 @@ def sound_claim(
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
     share = 1.0 if rho >= wanted else share_of(condition.V, x_low, x_high, rho, budget)
     excess = _terminal_excess(condition, D, duration, rho, budget)
-    return SoundClaim(
-        alpha, delta, duration, D, rho, wanted, largest_seen(condition.V, initial_states), share, excess,
-        found, proof.boxes, set_up + proof.seconds, proof.remaining_volume, proof.undecided, left_out,
-        proof.fingerprint, proof.seconds, names, crossing, violation, disturbance, spent, assumed,
+    return ProvedFunnel(
+        alpha=alpha, delta=delta, duration=duration, states=D, rho=rho, wanted=wanted,
+        least=largest_seen(condition.V, initial_states), volume_share=share, terminal_excess=excess,
+        counterexample=found, boxes=proof.boxes, seconds=set_up + proof.seconds,
+        remaining_volume=proof.remaining_volume, undecided=proof.undecided, left_out=left_out,
+        fingerprint=proof.fingerprint, proof_seconds=proof.seconds, constraints=names, crossing=crossing,
+        violation=violation, disturbance=disturbance, set_up=spent, assumed=assumed,
     )  # fmt: skip
 
 

@@ -31,8 +31,8 @@ FINE = 5e-5  # of the level: how close the excess at T is bounded
 DEGREE = 3  # of the forms: what cancels between V_t and the Hamiltonian is of third order, t·x²
 
 
-@dataclass(frozen=True)
-class LowerClaim:
+@dataclass(frozen=True, kw_only=True)
+class ProvedLowerBound:
     """With W(t, x) = β V(t, x) − δ(T − t) and 0 < β ≤ 1: at every (t, x) in [0, T] × D with W ≤ c, in continuous time,
 
         β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)] ≥ −δ,
@@ -159,7 +159,7 @@ def least_pivot(R: Tensor) -> PerState:
     return least
 
 
-def lower_claim(
+def prove_lower_bound(
     closed_loop: ClosedLoop,
     problem: Problem,
     beta: float = 0.95,
@@ -170,7 +170,7 @@ def lower_claim(
     report: Callable[[Progress], None] | None = None,
     keep: Path | None = None,
     replay: bool = False,
-) -> LowerClaim:
+) -> ProvedLowerBound:
     """The bound of the optimum from below that V proves within a budget, for as much of X₀ as it can.
 
     Args:
@@ -203,15 +203,16 @@ def lower_claim(
     )  # fmt: skip
     level = wanted if proof.level >= needed else proof.level
     seen = beta * largest_seen(condition.V, X0) - delta * duration
-    return LowerClaim(
-        beta, delta, duration, D, level, wanted, seen, excess, everywhere, proof.counterexample, proof.boxes,
-        time.monotonic() - started, proof.remaining_volume, proof.undecided, left_out, proof.fingerprint, proof.seconds,
-        set_up,
+    return ProvedLowerBound(
+        beta=beta, delta=delta, duration=duration, states=D, level=level, wanted=wanted, least=seen, excess=excess,
+        everywhere=everywhere, counterexample=proof.counterexample, boxes=proof.boxes,
+        seconds=time.monotonic() - started, remaining_volume=proof.remaining_volume, undecided=proof.undecided,
+        left_out=left_out, fingerprint=proof.fingerprint, proof_seconds=proof.seconds, set_up=set_up,
     )  # fmt: skip
 
 
 def require_bound_from_below(closed_loop: ClosedLoop, problem: Problem, beta: float, states: Box | None) -> None:
-    """Refuse at once what lower_claim would refuse: a cost, limits or a set D that do not fit."""
+    """Refuse at once what prove_lower_bound would refuse: a cost, limits or a set D that do not fit."""
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, 0.0, copied(problem))
     if states is not None:
         left_out = ignorable_states(condition.closed_loop, problem.constraints)

@@ -169,26 +169,3 @@ def _require_arguments(system: ControlAffineSystem, names: Mapping[str, Any]) ->
                 f"Expected {OPTION} among the arguments of {cls.__name__} ({', '.join(known) or 'none'}), got {name}; "
                 f"{hint}"
             )
-
-
-def parse_parameters(named: Sequence[str]) -> dict[str, list[float]]:
-    """The ends of each parameter's interval, by its name, from "mass=0.9:1.1".
-
-    Raises:
-        UsageError: what is named is no interval of finite numbers, or stands there twice.
-    """
-    found = dict[str, list[float]]()
-    for text in named:
-        name, _, interval = text.partition("=")
-        try:
-            lower, upper = (float(end) for end in interval.split(":"))
-        except ValueError as error:
-            raise UsageError(
-                f"Expected {OPTION} NAME=LOWER:UPPER with two numbers, got {text!r}; for example mass=0.9:1.1."
-            ) from error
-        if not -math.inf < lower <= upper < math.inf:
-            raise UsageError(f"Expected {OPTION} {name}=LOWER:UPPER, LOWER ≤ UPPER and finite, got {text!r}; mend it.")
-        if name in found:
-            raise UsageError(f"Expected {OPTION} once for each parameter, got {name} twice; leave one of them out.")
-        found[name] = [lower, upper]
-    return found

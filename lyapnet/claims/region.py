@@ -41,8 +41,8 @@ from lyapnet.value.policy import ValuePolicy
 PER_HORIZON = 0.01  # λT, unless it is given
 
 
-@dataclass(frozen=True)
-class RegionClaim:
+@dataclass(frozen=True, kw_only=True)
+class ProvedRegion:
     """Of the receding law u(0, x), read at every t, with V(x) = V(0, x), F = f + g u(0, ·) and levels ρ ≥ c > 0:
 
     at each x ∈ D with V(x) ≤ ρ, outside the hole {x ∈ B: V(x) < c},
@@ -217,7 +217,7 @@ def _kept(file: Path | None, decay: float, w: State | None, n: int, names: Seque
     return kept
 
 
-def region_claim(
+def prove_region(
     closed_loop: ClosedLoop,
     problem: Problem,
     decay: float | None = None,
@@ -229,7 +229,7 @@ def region_claim(
     replay: bool = False,
     disturbance: State | None = None,
     plants: Plants | None = None,
-) -> RegionClaim:
+) -> ProvedRegion:
     """The largest region of attraction of the receding law that is a sublevel set of V(0, ·), as the budget allows.
 
     Args:
@@ -269,20 +269,22 @@ def region_claim(
         proof = proof_within(condition, domain, level, budget, **options)
         rho = proof.level if proof.level >= condition.hole else rho
     extent, ultimate = (None, math.nan) if w is None or rho == -math.inf else _end(condition, D, n, budget)
-    rounding = _rounding(loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen)
+    precision, distance = _rounding(loop, closed_loop, contraction if rho > -math.inf else None, goal, D, seen)
     share = 1.0 if rho >= wanted else share_of(condition.V, X0.lower, X0.upper, rho, _half(budget))
-    return RegionClaim(
-        decay, first_of(D, n), rho, rim, wanted, largest_seen(condition.V, X0), condition.hole, contraction, slowest,
-        share, share_of(condition.V, D.lower, D.upper, rho, budget), proof, time.monotonic() - started,
-        left_out, names_of(problem.constraints), None if w is None else w[:n], extent, ultimate, plants, set_up,
-        *rounding,
+    return ProvedRegion(
+        decay=decay, states=first_of(D, n), rho=rho, rim=rim, wanted=wanted, least=largest_seen(condition.V, X0),
+        hole=condition.hole, contraction=contraction, slowest=slowest, volume_share=share,
+        region_share=share_of(condition.V, D.lower, D.upper, rho, budget), proof=proof,
+        seconds=time.monotonic() - started, left_out=left_out, constraints=names_of(problem.constraints),
+        disturbance=None if w is None else w[:n], extent=extent, ultimate_share=ultimate, plants=plants, set_up=set_up,
+        precision=precision, distance_left=distance,
     )  # fmt: skip
 
 
 def _rounding(
     loop: ClosedLoop, one: ClosedLoop, around: Contraction | None, goal: State, states: Box, seen: Sequence[int]
 ) -> tuple[str | None, float]:
-    """(the precision of u, the distance from the goal that it leaves), as of RegionClaim; `one` is of one plant."""
+    """(the precision of u, the distance from the goal that it leaves), as of ProvedRegion; `one` is of one plant."""
     precision = one.policy.precision if isinstance(one.policy, ValuePolicy) else None
     if precision is None or around is None:
         return precision, math.nan

@@ -1,9 +1,7 @@
 """Certificates by proof of the receding law: a region of attraction."""
 
 import math
-import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -14,24 +12,13 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import Corner
 from lyapnet.claims import figures
-from lyapnet.claims.certificates import FROZEN, NOT_PROVED, Certificate
-from lyapnet.claims.plants import parse_parameters, plants_of
+from lyapnet.claims.certificates import FROZEN, NOT_PROVED, Certificate, however_pushed, listed, named_pushes
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
-from lyapnet.claims.region import RegionClaim, region_claim
-from lyapnet.claims.sound_certificate import (
-    however_pushed,
-    listed,
-    named_pushes,
-    parse_disturbance,
-    parse_set,
-)
+from lyapnet.claims.region import ProvedRegion
 from lyapnet.claims.tables import floored
-from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition
-from lyapnet.prover.proof import Progress
 from lyapnet.value.policy import ValuePolicy
 
 NEARLY = 0.999  # of the least V on the boundary of D: a region that comes so close is as large as D lets it be
@@ -43,8 +30,8 @@ class RegionCertificate(Certificate):
     disturbance, to a smaller set around the goal, which none leaves. With plants, that is so for each of them.
     """
 
-    kind: ClassVar[str] = "region"
-    picture: ClassVar[str] = "region.png"
+    kind: str = "region"
+    picture: str = "region.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "set": "D",
@@ -77,7 +64,7 @@ class RegionCertificate(Certificate):
         "fingerprint": "fingerprint of what was bounded",
         "origin": "V and u",
     }
-    claim: RegionClaim
+    claim: ProvedRegion
 
     @property
     def complete(self) -> bool:
@@ -280,48 +267,3 @@ class RegionCertificate(Certificate):
             times = horizon.dt * torch.arange(horizon.steps + 1, dtype=x.dtype)
             paths = odeint(lambda _, x: loop.system.dynamics(x, loop.policy(t, x)), x0, times, method="rk4")
         return torch.as_tensor(paths)[..., :n]
-
-
-def region_certificate(
-    controller: Controller,
-    decay: float | None = None,
-    set: str | None = None,
-    seconds: float = 60.0,
-    workers: int = 1,
-    device: str = "cpu",
-    disturbance: Sequence[str] | None = None,
-    keep: str | None = None,
-    seed: int = 0,
-    report: Callable[[Progress], None] | None = None,
-    parameter: Sequence[str] | None = None,
-    *,
-    ray: str | None = None,
-    started: float | None = None,
-) -> RegionCertificate:
-    """The region of attraction of a controller's receding law.
-
-    Args:
-        decay: λ in 1/s; 1 % of 1/T if None.
-        set: D, as parse_set reads it; found if None.
-        seconds: when to stop undecided.
-        disturbance: STATE=w for each ẋ_i that is pushed by at most w.
-        keep: a file in which the proof is kept, and from which it goes on.
-        report: is told how far the proof is.
-        parameter: NAME=lower:upper for each parameter of the plant that may lie anywhere between.
-        ray: of Budget.
-        started: time.monotonic() from which the seconds count; now if None.
-    """
-    begun = time.monotonic() if started is None else started
-    budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
-    claim = region_claim(
-        controller.closed_loop, controller.problem, decay, None if set is None else parse_set(set), budget,
-        stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
-        disturbance=parse_disturbance(disturbance or (), controller),
-        plants=plants_of(controller, parse_parameters(parameter)) if parameter else None,
-    )  # fmt: skip
-    options = {
-        "decay": decay, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "ray": ray, "disturbance": list(disturbance or ()) or None, "parameter": list(parameter or ()) or None,
-        "keep": keep, "seed": seed,
-    }  # fmt: skip
-    return RegionCertificate(controller, claim, options)

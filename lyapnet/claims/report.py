@@ -13,8 +13,6 @@ from matplotlib.figure import Figure
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import digest_of_file, write_atomically
 from lyapnet.base.provenance import versions
-from lyapnet.claims.certificates import Certificate
-from lyapnet.claims.tables import certificate_rows
 from lyapnet.controller.controller import Controller, parameters_of
 from lyapnet.experiment.config import Config
 from lyapnet.task.constraints import names_of
@@ -52,12 +50,14 @@ def require_writable(figure: Path | None, folder: Path | None, keep: str | None 
 
 
 def write_outputs(
-    certificate: Certificate, checkpoint: Path, command: str, figure: Path | None, folder: Path | None
+    certificate: Any, checkpoint: Path | None, command: str, figure: Path | None, folder: Path | None
 ) -> Iterator[Path]:
     """Write the figure and the report that are asked for, each whole or not at all; their paths, as they are written.
 
     Args:
-        command: that makes the certificate again.
+        certificate: a lyapnet.Certificate.
+        checkpoint: of the controller; None where it was made from parts.
+        command: that makes the certificate again, or the call.
     """
     targets = [path for path in (figure, folder and folder / certificate.picture) if path]
     picture = certificate.figure() if targets else Figure()
@@ -82,10 +82,10 @@ def write_figure(picture: Figure, path: Path) -> None:
     write_atomically(path, buffer.getbuffer())
 
 
-def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[str, Any]:
+def report_of(certificate: Any, checkpoint: Path | None, command: str) -> dict[str, Any]:
     """Everything about a certificate as plain data."""
     controller, result = certificate.controller, certificate.result
-    config, box, horizon = controller.config, controller.initial_states, controller.horizon
+    box, horizon = controller.initial_states, controller.horizon
     return {
         "kind": certificate.kind,
         "verdict": result["verdict"],
@@ -94,25 +94,44 @@ def report_of(certificate: Certificate, checkpoint: Path, command: str) -> dict[
             "verdict": certificate.of_the_verdict(),
         },
         "certificate": result,
-        "numbers": certificate_rows(result, certificate.labels),
+        "numbers": certificate.rows,
         "options": dict(certificate.options),
-        "checkpoint": {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
-        "experiment": config.experiment,
-        "system": _system(controller, config),
+        "checkpoint": checkpoint and {"path": str(checkpoint), "sha256": digest_of_file(checkpoint)},
         "states": controller.system.state_labels,
         "initial_states": {"lower": box.lower.tolist(), "upper": box.upper.tolist()},
-        "cost": _cost(controller, config),
-        "controls": _controls(controller, config),
         "constraints": list(names_of(controller.problem.constraints)),
-        "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
         "horizon": {"steps": horizon.steps, "dt": horizon.dt, "duration": horizon.duration},
-        "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},
-        "network": {"name": config.network.name, "parameters": sum(p.numel() for p in controller.V.parameters())},
+        **_parts(controller),
         "command": command,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions("torch"),
         "figure": certificate.picture,
     }  # fmt: skip
+
+
+def _parts(controller: Controller) -> dict[str, Any]:
+    """What a controller is made of, as the config of its run says; by their classes where there was none."""
+    try:
+        config = controller.config
+    except UsageError:
+        system, law = controller.system, controller.closed_loop.policy
+        return {
+            "experiment": type(system).__name__,
+            "system": {"name": _name(system), "parameters": {}},
+            "cost": {"name": type(controller.cost).__name__},
+            "controls": {"name": type(controller.controls).__name__},
+            "rollout": {"policy": type(law).__name__, "method": controller.method},
+            "network": {"name": type(controller.V).__name__},
+        }
+    return {
+        "experiment": config.experiment,
+        "system": _system(controller, config),
+        "cost": _cost(controller, config),
+        "controls": _controls(controller, config),
+        "program": {name: value for name, value in vars(config.program).items() if value not in (None, {})},
+        "rollout": {"policy": config.rollout.policy, "method": config.rollout.method},
+        "network": {"name": config.network.name, "parameters": sum(p.numel() for p in controller.V.parameters())},
+    }
 
 
 # Markdown
@@ -122,9 +141,10 @@ def markdown(report: dict[str, Any]) -> str:
     """The report for a reader."""
     claim, horizon = report["claim"], report["horizon"]
     parameters = ", ".join(f"{name} = {value}" for name, value in report["system"]["parameters"].items())
+    given, network = report["checkpoint"], report["network"]
+    weights = f", {network['parameters']} parameters" if "parameters" in network else ""
     about = {
-        "checkpoint": f"`{report['checkpoint']['path']}`",
-        "sha256": f"`{report['checkpoint']['sha256']}`",
+        **({"checkpoint": f"`{given['path']}`", "sha256": f"`{given['sha256']}`"} if given else {}),
         "experiment": report["experiment"],
         "system": f"{report['system']['name']}{f': {parameters}' if parameters else ''}",
         "cost": ", ".join(f"{name} = {value}" for name, value in report["cost"].items()),
@@ -132,7 +152,7 @@ def markdown(report: dict[str, Any]) -> str:
         **({"constraints": "; ".join(report["constraints"])} if report["constraints"] else {}),
         "horizon": f"{horizon['steps']} steps of {horizon['dt']:g} s, T = {horizon['duration']:g} s",
         "closed loop": f"policy {report['rollout']['policy']}, integrator {report['rollout']['method']}",
-        "network": f"{report['network']['name']}, {report['network']['parameters']} parameters",
+        "network": f"{network['name']}{weights}",
         **report["versions"],
         "date": report["date"],
     }

@@ -4,13 +4,10 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar
 
-from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.claims import figures
 from lyapnet.claims.certificates import Certificate
-from lyapnet.claims.preconditions import require_goal
-from lyapnet.claims.statistical import SampledClaim, StatisticalClaim, sampled_claim, statistical_claim
+from lyapnet.claims.statistical import BoundedShare, CountedSuccesses
 from lyapnet.claims.tables import floored
-from lyapnet.controller.controller import Controller
 from lyapnet.loop.programs import ValueProgram
 from lyapnet.task.constraints import names_of
 
@@ -18,8 +15,8 @@ from lyapnet.task.constraints import names_of
 class SampledCertificate(Certificate):
     """The share of some states whose closed loop succeeds."""
 
-    kind: ClassVar[str] = "sampled"
-    picture: ClassVar[str] = "states.png"
+    kind: str = "sampled"
+    picture: str = "states.png"
     labels: ClassVar[Mapping[str, str]] = {
         "samples": "states",
         "tolerances": "tolerances",
@@ -41,7 +38,7 @@ class SampledCertificate(Certificate):
         "caveat": "this draw",
         "advice": "what to do",
     }
-    claim: SampledClaim
+    claim: CountedSuccesses
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
@@ -93,8 +90,8 @@ class SampledCertificate(Certificate):
 class StatisticalCertificate(SampledCertificate):
     """A share of X₀ that succeeds, with a confidence."""
 
-    kind: ClassVar[str] = "statistical"
-    claim: StatisticalClaim
+    kind: str = "statistical"
+    claim: BoundedShare
     caveat: str | None = None  # why the draw is not on record
 
     def numbers(self) -> dict[str, Any]:
@@ -153,43 +150,3 @@ class StatisticalCertificate(SampledCertificate):
         bound = f"at least {floored(self.claim.probability_lower_bound)} of X₀, confidence {self._confidence}"
         counted = f"{self.claim.successes['all']} of {self.claim.samples} states succeed"
         return f"statistical, {self.verdict}: {bound}\n{counted}"
-
-
-def sampled_certificate(
-    controller: Controller, samples: int = 100, radius: float | None = None, seed: int = 0
-) -> SampledCertificate:
-    """The sampled claim about a controller.
-
-    Args:
-        radius: of success at T, in the norm of x; not asked for if None.
-    """
-    require_goal(controller.problem, "sampled")
-    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
-    claim = sampled_claim(controller.rollout, controller.problem, tolerances, samples, generator)
-    return SampledCertificate(controller, claim, {"samples": samples, "radius": radius, "seed": seed})
-
-
-def statistical_certificate(
-    controller: Controller,
-    samples: int = 10_000,
-    confidence: float = 1 - 1e-6,
-    share: float = 0.99,
-    radius: float | None = None,
-    seed: int = 0,
-    *,
-    draws: int = 1,
-) -> StatisticalCertificate:
-    """The statistical claim about a controller.
-
-    Args:
-        share: of X₀, about which the verdict is.
-        radius: of success at T, in the norm of x; not asked for if None.
-        draws: of this controller that were made, this one included, with other seeds or numbers of states.
-    """
-    require_goal(controller.problem, "statistical")
-    tolerances, generator = controller.program.tolerances(radius), stream(seed, CERTIFICATION)
-    claim = statistical_claim(
-        controller.rollout, controller.problem, tolerances, samples, confidence, share, generator, draws=draws
-    )
-    options = {"samples": samples, "confidence": confidence, "share": share, "radius": radius, "seed": seed}
-    return StatisticalCertificate(controller, claim, options)

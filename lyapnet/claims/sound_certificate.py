@@ -1,41 +1,29 @@
 """Certificates by proof: a funnel, and the cost that it guarantees."""
 
-import math
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
-
-import torch
-from torch import Tensor
+from typing import Any, ClassVar
 
 from lyapnet.base.contracts import copied
-from lyapnet.base.errors import OracleError, UsageError
 from lyapnet.base.random_streams import CERTIFICATION, stream
-from lyapnet.base.types import Corner, PerState, State
+from lyapnet.base.types import Corner
 from lyapnet.claims import figures
-from lyapnet.claims.certificates import FROZEN, NOT_PROVED, Certificate
-from lyapnet.claims.funnel import SoundClaim, sound_claim
-from lyapnet.claims.preconditions import over_time, require_goal
+from lyapnet.claims.arguments import COMPARED
+from lyapnet.claims.certificates import FROZEN, NOT_PROVED, however_pushed, listed, named_pushes
+from lyapnet.claims.costs import CostCertificate, Inside
+from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.least_cost import ProvedLowerBound
+from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.tables import floored
-from lyapnet.controller.controller import Controller
-from lyapnet.evaluation.optimality import ratio_of_means
-from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
-from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition
-from lyapnet.prover.proof import Progress
-from lyapnet.task.sets import Box
-
-COMPARED = 1000  # states of X₀ on which the guaranteed cost is held against the optimum
-SEARCHED = 64  # of them, where each optimum is a search
 
 
-class SoundCertificate(Certificate):
+class SoundCertificate(CostCertificate):
     """A funnel that no closed loop leaves, and its cost."""
 
-    kind: ClassVar[str] = "sound"
-    picture: ClassVar[str] = "funnel.png"
+    kind: str = "sound"
+    picture: str = "funnel.png"
+    picture_of_both: ClassVar[str] = "two_sided.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "alpha": "α",
@@ -57,7 +45,7 @@ class SoundCertificate(Certificate):
         "seconds": "seconds",
         "fingerprint": "fingerprint of what was bounded",
     }
-    claim: SoundClaim
+    claim: ProvedFunnel
 
     @property
     def complete(self) -> bool:
@@ -71,16 +59,15 @@ class SoundCertificate(Certificate):
         condition = DecreaseCondition(loop, claim.alpha, claim.delta, disturbance=claim.disturbance)
         return condition, over_time(claim.states, claim.duration), claim.wanted
 
-    def numbers(self) -> dict[str, Any]:
-        return {**self.proved(), "guaranteed_cost_ratio": self.compared.ratio}
-
     @cached_property
-    def compared(self) -> "Compared":
-        """The guaranteed cost against the optimum, which is beside the claim."""
-        return compared_to_optima(self.controller, self.claim, max(1.0, 0.1 * self.options["seconds"]))
+    def inside(self) -> Inside:
+        x0 = self.controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
+        value = self.controller.value(0.0, x0).double()
+        guaranteed = self.claim.guaranteed_cost(value)
+        x0, value, guaranteed = (y[guaranteed.isfinite()] for y in (x0, value, guaranteed))
+        return Inside(x0, value, guaranteed)
 
     def proved(self) -> dict[str, Any]:
-        """The numbers of the claim, without the optimum, which takes an oracle."""
         claim, names = self.claim, self.controller.system.state_names
         kept = {
             "constraints": list(claim.constraints) if claim.volume_share else [], "crossing_level": claim.crossing,
@@ -156,174 +143,16 @@ class SoundCertificate(Certificate):
             where = f" At t = {found.t:.6g} s, x = {listed(found.x)} it fails by {found.condition:.3g}."
         return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
 
+    def in_short(self, lower: ProvedLowerBound) -> str:
+        return f"α = β = {self.claim.alpha:g}, δ = {self.claim.delta:.3g}"
+
+    def figure_of_both(self, lower: ProvedLowerBound, whose: str, headline: str) -> figures.Figure:
+        _, value, guaranteed, _ = self.inside
+        return figures.two_sided(value, guaranteed, lower.least_cost(value), self.optimum, headline, whose)
+
     def figure(self) -> figures.Figure:
         controller, problem = self.controller, self.controller.problem
         labels = controller.system.state_labels
         return figures.funnel(
             self.claim, controller.V, problem.initial_states, problem.goal, labels, problem.constraints
         )
-
-
-def named_pushes(w: State | None, names: Sequence[str]) -> dict[str, float]:
-    """The disturbed states and how much their derivatives are pushed at most."""
-    return {} if w is None else {names[i]: float(w[i]) for i in range(len(w)) if w[i] > 0}
-
-
-def however_pushed(pushes: Mapping[str, float]) -> str:
-    """What a claim says of disturbances."""
-    each = ", ".join(f"of at most {w!r} on d({name})/dt" for name, w in pushes.items())
-    return f"whatever pushes there are, {each}"
-
-
-def listed(x: Sequence[float]) -> str:
-    """A state in a sentence."""
-    return f"({', '.join(f'{entry:.6g}' for entry in x)})"
-
-
-def sound_certificate(
-    controller: Controller,
-    alpha: float = 0.95,
-    delta: float | None = None,
-    set: str | None = None,
-    seconds: float = 60.0,
-    workers: int = 1,
-    device: str = "cpu",
-    disturbance: Sequence[str] | None = None,
-    keep: str | None = None,
-    seed: int = 0,
-    report: Callable[[Progress], None] | None = None,
-    *,
-    ray: str | None = None,
-    started: float | None = None,
-) -> SoundCertificate:
-    """The sound claim about a controller.
-
-    Args:
-        alpha: the share of ℓ that V pays for.
-        delta: slack in cost per second; default_delta if None.
-        set: D, as parse_set reads it; found if None.
-        seconds: when to stop undecided, set-up and what follows the proof included.
-        workers, device: of Budget.
-        disturbance: STATE=w for each ẋ_i that is pushed by at most w.
-        keep: a file in which an unfinished proof is kept.
-        report: is told how far the proof is.
-        ray: of Budget.
-        started: time.monotonic() from which the seconds count; now if None.
-    """
-    require_goal(controller.problem, "sound")
-    begun = time.monotonic() if started is None else started
-    budget = Budget(seconds, workers=workers, device=device, ray=ray, started=begun)
-    claim = sound_claim(
-        controller.closed_loop, controller.problem, alpha,
-        default_delta(controller) if delta is None else delta, None if set is None else parse_set(set),
-        budget, stream(seed, CERTIFICATION), report, None if keep is None else Path(keep),
-        disturbance=parse_disturbance(disturbance or (), controller),
-    )  # fmt: skip
-    options = {
-        "alpha": alpha, "delta": delta, "set": set, "seconds": seconds, "workers": workers, "device": device,
-        "ray": ray, "disturbance": list(disturbance or ()) or None, "keep": keep, "seed": seed,
-    }  # fmt: skip
-    return SoundCertificate(controller, claim, options)
-
-
-def default_delta(controller: Controller) -> float:
-    """0.5 % of the mean running cost on X₀ at t = 0, in cost per second."""
-    x0 = controller.initial_states.sample(COMPARED, stream(0, CERTIFICATION))
-    return 0.005 * float(controller.cost.running(x0, controller.policy(0.0, x0)).mean())
-
-
-def parse_set(text: str) -> Box:
-    """The box that "-1:1,-0.7:0.7" names: bounds of each state, in the order of the system.
-
-    Raises:
-        UsageError: it names none.
-    """
-    try:
-        lower, upper = zip(*((float(low), float(high)) for low, high in _pairs(text)), strict=True)
-        return Box(torch.tensor(lower, dtype=torch.float64), torch.tensor(upper, dtype=torch.float64))
-    except ValueError as error:
-        raise UsageError(
-            f"Expected --set as lower:upper for each state, got {text!r}; for example --set=-1.6:1.6,-2.6:2.6."
-        ) from error
-
-
-def parse_disturbance(named: Sequence[str], controller: Controller) -> State | None:
-    """w from "velocity=0.1" for each state that is pushed; None where none is.
-
-    Raises:
-        UsageError: a name that is no state, or no number.
-    """
-    names, w = controller.system.state_names, torch.zeros(controller.system.n, dtype=torch.float64)
-    for text in named:
-        name, _, value = text.partition("=")
-        if name not in names:
-            raise UsageError(f"Expected --disturbance STATE=W of {', '.join(names)}, got {text!r}; name one of them.")
-        try:
-            w[names.index(name)] = float(value)
-        except ValueError as error:
-            raise UsageError(
-                f"Expected --disturbance STATE=W with a number, got {text!r}; for example {name}=0.1."
-            ) from error
-    return w if named else None
-
-
-def _pairs(text: str) -> Sequence[Sequence[str]]:
-    return [part.split(":") for part in text.split(",")]
-
-
-class Inside(NamedTuple):
-    """States of X₀ inside a funnel, with V(0, x₀) and the guaranteed cost."""
-
-    x0: State
-    value: PerState
-    guaranteed: PerState
-
-
-def states_inside(controller: Controller, claim: SoundClaim) -> Inside:
-    """As many of some states of X₀ as a funnel holds."""
-    x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
-    value = controller.value(0.0, x0).double()
-    guaranteed = claim.guaranteed_cost(value)
-    return Inside(*(y[guaranteed.isfinite()] for y in (x0, value, guaranteed)))
-
-
-class Compared(NamedTuple):
-    """States of X₀ inside a funnel: V(0, x₀), the guaranteed cost, and the optimum of the first of them."""
-
-    value: PerState
-    guaranteed: PerState
-    optimum: PerState | None  # of the discretised task; None where there is no oracle, or it takes longer
-
-    @property
-    def ratio(self) -> float | None:
-        """Mean guaranteed cost over the mean optimum."""
-        if self.optimum is None:
-            return None
-        return ratio_of_means(self.guaranteed[: len(self.optimum)], self.optimum)
-
-
-def compared_to_optima(controller: Controller, claim: SoundClaim, seconds: float = math.inf) -> Compared:
-    """The guaranteed cost of states of X₀ inside a funnel, held against their optima."""
-    x0, value, guaranteed = states_inside(controller, claim)
-    return Compared(value, guaranteed, optima_of(controller, x0, seconds))
-
-
-def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> Tensor | None:
-    """The optimum of the first of some states; None where there are no states or no oracle, or it takes longer.
-
-    A search by IPOPT takes fewer states, and the controller's help.
-    """
-    end = time.monotonic() + seconds
-
-    def in_time(done: int, total: int) -> None:
-        if done < total and time.monotonic() > end:
-            raise OracleError("Expected the optimum within the budget, got none; allow more seconds.")
-
-    if not len(x0):
-        return None
-    try:
-        oracle = oracle_of(controller.problem, controller.method)
-        some = x0 if isinstance(oracle, RiccatiOracle) else x0[:SEARCHED]
-        return oracle.solve(some, controller.rollout(some).u, in_time).cost.double()
-    except OracleError:
-        return None

@@ -19,7 +19,7 @@ from lyapnet.task.problem import Problem
 
 
 @dataclass(frozen=True)
-class SampledClaim:
+class CountedSuccesses:
     """On `successes["all"]` of `samples` states drawn uniformly from X₀ the closed loop succeeded. It proves no more.
 
     The claim that every state of X₀ succeeds is falsified by one that fails, and else unknown.
@@ -56,7 +56,7 @@ class SampledClaim:
 
 
 @dataclass(frozen=True)
-class StatisticalClaim(SampledClaim):
+class BoundedShare(CountedSuccesses):
     """With this confidence, at least `probability_lower_bound` of X₀ by volume succeeds.
 
     The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
@@ -120,14 +120,14 @@ def lower_bound(successes: int, samples: int, confidence: float) -> float:
     return float(betaincinv(successes, samples - successes + 1, 1 - confidence)) if successes else 0.0
 
 
-def sampled_claim(
+def count_successes(
     rollout: Callable[[State], Trajectory],
     problem: Problem,
     tolerances: Tolerances,
     samples: int = 100,
     generator: torch.Generator | None = None,
     batch: int = 1000,
-) -> SampledClaim:
+) -> CountedSuccesses:
     """Count successes among fresh states of X₀; K = 100 as in the paper.
 
     Args:
@@ -144,10 +144,10 @@ def sampled_claim(
     x0 = problem.initial_states.sample(samples, generator)
     tolerances = replace(tolerances, constraints=problem.constraints is not None)
     held = torch.cat([_events(rollout, part, tolerances, problem) for part in x0.split(batch)])
-    return SampledClaim(x0.cpu(), held, tolerances)
+    return CountedSuccesses(x0.cpu(), held, tolerances)
 
 
-def statistical_claim(
+def bound_share(
     rollout: Callable[[State], Trajectory],
     problem: Problem,
     tolerances: Tolerances,
@@ -157,7 +157,7 @@ def statistical_claim(
     generator: torch.Generator | None = None,
     batch: int = 1000,
     draws: int = 1,
-) -> StatisticalClaim:
+) -> BoundedShare:
     """Bound the share of X₀ on which the closed loop succeeds, from fresh states.
 
     The states must be fresh, drawn by a generator on which nothing was trained or chosen, and their number fixed in
@@ -167,11 +167,11 @@ def statistical_claim(
         draws: from which this one may be chosen, itself included.
 
     Raises:
-        ValueError: as sampled_claim and lower_bound.
+        ValueError: as count_successes and lower_bound.
     """
     lower_bound(0, samples, confidence)  # refuse before the work
-    sampled = sampled_claim(rollout, problem, tolerances, samples, generator, batch)
-    return StatisticalClaim(**vars(sampled), confidence=confidence, share=share, draws=draws)
+    sampled = count_successes(rollout, problem, tolerances, samples, generator, batch)
+    return BoundedShare(**vars(sampled), confidence=confidence, share=share, draws=draws)
 
 
 FEWEST = 16  # states that are counted as failures together where one of them diverges

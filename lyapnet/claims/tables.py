@@ -1,9 +1,11 @@
 """What certificates show in a terminal."""
 
+import io
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rich.console import Console
 from rich.table import Table
 
 
@@ -18,15 +20,23 @@ def progress_told_to(stages: Callable[..., None], kind: str) -> Callable[[Any], 
     return report
 
 
-def certificate_table(title: str, result: Mapping[str, Any], labels: Mapping[str, str]) -> Table:
-    """A claim, its verdict and its numbers."""
-    table = Table("", "", title=f"{title}\n{result['kind']}: {result['verdict']}", show_header=False)
-    for label, value in certificate_rows(result, labels):
+def table_of(title: str, rows: Iterable[tuple[str, str]]) -> Table:
+    """The numbers of a claim."""
+    table = Table("", "", title=title, show_header=False)
+    for label, value in rows:
         table.add_row(label, value)
     return table
 
 
-def certificate_rows(result: Mapping[str, Any], labels: Mapping[str, str]) -> list[tuple[str, str]]:
+def text_of(table: Table) -> str:
+    """A table as it is printed."""
+    console = Console(file=io.StringIO(), width=100, highlight=False, markup=False)
+    with console.capture() as printed:
+        console.print(table)
+    return printed.get().rstrip()
+
+
+def rows_of(result: Mapping[str, Any], labels: Mapping[str, str]) -> list[tuple[str, str]]:
     """What the numbers of a claim are called, and the numbers; without those that are not known."""
     known = {key: label for key, label in labels.items() if result.get(key) not in (None, [], {})}
     return [(label, _shown(key, result[key])) for key, label in known.items()]

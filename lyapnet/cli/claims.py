@@ -1,70 +1,135 @@
-"""Options of the commands that certify."""
+"""Options that several commands that certify share, beside those of each claim."""
 
+import json
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperOption
+from rich.console import Console
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.sizes import THREADS
+from lyapnet.claims.claim import option
+from lyapnet.cli.options import Given, read_pushes
 
-
-def number(holds: Callable[[float], bool], expected: str, remedy: str, help: str) -> Any:
-    """A number of which more than its type is expected."""
-
-    def checked(parameter: TyperOption, value: float | None) -> float | None:
-        if value is not None and not holds(value):
-            raise UsageError(f"Expected {parameter.opts[0]} {expected}, got {value:g}; {remedy}.")
-        return value
-
-    return typer.Option(help=help, callback=checked)
-
-
-Radius = Annotated[
-    float | None,
-    number(
-        lambda r: 0 <= r < math.inf, "≥ 0", "give it in the norm of x",
-        "Success at T needs ‖x(T) − goal‖ within it; not asked for if none.",
-    ),
-]  # fmt: skip
-States = Annotated[str | None, typer.Option("--set", help="The set D, as lower:upper,…; found if none.", metavar="BOX")]
-Seconds = Annotated[
-    float, number(lambda s: 0 < s < math.inf, "> 0", "a proof needs some", "When to stop undecided.")
-]  # fmt: skip
-Delta = Annotated[
-    float | None,
-    number(
-        lambda d: 0 <= d < math.inf, "≥ 0", "give it in cost per second",
-        "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none.",
-    ),
-]  # fmt: skip
 TwoSided = Annotated[bool, typer.Option("--two-sided", help="Bound the optimum from below, too.")]
-Device = Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")]
-Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
-Ray = Annotated[
-    str | None,
-    typer.Option(
-        help="Bound boxes by --workers cores of a Ray cluster: auto, local or ray://host:port.", metavar="ADDRESS"
-    ),
-]
-Disturbance = Annotated[
-    list[str] | None,
-    typer.Option(help="The largest push on the derivative of a state; may be given again.", metavar="STATE=W"),
-]
 Value = Annotated[
     Path | None,
     typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
 ]
 Law = Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")]
-Overrides = Annotated[list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")]
-Refine = Annotated[int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the draw.")]
-Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-FigureFile = Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")]
-ReportFolder = Annotated[
-    Path | None, typer.Option(help="Write report.md, report.json and the figure there.", metavar="FOLDER")
-]
+Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """How long a proof is sought, and by how many."""
+
+    seconds: float = option(60.0, "When to stop undecided.", above=0, remedy="a proof needs some")
+    workers: Workers = 1
+
+    def budget(self, started: float) -> Any:
+        """The same for a claim; its seconds count from when the command began."""
+        from lyapnet.prover.branch_and_bound import Budget
+
+        return Budget(**vars(self), started=started)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchAnywhere(Search):
+    """And where."""
+
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            help="Bound boxes by --workers cores of a Ray cluster: auto, local or ray://host:port.", metavar="ADDRESS"
+        ),
+    ] = None
+    device: Annotated[str, typer.Option(help="Where boxes are bounded: cpu, or cuda for a GPU.")] = "cpu"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refining:
+    """Whether a proof is kept, or what failed is trained on with: not both."""
+
+    overrides: Annotated[
+        list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
+    ] = None
+    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None
+    refine: Annotated[
+        int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
+    ] = 0
+
+    def require_fitting(self, given: Given) -> None:
+        """Refuse what does not go with --refine, and overrides without it."""
+        if self.refine and self.keep is not None:
+            raise UsageError("Expected --keep or --refine, got both; each round proves something about another V.")
+        if self.refine and given.at:
+            raise UsageError("Expected --at or --refine, got both; training goes on with the whole family.")
+        if self.overrides and not self.refine:
+            raise UsageError(f"Expected overrides with --refine ROUNDS, got {' '.join(self.overrides)!r}; add it.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """The draw, and how its certificate is shown."""
+
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False
+    figure: Annotated[Path | None, typer.Option(help="Draw the claim.", metavar="FILE")] = None
+    report: Annotated[
+        Path | None, typer.Option(help="Write report.md, report.json and the figure there.", metavar="FOLDER")
+    ] = None
+
+    def require_writable(self, keep: str | None = None) -> None:
+        """Refuse at once what could not be written after the work."""
+        from lyapnet.claims.report import require_writable
+
+        require_writable(self.figure, self.report, keep)
+
+    def show(self, certificate: Any, given: Given) -> None:
+        """The certificate as a table, unless JSON is asked for."""
+        given.report("comparing with the optimum")
+        certificate.result  # noqa: B018  # computed now, where it is told
+        given.report.rest()
+        if not self.as_json:
+            Console(highlight=False, markup=False).print(certificate.table(given.title))
+
+    def write(self, certificate: Any, given: Given) -> None:
+        """The certificate as JSON, and its figure and report, where they are asked for."""
+        from lyapnet.claims.report import write_outputs
+
+        if self.as_json:
+            print(json.dumps(certificate.result, allow_nan=False))
+        command = certificate.command(str(given.checkpoint), given.at or [], **given.again)
+        if self.figure is not None or self.report is not None:
+            given.report("drawing and writing")
+        for path in write_outputs(certificate, given.checkpoint, command, self.figure, self.report):
+            given.report.rest()
+            note_written(path)
+
+
+def note_written(path: Path) -> None:
+    """Say on stderr that a file was written."""
+    Console(stderr=True, highlight=False, markup=False).print(f"wrote {path}", soft_wrap=True)
+
+
+def pushes_of_one_state(named: list[str]) -> tuple[str, list[float]]:
+    """The state and the pushes that ["velocity=0,0.05,0.1"] names, in increasing order, each once.
+
+    Raises:
+        UsageError: more than one state is pushed, or what is named is no number ≥ 0.
+    """
+    if len(named) != 1:
+        raise UsageError(
+            f"Expected one --disturbance STATE=W,W,… where it has several values, got {len(named)} of them; push one "
+            "state."
+        )
+    state, _, values = named[0].partition("=")
+    pushes = {read_pushes([f"{state}={value}"])[state] for value in values.split(",")}
+    wrong = [w for w in pushes if not 0 <= w < math.inf]
+    if wrong:
+        raise UsageError(f"Expected disturbances ≥ 0, got {wrong[0]:g}; give the largest |w| in units of ẋ.")
+    return state, sorted(pushes)

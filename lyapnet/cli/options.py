@@ -1,9 +1,11 @@
 """What several commands share: options, and the controller that a command is given."""
 
+import dataclasses
 import functools
 import inspect
+import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +13,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
+from lyapnet.base.errors import UsageError
+from lyapnet.claims.claim import check_number, flag_of, kind_of_number
 from lyapnet.training.stages import PATIENCE, Stages
 
 FIRST = 1.0  # seconds after which a command says what it is doing
@@ -22,13 +26,6 @@ Checkpoint = Annotated[Path, typer.Argument(help="A checkpoint of a run, or zoo:
 At = Annotated[
     list[str] | None,
     typer.Option(help="Of a family, one member: NAME=VALUE for each parameter.", metavar="NAME=VALUE"),
-]
-Parameter = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="A parameter of the plant that may lie anywhere between; u and V stay. May be given again.",
-        metavar="NAME=LOWER:UPPER",
-    ),
 ]
 OWN = {
     "system": "a system", "network": "a network", "cost": "a cost", "controls": "a control set",
@@ -66,8 +63,6 @@ class Given:
 
     def with_functions(self, value: Path | None, law: Path | None) -> "Given":
         """The same with V and u of their own files, where there are both; a config in the place of a checkpoint."""
-        from lyapnet.base.errors import UsageError
-
         if value is None and law is None:
             return self
         if value is None or law is None or self.at:
@@ -117,13 +112,24 @@ def stages_of(name: str) -> Stages:
 
 
 def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
-    """A command with a Given among its parameters, as one with CKPT in its place, --system and its like, and --at."""
-    parameters = inspect.signature(command).parameters.values()
+    """A command with a Given among its parameters, as one with CKPT in its place, --system and its like, and --at.
+
+    A parameter of another dataclass stands for an option of each of its fields; see options_of.
+    """
+    parameters = list(inspect.signature(command).parameters.values())
     (given,) = (parameter.name for parameter in parameters if parameter.annotation is Given)
+    written = {parameter.name for parameter in parameters}
+    groups: dict[str, tuple[Any, list[inspect.Parameter]]] = {
+        parameter.name: (parameter.annotation, options_of(parameter.annotation, written))
+        for parameter in parameters if parameter.name != given and dataclasses.is_dataclass(parameter.annotation)
+    }  # fmt: skip
 
     @functools.wraps(command)
     def run(**options: Any) -> None:
         own, checkpoint = {name: options.pop(name) for name in OWN}, options.pop("checkpoint")
+        for name, (made, each) in groups.items():
+            taken = {option.name: options.pop(option.name) for option in each}
+            options[name] = made(**{name: _read(name, value) for name, value in taken.items()})
         with stages_of(command.__name__) as report:
             report(f"importing torch for {checkpoint}")
             import torch
@@ -139,25 +145,131 @@ def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:
     def keyword(name: str, annotation: Any, **more: Any) -> inspect.Parameter:
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, **more)
 
-    checkpoint = keyword("checkpoint", Checkpoint)
-    *own_options, debug = (
-        checkpoint if parameter.name == given else parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for parameter in parameters
-    )
+    taken = list[inspect.Parameter]()
+    for parameter in parameters:
+        if parameter.name == given:
+            taken.append(keyword("checkpoint", Checkpoint))
+        elif parameter.name in groups:
+            taken += groups[parameter.name][1]
+        else:
+            taken.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
     named = (
         keyword(name, Annotated[str | None, typer.Option(help=f"module:Class of {what} of your own.")], default=None)
         for name, what in OWN.items()
     )
-    taken = [*own_options, *named, keyword("at", At, default=None), debug]
+    taken[-1:] = [*named, keyword("at", At, default=None), taken[-1]]  # the last one is --debug
     vars(run)["__signature__"] = inspect.Signature(taken)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in taken}
     return run
 
 
+def options_of(cls: Any, written: Container[str] = ()) -> list[inspect.Parameter]:
+    """The options of the command line that the fields of a dataclass stand for.
+
+    A field declared with lyapnet.claims.claim.option has its sentence, its rule and its name from there; any other says
+    itself what it is, as Annotated[…, typer.Option(…)].
+
+    Args:
+        written: parameters that a command has by itself, which stand for no field.
+    """
+    return [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, annotation=_annotation(f), default=f.default)
+        for f in dataclasses.fields(cls)
+        if f.name not in written and flag_of(f) is not None
+    ]
+
+
+def _annotation(f: dataclasses.Field[Any]) -> Any:
+    """A field as an option of the command line, with its rule."""
+    if "doc" not in f.metadata:
+        return f.type
+    name, kind, rule = f"--{flag_of(f)}", kind_of_number(f), f.metadata
+    if kind is None:
+        several, _ = READ[f.name]
+        texts = list[str] if several else str
+        return Annotated[texts | None, typer.Option(name, help=rule["doc"], metavar=rule["metavar"])]
+
+    def checked(value: float | None) -> float | None:
+        check_number(f, value, name)
+        return value
+
+    least = rule["bounds"][1] if kind is int else None
+    return Annotated[f.type, typer.Option(name, help=rule["doc"], min=least, callback=checked)]
+
+
+def _read(name: str, value: Any) -> Any:
+    """The value of a field from what its option was given."""
+    return READ[name][1](value) if name in READ and value is not None else value
+
+
+def read_set(text: str) -> list[list[float]]:
+    """[lower, upper] of "-1:1,-0.7:0.7": bounds of each state, in the order of the system.
+
+    Raises:
+        UsageError: there are none.
+    """
+    try:
+        lower, upper = zip(*((float(low), float(high)) for low, high in _pairs(text)), strict=True)
+        if not all(-math.inf < low <= high < math.inf for low, high in zip(lower, upper, strict=True)):
+            raise ValueError("no bounds")
+    except ValueError as error:
+        raise UsageError(
+            f"Expected --set as lower:upper for each state, got {text!r}; for example --set=-1.6:1.6,-2.6:2.6."
+        ) from error
+    return [list(lower), list(upper)]
+
+
+def _pairs(text: str) -> list[list[str]]:
+    return [part.split(":") for part in text.split(",")]
+
+
+def read_pushes(named: Sequence[str]) -> dict[str, float]:
+    """The largest push on the derivative of each state, by its name, from "velocity=0.1".
+
+    Raises:
+        UsageError: no number.
+    """
+    found = dict[str, float]()
+    for text in named:
+        name, _, value = text.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError as error:
+            raise UsageError(
+                f"Expected --disturbance STATE=W with a number, got {text!r}; for example {name}=0.1."
+            ) from error
+    return found
+
+
+def read_intervals(named: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """The ends of each parameter's interval, by its name, from "mass=0.9:1.1".
+
+    Raises:
+        UsageError: what is named is no interval, or stands there twice.
+    """
+    found = dict[str, tuple[float, float]]()
+    for text in named:
+        name, _, interval = text.partition("=")
+        try:
+            lower, upper = (float(end) for end in interval.split(":"))
+        except ValueError as error:
+            raise UsageError(
+                f"Expected --parameter NAME=LOWER:UPPER with two numbers, got {text!r}; for example mass=0.9:1.1."
+            ) from error
+        if name in found:
+            raise UsageError(f"Expected --parameter once for each parameter, got {name} twice; leave one of them out.")
+        found[name] = (lower, upper)
+    return found
+
+
+READ: dict[str, tuple[bool, Callable[[Any], Any]]] = {
+    "states": (False, read_set), "disturbance": (True, read_pushes), "parameters": (True, read_intervals),
+}  # fmt: skip
+"""A field that is no number ↦ whether its option may be given again, and how its text is read."""
+
+
 def member_of(controller: Any, at: list[str]) -> Any:
     """The controller of one member of a family, from NAME=VALUE of its parameters."""
-    from lyapnet.base.errors import UsageError
-
     try:
         parameters = {name: float(value) for name, _, value in (each.partition("=") for each in at)}
     except ValueError as error:

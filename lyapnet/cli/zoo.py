@@ -58,7 +58,8 @@ def demo(
         report(f"importing torch for {name}")
         import torch
 
-        from lyapnet.claims.sampling_certificates import statistical_certificate
+        from lyapnet.claims.certify import certify
+        from lyapnet.claims.kinds import Statistical
         from lyapnet.evaluation.afterwards import share_at_goal
         from lyapnet.evaluation.animation import Film
         from lyapnet.evaluation.figures import trajectories
@@ -70,7 +71,7 @@ def demo(
         report("closed loops, and a certificate of them")
         controller = one.load()
         trajectory, ratio, error = one.measured(controller)
-        certificate = statistical_certificate(controller, STATES, 1 - 1e-3, 0.95)
+        certificate = certify(controller, Statistical(samples=STATES, confidence=1 - 1e-3, share=0.95))
         report("closed loops after T")
         measured = {
             "cost / optimum, ratio of the means": f"{ratio:.4f}",

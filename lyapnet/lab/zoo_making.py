@@ -18,7 +18,8 @@ import torch
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_json, write_json
-from lyapnet.claims.sampling_certificates import statistical_certificate
+from lyapnet.claims.certify import certify
+from lyapnet.claims.kinds import Statistical
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.loading import load
 from lyapnet.evaluation.measurement import evaluation
@@ -81,7 +82,7 @@ def _measurements(controller: Controller, checkpoint: Path) -> dict[str, Any]:
     if optima is None or not (known := optima.isfinite()).any():
         raise UsageError(f"Expected optima to compare with, got none ({measured.notes[0]}); install lyapnet[oracle].")
     result = measured.result()
-    certificate = statistical_certificate(controller).result
+    certificate = certify(controller, Statistical()).result
     return {
         "evaluation": {key: result[key] for key in EVALUATED if key in result},
         "worst_ratio": float((measured.table.cost / optima)[known].max()),

@@ -6,8 +6,8 @@ from lyapnet.base.errors import Interrupted
 class Stop:
     """Whether the user has asked a search to stop; asked before it began, or once more, it stops at once."""
 
-    def __init__(self) -> None:
-        self.asked = self.searching = False
+    asked: bool = False
+    searching: bool = False
 
     def ask(self, *_: object) -> None:
         """Take a signal."""

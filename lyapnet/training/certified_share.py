@@ -3,7 +3,7 @@
 from lightning.pytorch import LightningModule, Trainer
 
 from lyapnet.base.random_streams import CERTIFICATION, stream
-from lyapnet.claims import StatisticalClaim, statistical_claim
+from lyapnet.claims.statistical import BoundedShare, bound_share
 from lyapnet.training.curves import log_scalars, with_loggers
 from lyapnet.training.learner import Learner
 from lyapnet.training.recurring import Recurring
@@ -35,9 +35,9 @@ class CertifiedShare(Recurring):
             bounds = self.claim_of(member, trainer.global_step).named_bounds
             log_scalars(trainer, loggers, {f"{name}/val": bound for name, bound in bounds.items()})
 
-    def claim_of(self, member: Learner, step: int) -> StatisticalClaim:
+    def claim_of(self, member: Learner, step: int) -> BoundedShare:
         """The claim about a member at a step, with the defaults of `lyapnet certify statistical`: no radius."""
-        return statistical_claim(
+        return bound_share(
             member.rollout, member.problem, member.program.tolerances(), self.states, self.confidence,
             generator=stream(member.seed, CERTIFICATION, step),
         )  # fmt: skip

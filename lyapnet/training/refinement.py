@@ -12,12 +12,12 @@ from torch import Tensor
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file, write_atomically
 from lyapnet.base.random_streams import CERTIFICATION, stream
-from lyapnet.claims import violations
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.controller.loading import require_parts
 from lyapnet.experiment.assembly import Parts, build_program
 from lyapnet.experiment.config import Config, config_from_plain, load_config, to_plain, to_yaml
+from lyapnet.prover.counterexamples import violations
 from lyapnet.training.experiment import train
 from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
 

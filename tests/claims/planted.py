@@ -5,7 +5,7 @@ from functools import cache
 import torch
 from scipy.linalg import solve_continuous_are
 
-from lyapnet.claims import DecreaseCondition
+from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import DoubleIntegrator

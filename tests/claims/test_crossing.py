@@ -4,12 +4,13 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, DecreaseCondition, sound_claim
 from lyapnet.claims.checking import check
 from lyapnet.claims.crossing import beginning_level, crossing_level, find_violation
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.controller.controller import Controller
-from lyapnet.prover.condition import bounded_condition, own_constraints
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition, bounded_condition, own_constraints
 from lyapnet.task.constraints import Ball, Constraints, StateLimits
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import DoubleIntegrator
@@ -99,7 +100,7 @@ def task_within(constraints):
 
 
 def claim(constraints, **options):
-    return sound_claim(
+    return prove_funnel(
         loop(riccati()), task_within(constraints), **{"alpha": 0.9, "delta": 0.02, "budget": Budget(20), **options}
     )
 
@@ -190,9 +191,9 @@ def test_the_condition_is_not_asked_for_where_a_constraint_excludes_the_state():
     bumped = Formula(lambda t, x: quadratic(t, x) + 0.05 * torch.exp(-1500 * ((x - place) ** 2).sum(-1)))
     closed_loop = hjb_loop(DoubleIntegrator(), cost(), bumped)
     task, box = problem().replaced(initial_states=Box([-0.25, -0.25], [0.25, 0.25])), Box([-0.8, -1.2], [0.8, 1.2])
-    assert sound_claim(closed_loop, task, 0.9, 0.02, box, Budget(60, boxes=2000)).verdict == "falsified"
+    assert prove_funnel(closed_loop, task, 0.9, 0.02, box, Budget(60, boxes=2000)).verdict == "falsified"
     slow = task.replaced(constraints=speed(0.65))
-    assert sound_claim(closed_loop, slow, 0.9, 0.02, box, Budget(60)).verdict == "certified"
+    assert prove_funnel(closed_loop, slow, 0.9, 0.02, box, Budget(60)).verdict == "certified"
 
 
 @pytest.mark.gate

@@ -21,8 +21,10 @@ import pytest
 import torch
 
 from lyapnet.base.errors import LyapnetError
-from lyapnet.claims import Budget, funnel, sound_claim
+from lyapnet.claims import funnel
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.cost import Cost, QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.sets import Box, ControlSet
@@ -114,7 +116,7 @@ def claim(system=None, cost=None, V=None, law=HJBPolicy, loop=ClosedLoop, contro
     closed_loop = loop(problem, law(problem, V or Bowl())).double()
     domain = Box([-side] * n, [side] * n)
     options = {"alpha": ALPHA, "delta": DELTA, "states": domain, "budget": Budget(BRIEF, boxes=boxes), **options}
-    return sound_claim(closed_loop, problem, **options)
+    return prove_funnel(closed_loop, problem, **options)
 
 
 def patient():
@@ -846,7 +848,7 @@ def test_a_problem_that_changes_after_its_check_is_certified_as_it_is_then():
     closed_loop = ClosedLoop(problem, HJBPolicy(problem, Bowl())).double()
     domain, budget = Box([-1.0] * 2, [1.0] * 2), Budget(AMPLE, boxes=2000)
     system.add = spike
-    assert sound_claim(closed_loop, problem, ALPHA, DELTA, domain, budget).verdict != "certified"
+    assert prove_funnel(closed_loop, problem, ALPHA, DELTA, domain, budget).verdict != "certified"
     system.add = None
     problem.horizon = Horizon(20, 0.2)
-    assert sound_claim(closed_loop, problem, ALPHA, DELTA, domain, budget).duration == 4.0
+    assert prove_funnel(closed_loop, problem, ALPHA, DELTA, domain, budget).duration == 4.0

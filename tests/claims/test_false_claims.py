@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, sound_claim
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.cost import Cost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem, Linear
@@ -109,7 +110,7 @@ def claim(system, cost, V):
     problem = problem_of(system, cost, steps=20, initial_states=Box([-0.5, -0.5], [0.5, 0.5]))
     closed_loop = ClosedLoop(problem, HJBPolicy(problem, V)).double()
     domain = Box(torch.tensor([-1.0, -1.0]).double(), torch.tensor([1.0, 1.0]).double())
-    return sound_claim(closed_loop, problem, 0.5, 0.02, domain, Budget(AMPLE, boxes=5000))
+    return prove_funnel(closed_loop, problem, 0.5, 0.02, domain, Budget(AMPLE, boxes=5000))
 
 
 @pytest.mark.gate

@@ -5,7 +5,7 @@ import torch
 
 import lyapnet
 from lyapnet.base.errors import UsageError
-from lyapnet.claims.funnel import sound_claim
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.rollout import Rollout
@@ -46,11 +46,11 @@ def test_a_funnel_of_a_family_has_no_members_beside_it():
         "family": {"k": [0.8, 1.2]},
     }))  # fmt: skip
     loop = Rollout(task, HJBPolicy(task, Square())).closed_loop
-    claim = sound_claim(loop, task, 0.5, 0.3, budget=Budget(60))
+    claim = prove_funnel(loop, task, 0.5, 0.3, budget=Budget(60))
     assert claim.verdict == "certified"
     assert (claim.states.lower[1], claim.states.upper[1]) == (0.8, 1.2)
     with pytest.raises(UsageError, match="Expected a set around X₀"):
-        sound_claim(loop, task, 0.5, 0.3, Box([-2.0, 0.9], [2.0, 1.2]))
+        prove_funnel(loop, task, 0.5, 0.3, Box([-2.0, 0.9], [2.0, 1.2]))
     task.system.constants = (0, 1)
     with pytest.raises(UsageError, match="Expected ẋ = 0 for the constants of a system"):
-        sound_claim(loop, task, 0.5, 0.3, Box([-2.0, 0.8], [2.0, 1.2]))
+        prove_funnel(loop, task, 0.5, 0.3, Box([-2.0, 0.8], [2.0, 1.2]))

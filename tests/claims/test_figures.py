@@ -4,11 +4,14 @@ import pytest
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from lyapnet.claims import Counterexample, RegionClaim, SampledClaim, SoundClaim, StatisticalClaim
 from lyapnet.claims.figures import funnel, region, sampled_states
+from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.region import ProvedRegion
 from lyapnet.claims.sampling_certificates import SampledCertificate, StatisticalCertificate
+from lyapnet.claims.statistical import BoundedShare, CountedSuccesses
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.programs import Tolerances
+from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Cartpole, DoubleIntegrator
 from tests.problems import Formula, problem_of
@@ -28,7 +31,11 @@ def claim(rho, dimension=2, wanted=2.0, found=None):
     share = 0.5 if rho > 0 else 0.0
     undecided = torch.empty(0, 1 + dimension)
     D = cube(2.0, dimension)
-    return SoundClaim(0.9, 0.01, 4.0, D, rho, wanted, wanted, share, 0.0, found, 10, 1.0, 0.0, undecided, [])
+    return ProvedFunnel(
+        alpha=0.9, delta=0.01, duration=4.0, states=D, rho=rho, wanted=wanted, least=wanted, volume_share=share,
+        terminal_excess=0.0, counterexample=found, boxes=10, seconds=1.0, remaining_volume=0.0, undecided=undecided,
+        left_out=[],
+    )  # fmt: skip
 
 
 def draw(figure):
@@ -123,7 +130,7 @@ def sampled(held, states=None, limits=None):
     held = torch.cat([held, *([torch.ones_like(held[:, :1])] * (held.shape[1] < 4))], -1)
     held = torch.cat([held, held.all(-1, keepdim=True)], -1)
     states = cube(1.0, 2).sample(len(held), torch.Generator().manual_seed(0)) if states is None else states
-    return SampledClaim(states, held, limits or Tolerances(0.1, 1e-2, 0.05))
+    return CountedSuccesses(states, held, limits or Tolerances(0.1, 1e-2, 0.05))
 
 
 def points(figure):
@@ -158,7 +165,7 @@ def test_the_headline_says_what_is_claimed():
     one = sampled([[True] * 3] * 300)
     figure = SampledCertificate(controller(), one, {}).figure()
     assert figure.axes[0].get_title() == "sampled, unknown: 300 of 300 states succeed"
-    bound = StatisticalClaim(one.states, one.held, one.tolerances, 1 - 1e-6, 0.9)
+    bound = BoundedShare(one.states, one.held, one.tolerances, 1 - 1e-6, 0.9)
     title = StatisticalCertificate(controller(), bound, {}).figure().axes[0].get_title()
     assert title == "statistical, certified: at least 95.499% of X₀, confidence 1 − 1e-06\n300 of 300 states succeed"
 
@@ -176,7 +183,10 @@ def test_a_projection_says_so_and_one_free_state_is_binned():
 
 def region_of(rho, wanted):
     proved = 0.25 if rho > 0 else 0.0
-    return RegionClaim(0.01, cube(2.0, 2), rho, 4.0, wanted, wanted, 0.1, None, -1.0, proved, proved, None, 1.0, [])
+    return ProvedRegion(
+        decay=0.01, states=cube(2.0, 2), rho=rho, rim=4.0, wanted=wanted, least=wanted, hole=0.1, contraction=None,
+        slowest=-1.0, volume_share=proved, region_share=proved, proof=None, seconds=1.0, left_out=[],
+    )  # fmt: skip
 
 
 def test_the_region_is_drawn_with_its_level():

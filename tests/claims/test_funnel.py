@@ -10,22 +10,18 @@ import torch
 from torch import nn
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import (
-    Budget,
-    Counterexample,
-    DecreaseCondition,
-    enclosing_box,
-    prove,
-    sound_claim,
-)
 from lyapnet.claims import funnel as funnels
+from lyapnet.claims.funnel import enclosing_box, prove_funnel
 from lyapnet.loop.rollout import Rollout
 from lyapnet.prover import condition as conditions
 from lyapnet.prover import elementary_functions, taylor
 from lyapnet.prover import proof as proofs
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import faces
-from lyapnet.prover.branch_and_bound import minimum, share_below
+from lyapnet.prover.branch_and_bound import Budget, minimum, share_below
+from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.counterexamples import Counterexample
+from lyapnet.prover.proof import prove
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Linear
 from lyapnet.value.policy import HJBPolicy
@@ -40,7 +36,7 @@ def P():
 
 def certify(closed_loop, **options):
     options = {"alpha": 0.9, "delta": 0.02, "budget": Budget(AMPLE), **options}
-    return sound_claim(closed_loop, problem(), **options)
+    return prove_funnel(closed_loop, problem(), **options)
 
 
 @cache

@@ -6,10 +6,11 @@ import pytest
 import torch
 from scipy.linalg import solve_continuous_are
 
-from lyapnet.claims import Budget, sound_claim
 from lyapnet.claims import ignorable_states as module
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.ignorable_states import ignorable_states
 from lyapnet.loop.rollout import Rollout
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Cartpole, ControlAffineSystem, DoubleIntegrator
@@ -123,14 +124,14 @@ def plain_claim():
     system, cost = DoubleIntegrator(), QuadraticCost(torch.diag(torch.tensor(Q)), [[1.0]], torch.diag(torch.tensor(Q)))
     X0, D = Box([-1.0, -0.7], [1.0, 0.7]), Box([-1.9, -3.4], [1.9, 3.4])
     problem = problem_of(system, cost, 100, DURATION / 100, X0)
-    return sound_claim(hjb_loop(system, cost, quadratic()), problem, states=D, budget=Budget(60), **OPTIONS)
+    return prove_funnel(hjb_loop(system, cost, quadratic()), problem, states=D, budget=Budget(60), **OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def claim():
     torch.set_default_dtype(torch.float64)
     X0, D = Box([-1.0, -0.7, -3.0], [1.0, 0.7, 5.0]), Box([-1.9, -3.4, -0.1], [1.9, 3.4, 0.1])
-    return sound_claim(
+    return prove_funnel(
         loop(), problem_of(Odometer(), None, 100, DURATION / 100, X0), states=D, budget=Budget(60), **OPTIONS
     )
 

@@ -7,16 +7,16 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, region_claim
+from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check, kept_funnel
 from lyapnet.claims.kept_regions import KeptRegion
+from lyapnet.claims.kinds import Funnel, LowerBound, Region
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
-from lyapnet.claims.region_certificate import region_certificate
-from lyapnet.claims.sound_certificate import sound_certificate
-from lyapnet.claims.two_sided_certificate import two_sided_certificate
+from lyapnet.claims.region import prove_region
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import bounded_condition
 from lyapnet.task.sets import Box
 from tests.claims import planted
@@ -34,7 +34,7 @@ def V_of(factor=1.0):
 
 def claimed(path, boxes=4000, V=None, decay=None, states=D):
     V = V_of() if V is None else V
-    return region_claim(loop_of(V, ABOUT), ABOUT, decay, states, Budget(AMPLE, boxes, chunk=256), keep=path)
+    return prove_region(loop_of(V, ABOUT), ABOUT, decay, states, Budget(AMPLE, boxes, chunk=256), keep=path)
 
 
 def checked(path, V=None):
@@ -293,16 +293,16 @@ def test_a_region_is_no_funnel(name, kept):
 def test_a_funnel_is_no_region(kept, tmp_path):
     """One line says what the file is, and it stays what it was."""
     funnel, about = tmp_path / "funnel", Controller(planted.problem(), V_of())
-    options = {"alpha": 0.9, "delta": 0.05, "set": "-2.5:2.5,-4.5:4.5"}
-    assert sound_certificate(about, **options, keep=str(funnel)).verdict == "certified"
+    claim = Funnel(alpha=0.9, delta=0.05, states=[[-2.5, -4.5], [2.5, 4.5]])
+    assert certify(about, claim, keep=funnel).verdict == "certified"
     before = kept.read_bytes(), funnel.read_bytes()
     with pytest.raises(UsageError, match=r"^Expected the proof of a region in .*, got that of a funnel; take another"):
-        region_certificate(about, keep=str(funnel))
-    for make in (sound_certificate, two_sided_certificate):
+        certify(about, Region(), keep=funnel)
+    for claims in ([claim], [claim, LowerBound()]):
         with pytest.raises(
             UsageError, match=r"^Expected the proof of a funnel in .*, got that of a region; take a new"
         ):
-            make(about, **options, keep=str(kept))
+            certify(about, *claims, keep=kept)
     with pytest.raises(UsageError, match=r"^Expected the proof of a funnel in .*, got that of a region; name another"):
         kept_funnel(about, kept)
     assert before == (kept.read_bytes(), funnel.read_bytes())

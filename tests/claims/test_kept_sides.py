@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from lyapnet.base.errors import Interrupted, UsageError
+from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check, kept_funnel
-from lyapnet.claims.sound_certificate import sound_certificate
-from lyapnet.claims.two_sided_certificate import two_sided_certificate
+from lyapnet.claims.kinds import Funnel, LowerBound
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
 from tests.claims.planted import riccati, stationary
@@ -18,7 +18,7 @@ from tests.claims.test_least_cost import problem
 from tests.problems import Formula
 
 pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("batch_sizes_once")]
-SET = "-2.5:2.5,-4.5:4.5"
+SET = [[-2.5, -4.5], [2.5, 4.5]]
 
 
 def controller(factor=1.0):
@@ -28,7 +28,8 @@ def controller(factor=1.0):
 
 
 def both(path, alpha=0.95, delta=0.02, seconds=60.0, states=SET, factor=1.0, report=None):
-    return two_sided_certificate(controller(factor), alpha, delta, states, seconds, keep=str(path), report=report)
+    claim = Funnel(alpha=alpha, delta=delta, states=states)
+    return certify(controller(factor), claim, LowerBound(), budget=seconds, keep=path, report=report)
 
 
 @pytest.fixture(scope="module")
@@ -100,11 +101,11 @@ def test_ctrl_c_in_the_middle_of_the_second_side_keeps_both(whole, tmp_path):
 
 def test_another_question_does_not_go_on(kept):
     before = kept.read_bytes()
-    for options in ({"alpha": 0.94}, {"delta": 0.06}, {"states": "-2.5:2.5,-4.5:4.6"}, {"factor": 0.999}):
+    for options in ({"alpha": 0.94}, {"delta": 0.06}, {"states": [[-2.5, -4.5], [2.5, 4.6]]}, {"factor": 0.999}):
         with pytest.raises(UsageError, match=r"take a new file\.$"):
             both(kept, **options)
     with pytest.raises(UsageError, match=r"take a new file\.$"):  # forms of another degree
-        sound_certificate(controller(), 0.95, 0.02, SET, keep=str(kept))
+        certify(controller(), Funnel(alpha=0.95, delta=0.02, states=SET), keep=kept)
     assert kept.read_bytes() == before
 
 

@@ -11,13 +11,15 @@ import torch
 from scipy.linalg import solve_continuous_are
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, prove
+from lyapnet.claims.certify import certify
 from lyapnet.claims.figures import two_sided
-from lyapnet.claims.least_cost import RiseCondition, least_over_controls, least_pivot, lower_claim
-from lyapnet.claims.two_sided_certificate import two_sided_certificate
+from lyapnet.claims.kinds import Funnel, LowerBound
+from lyapnet.claims.least_cost import RiseCondition, least_over_controls, least_pivot, prove_lower_bound
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.proof import prove
 from lyapnet.task.cost import Cost, QuadraticCost, TargetCost, is_quadratic_about_target
 from lyapnet.task.sets import Box, ControlBox, Unbounded
 from lyapnet.task.systems import DoubleIntegrator, Linear
@@ -42,7 +44,7 @@ def problem(controls=None, cost=None, system=None):
 def claimed(V=None, about=None, beta=0.95, delta=0.02, states=None, boxes=6000, **options):
     about = about or problem()
     loop = ClosedLoop(about, HJBPolicy(about, stationary(riccati()) if V is None else V))
-    return lower_claim(loop, about, beta, delta, states, Budget(100, boxes, chunk=512), **options)
+    return prove_lower_bound(loop, about, beta, delta, states, Budget(100, boxes, chunk=512), **options)
 
 
 @cache
@@ -273,7 +275,9 @@ def test_about_a_target():
     box = Box(target + X0().lower, target + X0().upper).double()
     about = problem_of(DoubleIntegrator(), cost, STEPS, DURATION / STEPS, box)
     V = Formula(lambda t, x: optimum(x - target) + 0 * t)
-    claim = lower_claim(ClosedLoop(about, HJBPolicy(about, V)), about, 0.95, 0.02, budget=Budget(100, 6000, chunk=512))
+    claim = prove_lower_bound(
+        ClosedLoop(about, HJBPolicy(about, V)), about, 0.95, 0.02, budget=Budget(100, 6000, chunk=512)
+    )
     assert claim.verdict == "certified"
     assert claim.everywhere
     assert claim.level == pytest.approx(plain_claim().level, rel=1e-2)
@@ -287,7 +291,7 @@ def test_where_nothing_is_proved_nothing_is_said():
 
 def test_both_sides_of_the_riccati_solution():
     """The ratio of the means is that of α and β and of what δT adds to each side; every optimum lies between."""
-    result = two_sided_certificate(Controller(problem(), stationary(riccati())), 0.95, 0.02).result
+    result = certify(Controller(problem(), stationary(riccati())), Funnel(alpha=0.95, delta=0.02), LowerBound()).result
     assert result["verdict"] == "certified"
     assert result["holds_for"] == "every control"
     assert result["optima_between"] == 1
@@ -302,7 +306,7 @@ def test_one_false_side_is_enough_for_no_certificate():
     """V = 0.9 J* is too low to pay for its law, V = 1.1 J* too high for the optimum."""
     for factor in (0.9, 1.1):
         V = Formula(lambda t, x, factor=factor: factor * optimum(x) + 0 * t)
-        certificate = two_sided_certificate(Controller(problem(), V), 0.97, 0.02, seconds=4.0)
+        certificate = certify(Controller(problem(), V), Funnel(alpha=0.97, delta=0.02), LowerBound(), budget=4)
         assert certificate.verdict != "certified"
 
 

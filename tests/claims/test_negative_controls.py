@@ -6,8 +6,12 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, DecreaseCondition, funnel, prove, sound_claim
+from lyapnet.claims import funnel
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.proof import prove
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import Linear
 from lyapnet.value.calculus import ValueFunction
@@ -57,7 +61,7 @@ def X0(half=0.5):
 def claim(closed_loop, *arguments, **options):
     """The sound claim of a loop on X₀ for 2 s."""
     problem = problem_of(closed_loop.system, steps=20, dt=DURATION / 20, initial_states=X0())
-    return sound_claim(closed_loop, problem, *arguments, **options)
+    return prove_funnel(closed_loop, problem, *arguments, **options)
 
 
 def planted_at_random(seed):

@@ -1,5 +1,6 @@
 """Regions of plants whose parameters are not known: against closed forms, simulated plants, and laws that are told."""
 
+import dataclasses
 import math
 from functools import cache
 
@@ -8,16 +9,21 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, contraction, region, region_claim
+from lyapnet.claims import contraction, region
+from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check
 from lyapnet.claims.contraction import contraction_around
-from lyapnet.claims.plants import parse_parameters, plants_of
+from lyapnet.claims.kinds import Region
+from lyapnet.claims.plants import plants_of
 from lyapnet.claims.receding_decrease import RecedingDecrease
-from lyapnet.claims.region_certificate import RegionCertificate, region_certificate
+from lyapnet.claims.region import prove_region
+from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.cli import main
+from lyapnet.cli.options import read_intervals
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
 from lyapnet.prover.boxes import pieces
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem, DoubleIntegrator, Pendulum
@@ -104,7 +110,7 @@ def quick(monkeypatch):
 
 def claimed(controller, ranges, states=None, boxes=3000, **options):
     D = Box([-1.0] * controller.system.n, [1.0] * controller.system.n) if states is None else states
-    return region_claim(
+    return prove_region(
         controller.closed_loop, controller.problem, None, D, Budget(60, boxes, chunk=64),
         plants=plants_of(controller, ranges) if ranges else None, **options,
     )  # fmt: skip
@@ -274,8 +280,8 @@ def test_pieces_cover_a_box():
 @pytest.mark.gate
 def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_path):
     at, path = leaky(), tmp_path / "plants.proof"
-    options = {"set": "-1:1", "parameter": ["gain=2:3"], "seconds": 20.0}
-    certificate = region_certificate(at, **options, keep=str(path))
+    claim = Region(states=[[-1], [1]], parameters={"gain": (2, 3)})
+    certificate = certify(at, claim, budget=20, keep=path)
     assert certificate.verdict == "certified", "a law is not bound to hold its own plant"
     assert "for each plant of this model with constant gain ∈ [2.0, 3.0]: no closed loop" in certificate.in_words()
     assert "u and V are those made for gain = 1.0: they are not told" in certificate.in_words()
@@ -294,9 +300,9 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     assert (result["verdict"], result["reason"], result["rho"]) == ("certified", None, certificate.result["rho"])
     assert result["parameters"] == {"gain": [2.0, 3.0]}
     whole = path.read_bytes()
-    for others in (["gain=2:3.1"], []):
+    for others in ({"gain": (2, 3.1)}, {}):
         with pytest.raises(UsageError, match=r"Expected the parameters of .*, got others; take another file"):
-            region_certificate(at, **{**options, "parameter": others}, keep=str(path))
+            certify(at, dataclasses.replace(claim, parameters=others), budget=20, keep=path)
     for name, (change, word) in EDITS.items():
         path.write_bytes(whole)
         proofs = kept_proofs.read_proofs(path)
@@ -345,21 +351,21 @@ EDITS = {  # by someone who computes the digest again; the fingerprint is that o
         ("mass=1", "with two numbers, got 'mass=1'"),
         ("mass=a:b", "with two numbers"),
         ("mass=1:2:3", "with two numbers"),
-        ("mass=2:1", "Expected --parameter mass=LOWER:UPPER, LOWER ≤ UPPER and finite, got 'mass=2:1'"),
+        ("mass=2:1", "Expected --parameter mass=LOWER:UPPER, LOWER ≤ UPPER and finite, got (2.0, 1.0)"),
         ("mass=1:inf", "LOWER ≤ UPPER and finite"),
         ("mass=nan:1", "LOWER ≤ UPPER and finite"),
     ],
 )
 def test_what_is_no_interval_is_refused(named, expected):
     with pytest.raises(UsageError) as refused:
-        parse_parameters([named])
+        Region(parameters=read_intervals([named]))
     assert expected in str(refused.value)
 
 
 def test_an_interval_is_named_once():
-    assert parse_parameters(["mass=1:2", "length=-1e-3:0"]) == {"mass": [1.0, 2.0], "length": [-1e-3, 0.0]}
+    assert read_intervals(["mass=1:2", "length=-1e-3:0"]) == {"mass": (1.0, 2.0), "length": (-1e-3, 0.0)}
     with pytest.raises(UsageError, match="Expected --parameter once for each parameter, got mass twice"):
-        parse_parameters(["mass=1:2", "mass=1:3"])
+        read_intervals(["mass=1:2", "mass=1:3"])
 
 
 @pytest.mark.parametrize(

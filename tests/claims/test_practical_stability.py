@@ -9,15 +9,20 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, region, region_claim
+from lyapnet.claims import region
+from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check
-from lyapnet.claims.disturbances.regions import parse_pushes, regions_under_pushes
+from lyapnet.claims.disturbances.regions import RegionsUnderPushes
+from lyapnet.claims.kinds import Region
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import RecedingDecrease
-from lyapnet.claims.region_certificate import RegionCertificate, region_certificate
+from lyapnet.claims.region import prove_region
+from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.cli import main
+from lyapnet.cli.claims import pushes_of_one_state
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import kept_proofs
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import bounded_condition
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.sets import Box
@@ -88,7 +93,7 @@ def test_of_one_state_the_ultimate_bound_is_known(w):
     """ẋ = −x + w(t) with V = x²: V̇ ≤ −λV where |x| ≥ 2W/(2 − λ)."""
     about = problem_of(Linear([[-1.0]], [[0.0]]), None, 100, 0.02, Box([-0.8], [0.8]))
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
-    claim = region_claim(
+    claim = prove_region(
         loop_of(V, about), about, None, Box([-1.0], [1.0]), Budget(100, 1000, chunk=64), disturbance=torch.tensor([w])
     )
     least = 2 * w / (2 - LAMBDA)
@@ -175,7 +180,7 @@ def test_pushes_end_in_every_well():
     """V = x²(x − 2)² is low around 0 and 2, and nothing is said of which of the two a closed loop comes to."""
     about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
     V = Formula(lambda t, x: (x[..., 0] * (x[..., 0] - 2)) ** 2 + 0 * t)
-    claim = region_claim(
+    claim = prove_region(
         loop_of(V, about), about, None, Box([-1.0], [3.0]), Budget(100, 2000, chunk=64),
         disturbance=torch.tensor([0.05]),
     )  # fmt: skip
@@ -350,8 +355,9 @@ def controller():
 
 @pytest.mark.gate
 def test_for_each_size_there_is_a_claim():
-    regions = regions_under_pushes(controller(), ["velocity=0.4,0,0.2,30,0.2"], set="-3:3,-4:4")
-    assert regions.pushes == [0, 0.2, 0.4, 30]
+    about, pushes = controller(), [0.0, 0.2, 0.4, 30.0]
+    claims = [Region(states=D, disturbance={"velocity": w}) for w in pushes]
+    regions = RegionsUnderPushes(about, "velocity", pushes, [certify(about, claim) for claim in claims])
     still, small, large, none = (each.claim for each in regions.certificates)
     assert still.contraction is not None
     assert small.hole == pytest.approx(pushed_claim().hole, rel=1e-3)
@@ -374,20 +380,24 @@ def test_for_each_size_there_is_a_claim():
 
 
 def test_pushes_of_several_sizes_are_of_one_state():
-    assert parse_pushes(["velocity=0.2,0,0.1"], controller()) == ("velocity", [0, 0.1, 0.2])
+    assert pushes_of_one_state(["velocity=0.2,0.4,0,30,0.2"]) == ("velocity", [0, 0.2, 0.4, 30])
     for named, expected in (
         (["velocity=0,1", "position=1"], "Expected one --disturbance STATE=W,W,… .* got 2 of them"),
-        (["speed=0,1"], "of position, velocity, got 'speed=0'"),
         (["velocity=0,a"], "with a number"),
         (["velocity=0,"], "with a number"),
         (["velocity=0,-1"], "Expected disturbances ≥ 0"),
     ):
         with pytest.raises(UsageError, match=expected):
-            parse_pushes(named, controller())
+            pushes_of_one_state(named)
+
+
+def test_another_state_than_those_of_the_system_is_refused():
+    with pytest.raises(UsageError, match="of position, velocity, got 'speed=1'; name one of them"):
+        certify(controller(), Region(disturbance={"speed": 1}))
 
 
 def test_a_certificate_names_its_disturbance_among_its_options():
-    certificate = region_certificate(controller(), set="-3:3,-4:4", disturbance=["velocity=0.2"])
+    certificate = certify(controller(), Region(states=D, disturbance={"velocity": 0.2}))
     assert "--disturbance=velocity=0.2" in certificate.command("best.ckpt")
     assert certificate.claim.hole == pytest.approx(pushed_claim().hole, rel=1e-3)
 

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, region_claim
 from lyapnet.claims.contraction import contraction_around
+from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout import ClosedLoop
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlBox
@@ -40,7 +41,7 @@ def loop_of(V, about):
 
 def claimed(V=None, about=None, states=D, boxes=4000, seconds=100, **options):
     about = about or problem()
-    return region_claim(loop_of(stationary(riccati()) if V is None else V, about), about, None, states,
+    return prove_region(loop_of(stationary(riccati()) if V is None else V, about), about, None, states,
                         Budget(seconds, boxes, chunk=512), **options)  # fmt: skip
 
 
@@ -131,7 +132,7 @@ def test_a_law_that_leaves_further_out_is_falsified():
     system = Linear([[-1.0, 0.0], [0.0, -1.0]], [[0.0], [1.0]])
     V = Formula(lambda t, x: x[..., 0] ** 2 + x[..., 1] ** 2 - x[..., 1] ** 4 / 2 + 0 * t)
     about = problem_of(system, cost(), 100, 0.02, Box([-1.5, -1.5], [1.5, 1.5]))
-    claim = region_claim(loop_of(V, about), about, None, Box([-2.0, -2.0], [2.0, 2.0]), Budget(100, 2000, chunk=512))
+    claim = prove_region(loop_of(V, about), about, None, Box([-2.0, -2.0], [2.0, 2.0]), Budget(100, 2000, chunk=512))
     assert claim.verdict != "certified"
     assert claim.rho < 0.5, "V at (0, 1), beyond which V falls as |x₂| grows"
 
@@ -142,9 +143,9 @@ def test_a_second_well_is_not_taken_for_the_hole():
     system = Linear([[0.0]], [[1.0]])
     V = Formula(lambda t, x: (x[..., 0] * (x[..., 0] - 2)) ** 2 + 0 * t)
     about = problem_of(system, None, 100, 0.02, Box([-0.2], [0.2]))
-    claim = region_claim(loop_of(V, about), about, None, Box([-1.0], [3.0]), Budget(100, 1000, chunk=64))
+    claim = prove_region(loop_of(V, about), about, None, Box([-1.0], [3.0]), Budget(100, 1000, chunk=64))
     assert claim.rho == -math.inf
-    alone = region_claim(loop_of(V, about), about, None, Box([-0.9], [0.9]), Budget(100, 1000, chunk=64))
+    alone = prove_region(loop_of(V, about), about, None, Box([-0.9], [0.9]), Budget(100, 1000, chunk=64))
     assert alone.verdict == "certified"
 
 
@@ -235,7 +236,7 @@ def test_a_hole_below_zero_is_none(well):
     """V̇ ≤ −λ max(V, c) lets V rise there."""
     about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
     V = Formula(lambda t, x: well(x[..., 0]) + 0 * t)
-    claim = region_claim(loop_of(V, about), about, None, Box([-1.0], [1.0]), Budget(5, 1000, chunk=64))
+    claim = prove_region(loop_of(V, about), about, None, Box([-1.0], [1.0]), Budget(5, 1000, chunk=64))
     assert claim.verdict != "certified"
     assert claim.rho == -math.inf
     assert "not above 0 around the goal" in claim.reason
@@ -246,7 +247,7 @@ def test_a_rate_that_is_asked_in_vain_is_not_called_unstable():
     """ẋ = −x with V = x² falls at the rate 2, and no faster."""
     about = problem_of(Linear([[-1.0]], [[0.0]]), None, 100, 0.02, Box([-0.8], [0.8]))
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
-    at = partial(region_claim, loop_of(V, about), about, states=Box([-1.0], [1.0]), budget=Budget(100, 1000, chunk=64))
+    at = partial(prove_region, loop_of(V, about), about, states=Box([-1.0], [1.0]), budget=Budget(100, 1000, chunk=64))
     assert at(1.9).verdict == "certified"
     claim = at(2.1)
     assert claim.verdict != "certified"
@@ -291,7 +292,7 @@ def test_a_constraint_bounds_the_region():
 
 def test_what_is_no_claim_is_refused():
     with pytest.raises(UsageError, match=r"Expected decay > 0, got -1\."):
-        region_claim(loop_of(stationary(riccati()), problem()), problem(), -1.0, D)
+        prove_region(loop_of(stationary(riccati()), problem()), problem(), -1.0, D)
     with pytest.raises(UsageError, match=r"Expected a set around X₀"):
         claimed(states=Box([-0.1, -4.0], [3.0, 4.0]))
     beside = Box([0.2, -0.2], [0.3, 0.2]).double()

@@ -9,20 +9,19 @@ import re
 import pytest
 import torch
 
-from lyapnet.claims import Counterexample, SampledClaim, SoundClaim, StatisticalClaim
+from lyapnet.claims.certify import certify
+from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.kinds import Funnel, Sampled, Statistical
 from lyapnet.claims.report import markdown, report_of, write_outputs
-from lyapnet.claims.sampling_certificates import (
-    SampledCertificate,
-    StatisticalCertificate,
-    sampled_certificate,
-    statistical_certificate,
-)
-from lyapnet.claims.sound_certificate import SoundCertificate, sound_certificate
+from lyapnet.claims.sampling_certificates import SampledCertificate, StatisticalCertificate
+from lyapnet.claims.sound_certificate import SoundCertificate
+from lyapnet.claims.statistical import BoundedShare, CountedSuccesses
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.loading import load
 from lyapnet.experiment.checkpoint import read_checkpoint, write_checkpoint
 from lyapnet.loop.programs import LyapunovProgram, Tolerances, ValueProgram
+from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.task.sets import Box, ControlBox
 from lyapnet.task.systems import DoubleIntegrator
 from tests.problems import Formula, problem_of
@@ -80,7 +79,7 @@ def test_a_report_has_the_limits_of_the_controller(checkpoint):
     """Not those of its config, which may be others."""
 
     def controls_of(**own):
-        certificate = sampled_certificate(load(checkpoint, **own), 3)
+        certificate = certify(load(checkpoint, **own), Sampled(samples=3))
         report = report_of(certificate, checkpoint, "lyapnet certify")
         (line,) = [line for line in markdown(report).splitlines() if line.startswith("| controls |")]
         return report["controls"], line
@@ -131,23 +130,23 @@ def claimed(cls, claim, seed=3):
     return cls(Controller(problem_of(DoubleIntegrator()), V), claim, {"seed": seed})
 
 
-def sampled_claim(successes, limits, cls=SampledClaim, samples=100, **more):
+def count_successes(successes, limits, cls=CountedSuccesses, samples=100, **more):
     held = (torch.arange(samples) < successes)[:, None].expand(samples, 5)
     return cls(torch.zeros(samples, 2), held, limits, **more)
 
 
 def test_a_sampled_claim_in_words():
-    one = claimed(SampledCertificate, sampled_claim(97, Tolerances(0.5, None, 0.05)))
+    one = claimed(SampledCertificate, count_successes(97, Tolerances(0.5, None, 0.05)))
     assert one.in_words().startswith("Of 100 states drawn uniformly from X₀ (seed 3), 97 succeed")
     assert one.in_formulas() == ["‖x(T)‖ ≤ 0.5", "J(x₀) ≤ 1.05 V(0, x₀)"]
     assert "one that fails was found" in one.of_the_verdict()
-    all_succeed = claimed(SampledCertificate, sampled_claim(100, Tolerances(0.5, None, 0.05)))
+    all_succeed = claimed(SampledCertificate, count_successes(100, Tolerances(0.5, None, 0.05)))
     assert "one that fails" not in all_succeed.of_the_verdict()
 
 
 def test_a_bound_is_rounded_down_in_words():
     limits, more = Tolerances(None, 0.01, 0.05), {"confidence": 1 - 1e-6, "share": 0.99}
-    claim = sampled_claim(50, limits, StatisticalClaim, 50, **more)
+    claim = count_successes(50, limits, BoundedShare, 50, **more)
     assert claim.probability_lower_bound == pytest.approx(0.7585776, abs=1e-7)
     one = claimed(StatisticalCertificate, claim)
     assert "With confidence 1 − 1e-06, at least 75.857% of X₀" in one.in_words()
@@ -160,7 +159,7 @@ def funnel(**changes):
         "wanted": 2.0, "least": 2.0, "volume_share": 0.5, "terminal_excess": 0.5, "counterexample": None, "boxes": 10,
         "seconds": 1.0, "remaining_volume": 0.1, "undecided": torch.empty(0, 3), "left_out": [], **changes,
     }  # fmt: skip
-    return claimed(SoundCertificate, SoundClaim(**found))
+    return claimed(SoundCertificate, ProvedFunnel(**found))
 
 
 def test_a_funnel_in_words():
@@ -198,7 +197,7 @@ def test_the_result_is_printed_even_if_the_report_cannot_be_written(checkpoint, 
 
 @pytest.mark.gate
 def test_a_figure_in_any_format_that_is_known(checkpoint, tmp_path):
-    certificate = sampled_certificate(load(checkpoint), 5)
+    certificate = certify(load(checkpoint), Sampled(samples=5))
     for name, start in (("claim.svg", b"<?xml"), ("claim.pdf", b"%PDF")):
         assert [*write_outputs(certificate, checkpoint, "", tmp_path / name, None)] == [tmp_path / name]
         assert (tmp_path / name).read_bytes().startswith(start)
@@ -206,7 +205,7 @@ def test_a_figure_in_any_format_that_is_known(checkpoint, tmp_path):
 
 @pytest.mark.gate
 def test_nothing_is_infinite_in_json(checkpoint):
-    result = sound_certificate(load(checkpoint), alpha=1.0, delta=0.0, seconds=0.1).result
+    result = certify(checkpoint, Funnel(alpha=1.0, delta=0.0), budget=0.1).result
     assert json.dumps(result, allow_nan=False)
     assert result["terminal_excess"] is None, "κ is infinite where no funnel was proved"
 
@@ -214,6 +213,6 @@ def test_nothing_is_infinite_in_json(checkpoint):
 @pytest.mark.parametrize(("program", "told"), [(ValueProgram(), True), (LyapunovProgram(), False)])
 def test_a_value_function_that_is_no_bound_is_told_what_to_do(program, told):
     V = Formula(lambda t, x: 1e-3 * (x**2).sum(-1))
-    certificate = statistical_certificate(Controller(problem_of(DoubleIntegrator()), V, program=program), samples=50)
+    certificate = certify(Controller(problem_of(DoubleIntegrator()), V, program=program), Statistical(samples=50))
     assert certificate.verdict == "falsified"
     assert ("program.name=lyapunov" in certificate.result.get("advice", "")) is told

@@ -7,7 +7,7 @@ import torch
 from scipy.stats import binom
 
 from lyapnet.base.errors import DivergenceError
-from lyapnet.claims import lower_bound, sampled_claim, statistical_claim
+from lyapnet.claims.statistical import bound_share, count_successes, lower_bound
 from lyapnet.evaluation.oracles.riccati import discrete_riccati
 from lyapnet.loop.programs import Tolerances
 from lyapnet.loop.rollout import Rollout
@@ -72,7 +72,7 @@ def test_impossible_counts_and_confidences_are_refused(arguments):
 
 def test_a_good_value_function_is_certified(scalar):
     # V_{n+1} − V_n + Δt ℓ ≤ 0 up to O(Δt) where V exceeds the optimum by a little
-    claim = statistical_claim(scalar(factor=1.1), problem(), Tolerances(radius=0.6, cost=0.05), samples=2000)
+    claim = bound_share(scalar(factor=1.1), problem(), Tolerances(radius=0.6, cost=0.05), samples=2000)
     assert claim.successes == dict.fromkeys(("decrease", "terminal", "cost", "constraints", "all"), 2000)
     assert claim.verdict == "certified"
     assert claim.probability_lower_bound == pytest.approx(1e-6 ** (1 / 2000))
@@ -80,7 +80,7 @@ def test_a_good_value_function_is_certified(scalar):
 
 
 def test_a_value_below_the_cost_is_falsified(scalar):
-    claim = statistical_claim(scalar(factor=0.5), problem(), Tolerances(radius=0.6), samples=2000)
+    claim = bound_share(scalar(factor=0.5), problem(), Tolerances(radius=0.6), samples=2000)
     assert claim.verdict == "falsified"
     assert claim.successes["cost"] == 0
     assert torch.equal(claim.failures, claim.states)
@@ -89,7 +89,7 @@ def test_a_value_below_the_cost_is_falsified(scalar):
 def test_a_radius_that_some_states_miss_gives_their_share(scalar):
     rollout = scalar()
     reach = float(rollout(torch.ones(1, 1)).x[-1].detach().abs())
-    claim = statistical_claim(rollout, problem(), Tolerances(radius=0.7 * reach, cost=1e-6), samples=2000)
+    claim = bound_share(rollout, problem(), Tolerances(radius=0.7 * reach, cost=1e-6), samples=2000)
     share = claim.shares["terminal"]
     assert share == pytest.approx(0.7, abs=0.05)
     assert claim.lower_bounds["terminal"] < 0.7 < 1 - lower_bound(2000 - int(2000 * share), 2000, 1 - 1e-6)
@@ -99,13 +99,13 @@ def test_a_radius_that_some_states_miss_gives_their_share(scalar):
 
 
 def test_too_few_samples_leave_it_unknown(scalar):
-    claim = statistical_claim(scalar(factor=1.1), problem(), Tolerances(radius=0.6, cost=0.05), samples=100)
+    claim = bound_share(scalar(factor=1.1), problem(), Tolerances(radius=0.6, cost=0.05), samples=100)
     assert claim.verdict == "unknown"
 
 
 def test_batches_do_not_change_the_claim(scalar):
     claims = [
-        sampled_claim(scalar(), problem(), Tolerances(0.1), 100, torch.Generator().manual_seed(0), batch)
+        count_successes(scalar(), problem(), Tolerances(0.1), 100, torch.Generator().manual_seed(0), batch)
         for batch in (7, 100)
     ]
     assert claims[0].successes == claims[1].successes
@@ -119,18 +119,18 @@ def test_divergent_closed_loops_count_as_failures(scalar):
             raise DivergenceError("Expected a finite closed loop, got none.")
         return rollout(x0)
 
-    claim = sampled_claim(diverging, problem(), Tolerances(radius=0.6, cost=0.05), samples=1000)
+    claim = count_successes(diverging, problem(), Tolerances(radius=0.6, cost=0.05), samples=1000)
     beyond = int((problem().initial_states.sample(1000, torch.Generator().manual_seed(0)) > 0.99).sum())
     assert 0 < 1000 - claim.successes["all"] <= 16 * 3 * max(beyond, 5)
     assert claim.verdict == "falsified"
 
 
 def test_sampling_never_certifies(scalar):
-    assert sampled_claim(scalar(factor=1.1), problem(), Tolerances(0.6, cost=0.05)).verdict == "unknown"
+    assert count_successes(scalar(factor=1.1), problem(), Tolerances(0.6, cost=0.05)).verdict == "unknown"
 
 
 def test_no_samples_and_negative_tolerances_are_refused(scalar):
     with pytest.raises(ValueError, match="samples"):
-        sampled_claim(scalar(), problem(), Tolerances(0.1), samples=0)
+        count_successes(scalar(), problem(), Tolerances(0.1), samples=0)
     with pytest.raises(ValueError, match="radius"):
         Tolerances(radius=-1.0)

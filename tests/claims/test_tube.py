@@ -9,14 +9,16 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_lyapunov
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget
+from lyapnet.claims.certify import certify
+from lyapnet.claims.kinds import Tube
 from lyapnet.claims.tubes import enclosure
-from lyapnet.claims.tubes.certificate import TubeCertificate, tube_certificate
+from lyapnet.claims.tubes.certificate import TubeCertificate
 from lyapnet.claims.tubes.coordinates import Moving, ratio_of, rotated, turning
-from lyapnet.claims.tubes.tube import tube_claim
+from lyapnet.claims.tubes.tube import prove_tube
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.prover import bounds
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.constraints import StateLimits
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
@@ -59,12 +61,12 @@ def damped(t, x):
 @pytest.fixture(scope="module")
 def straight():
     """Of the linear system without a law."""
-    return tube_claim(controller(), Budget(60))
+    return prove_tube(controller(), Budget(60))
 
 
 @pytest.fixture(scope="module")
 def swung():
-    return tube_claim(controller(Swinging(), Formula(damped)), Budget(60))
+    return prove_tube(controller(Swinging(), Formula(damped)), Budget(60))
 
 
 def final(about, x0):
@@ -116,7 +118,7 @@ def test_a_second_integrator_stays_within(swung):
 @pytest.mark.gate
 def test_the_machine_code_encloses_the_same(swung, monkeypatch):
     monkeypatch.setattr(bounds, "MANY", 10**9 if swung.steps > bounds.MANY else 0)
-    other = tube_claim(controller(Swinging(), Formula(damped)), Budget(60))
+    other = prove_tube(controller(Swinging(), Formula(damped)), Budget(60))
     torch.testing.assert_close(torch.tensor(other.mean_cost), torch.tensor(swung.mean_cost), rtol=1e-9, atol=1e-12)
     torch.testing.assert_close(other.ends, swung.ends, rtol=1e-8, atol=1e-10)
 
@@ -128,10 +130,10 @@ def limit(bound):
 @pytest.mark.gate
 def test_constraints_are_kept_or_violated_and_which_is_proved(straight):
     peak = float(straight.ranges[..., 0, 1].max())
-    kept = tube_claim(controller(constraints=limit(1.05 * peak)), Budget(60))
+    kept = prove_tube(controller(constraints=limit(1.05 * peak)), Budget(60))
     assert kept.verdict == "certified"
     assert list(kept.constraints) == ["angle"]
-    violated = tube_claim(controller(constraints=limit(0.9 * peak)), Budget(60))
+    violated = prove_tube(controller(constraints=limit(0.9 * peak)), Budget(60))
     assert violated.verdict == "falsified"
     x0 = torch.tensor(violated.violating).double()
     A, t = torch.tensor([[0.0, 2.0], [-2.0, -0.5]]).double(), torch.linspace(0, T, 200).double()
@@ -141,7 +143,7 @@ def test_constraints_are_kept_or_violated_and_which_is_proved(straight):
 @pytest.mark.gate
 def test_the_end_within_a_radius(straight):
     radii = 1.001 * straight.reach, 0.5 * straight.reach
-    asked = [tube_claim(controller(), Budget(60), radius=r).verdict for r in radii]
+    asked = [prove_tube(controller(), Budget(60), radius=r).verdict for r in radii]
     assert asked == ["certified", "falsified"]
 
 
@@ -154,8 +156,8 @@ class Escaping(Swinging):
 
 @pytest.mark.gate
 def test_what_escapes_is_not_proved():
-    assert tube_claim(controller(Escaping(), half=0.7), Budget(60)).verdict == "certified"
-    claim = tube_claim(controller(Escaping(), half=1.2), Budget(60, 100))
+    assert prove_tube(controller(Escaping(), half=0.7), Budget(60)).verdict == "certified"
+    claim = prove_tube(controller(Escaping(), half=1.2), Budget(60, 100))
     assert claim.verdict == "unknown"
     assert 0 < claim.volume_share < 2.2 / 2.4
     assert float(claim.cells.upper[:, 0].max()) < 1
@@ -186,7 +188,7 @@ class Pretending(Escaping):
 
 def test_a_closed_loop_that_is_not_its_parts_is_refused():
     with pytest.raises(UsageError, match="runs by"):
-        tube_claim(controller(Pretending()), Budget(4))
+        prove_tube(controller(Pretending()), Budget(4))
 
 
 advanced = enclosure.nominal.advanced
@@ -210,7 +212,7 @@ def test_simulations_are_not_believed(monkeypatch):
     """Polynomials along closed loops that are not are further off, and the tube is as much wider."""
     monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
     about = controller(Swinging(), Formula(damped))
-    claim = tube_claim(about, Budget(20))
+    claim = prove_tube(about, Budget(20))
     wrong, bounded = outside(claim, about)
     assert bounded > 0
     assert wrong == 0
@@ -228,7 +230,7 @@ def test_without_the_bounds_they_would_be(monkeypatch):
 
     monkeypatch.setattr(enclosure._Tube, "_bounded", careless)
     about = controller(Swinging(), Formula(damped))
-    assert outside(tube_claim(about, Budget(20)), about)[0] > 0
+    assert outside(prove_tube(about, Budget(20)), about)[0] > 0
 
 
 def test_the_certificate_and_its_figure(swung):
@@ -241,7 +243,7 @@ def test_the_certificate_and_its_figure(swung):
 
 
 def test_two_workers_prove_the_same(swung):
-    two = tube_certificate(controller(Swinging(), Formula(damped)), seconds=60, workers=2).claim
+    two = certify(controller(Swinging(), Formula(damped)), Tube(), budget=Budget(60, workers=2)).claim
     assert two.mean_cost == pytest.approx(swung.mean_cost, rel=1e-9)
     assert two.volume_share == swung.volume_share == 1
 

@@ -9,11 +9,15 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget
-from lyapnet.claims.tubes import two_sided
-from lyapnet.claims.tubes.two_sided import TwoSidedTube, two_sided_tube
+from lyapnet.claims.certify import certify
+from lyapnet.claims.from_below import LowerBoundCertificate
+from lyapnet.claims.kinds import LowerBound, Tube
+from lyapnet.claims.tubes.certificate import TubeCertificate
+from lyapnet.claims.two_sided import TwoSidedCertificate
 from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
+from lyapnet.prover import branch_and_bound
+from lyapnet.prover.branch_and_bound import Budget
 from tests.claims.planted import X0, riccati, stationary
 from tests.claims.test_least_cost import optimum, problem
 from tests.problems import Formula
@@ -29,14 +33,16 @@ def in_continuous_time():
     return problem().in_steps(method="rk4")
 
 
-def both_sides(factor=1.0, beta=BETA, **options):
+def both_sides(factor=1.0, beta=BETA, radius=None, states=None, budget=60):
     V = Formula(lambda t, x: factor * optimum(x) + 0 * t)
-    return two_sided_tube(Controller(in_continuous_time(), V), beta, DELTA, **options)
+    below = LowerBound(beta=beta, delta=DELTA, states=states)
+    return certify(Controller(in_continuous_time(), V), Tube(radius=radius), below, budget=budget)
 
 
 @pytest.fixture(scope="module")
 def riccatis():
-    return two_sided_tube(Controller(in_continuous_time(), stationary(riccati())), BETA, DELTA)
+    controller = Controller(in_continuous_time(), stationary(riccati()))
+    return certify(controller, Tube(), LowerBound(beta=BETA, delta=DELTA))
 
 
 @pytest.mark.gate
@@ -55,7 +61,7 @@ def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
 @pytest.mark.gate
 def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
     """V = 0.8 J* bounds the optimum from below, and its law is not the optimal one."""
-    result = both_sides(0.8, seconds=30).result
+    result = both_sides(0.8, budget=30).result
     assert result["verdict"] == "certified"
     assert result["certified_ratio"] > 1.2 * riccatis.result["certified_ratio"]
     assert result["optima_between"] == 1
@@ -64,24 +70,23 @@ def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
 @pytest.fixture
 def few_boxes(monkeypatch):
     """Of each side, whatever the seconds."""
-    monkeypatch.setattr(two_sided, "Budget", partial(Budget, boxes=300))
+    monkeypatch.setattr(branch_and_bound, "Budget", partial(Budget, boxes=300))
 
 
 @pytest.mark.gate
-@pytest.mark.usefixtures("few_boxes")
 def test_a_value_that_is_too_high_is_no_bound():
-    certificate = both_sides(1.1)
+    certificate = both_sides(1.1, budget=Budget(60, boxes=300))
     assert certificate.claim.verdict == "certified", "the tube itself is none the worse"
     assert certificate.verdict != "certified"
     assert certificate.result["lower_reason"] is not None
-    below, x0 = certificate.below.claim, certificate.compared.x0
+    below, inside = certificate.below.claim, certificate.above.inside
     assert below.level < below.wanted
-    assert bool((below.least_cost(certificate.value) <= optimum(x0)).all()), "what is left of it is true"
+    assert bool((below.least_cost(inside.value) <= optimum(inside.x0)).all()), "what is left of it is true"
 
 
 @pytest.mark.gate
 def test_one_of_the_sides_alone_is_no_certificate(riccatis):
-    certificate = both_sides(radius=1e-9, seconds=30)
+    certificate = both_sides(radius=1e-9, budget=30)
     assert certificate.below.claim.verdict == "certified"
     assert certificate.verdict == certificate.claim.verdict != "certified"
 
@@ -123,7 +128,7 @@ def test_what_is_of_the_other_side_is_refused_without_it(option, capsys):
 @pytest.mark.gate
 def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay():
     """D just around X₀: a bound for controls that stay there, and a law that does not."""
-    certificate = both_sides(set="-1.01:1.01,-0.71:0.71", seconds=30)
+    certificate = both_sides(states=[[-1.01, -0.71], [1.01, 0.71]], budget=30)
     assert certificate.below.claim.verdict == certificate.claim.verdict == "certified"
     assert not certificate.below.claim.everywhere
     assert certificate.result["tube_in_set"] is False
@@ -139,17 +144,19 @@ def test_with_half_a_tube_the_states_that_have_one_are_compared(riccatis, monkey
         claim, cells=claim.cells[kept], cost=claim.cost[:, kept], slack=claim.slack[kept], ends=claim.ends[kept],
         volume_share=0.5,
     )  # fmt: skip
-    certificate = TwoSidedTube(riccatis.controller, half, riccatis.below.claim, riccatis.options)
+    tube = TubeCertificate(riccatis.controller, half, riccatis.options)
+    certificate = TwoSidedCertificate(tube, riccatis.below, riccatis.options)
     assert certificate.verdict == "unknown"
-    assert 400 < len(certificate.value) < 600
-    assert bool((certificate.compared.x0[:, 0] >= 0).all())
+    assert 400 < len(certificate.above.inside.value) < 600
+    assert bool((certificate.above.inside.x0[:, 0] >= 0).all())
     assert certificate.result["certified_ratio"] == pytest.approx(riccatis.result["certified_ratio"], rel=0.05)
 
 
 @pytest.mark.gate
 def test_where_nothing_is_proved_from_below_nothing_is_drawn_of_it(riccatis):
     nothing = dataclasses.replace(riccatis.below.claim, level=-math.inf)
-    certificate = TwoSidedTube(riccatis.controller, riccatis.claim, nothing, riccatis.options)
+    below = LowerBoundCertificate(riccatis.controller, nothing, riccatis.options)
+    certificate = TwoSidedCertificate(riccatis.above, below, riccatis.options)
     figure = certificate.figure()
     assert not any("costs at least" in text.get_text() and "any" in text.get_text()
                    for legend in figure.legends for text in legend.get_texts())  # fmt: skip
@@ -160,12 +167,12 @@ def test_where_nothing_is_proved_from_below_nothing_is_drawn_of_it(riccatis):
 @pytest.mark.parametrize(
     ("states", "words"),
     [
-        ("-1:1,nonsense", "Expected"),
-        ("-2:2", "Expected a set of 2 states"),
-        ("-0.5:2,-2:2", "a set around X₀"),
+        ([[-1, "nonsense"], [1, 2]], "Expected states as"),
+        ([[-2], [2]], "Expected a set of 2 states"),
+        ([[-0.5, -2], [2, 2]], "a set around X₀"),
     ],
 )
 def test_a_set_that_does_not_fit_is_refused_before_the_tube(states, words, monkeypatch):
-    monkeypatch.setattr(two_sided, "tube_claim", lambda *_: pytest.fail("too late"))
+    monkeypatch.setattr("lyapnet.claims.tubes.tube.prove_tube", lambda *_: pytest.fail("too late"))
     with pytest.raises(UsageError, match=words):
-        both_sides(set=states)
+        both_sides(states=states)

@@ -1,6 +1,5 @@
 """lyapnet certify: its JSON for every kind of claim, its table, and what it refuses."""
 
-import inspect
 import json
 import subprocess
 import sys
@@ -11,22 +10,18 @@ from typer.main import get_command
 
 from lyapnet.base.errors import UsageError
 from lyapnet.claims import checking, funnel
-from lyapnet.claims.region_certificate import region_certificate
-from lyapnet.claims.sampling_certificates import sampled_certificate, statistical_certificate
-from lyapnet.claims.sound_certificate import SoundCertificate, parse_set, sound_certificate
+from lyapnet.claims.claim import flags_of
+from lyapnet.claims.kinds import Funnel, LowerBound, Region, Sampled, Statistical, Tube
+from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.cli import certify, main
+from lyapnet.cli.options import read_set
 from lyapnet.controller.controller import Controller
 from lyapnet.task.systems import DoubleIntegrator
 from tests.claims import planted
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-MAKERS = {
-    "sampled": sampled_certificate,
-    "statistical": statistical_certificate,
-    "sound": sound_certificate,
-    "region": region_certificate,
-}
+CLAIMS = {claim.kind: claim for claim in (Sampled, Statistical, Funnel, Region, Tube)}
 
 pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
@@ -85,7 +80,8 @@ def test_tables(checkpoint, capsys):
 
 
 REFUSED = [
-    ("certify --kind=certain", "Expected --kind as one of sampled, statistical, sound, region, tube, got 'certain'"),
+    ("certify --kind=sound", "Expected the kind of claim as a word, got --kind; as in lyapnet certify sound CKPT."),
+    ("certify sound --kind sound", "Expected the kind of claim as a word, got --kind"),
     ("certify sound --set=1,2", "Expected --set as lower:upper"),
     ("certify sound --set=-0.5:0.5,-2:2", "Expected a set around X₀"),
     ("certify sound --set=-2:2", "Expected a set of 2 states, got 1"),
@@ -161,7 +157,7 @@ def test_a_kept_proof_is_checked(checkpoint, tmp_path, monkeypatch, capsys):
     assert result["share_of_search"] > 0
     assert main(["certify", "check", path, checkpoint]) == 0
     assert "check: certified" in capsys.readouterr().out
-    monkeypatch.setattr(checking, "sound_claim", lambda *a, **o: pytest.fail("Expected no work on another proof."))
+    monkeypatch.setattr(checking, "prove_funnel", lambda *a, **o: pytest.fail("Expected no work on another proof."))
     for other, why in ((0.999, "name its checkpoint."), (1.0, "changed or damaged")):  # another V, then a changed file
         V = planted.stationary(other * planted.riccati())
         monkeypatch.setattr(certify.Given, "load", lambda _, V=V: Controller(planted.problem(), V))
@@ -194,15 +190,16 @@ def test_kept_proofs_of_other_kinds_are_checked(kind, checkpoint, tmp_path, monk
     assert "check: " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("kind", "make"), list(MAKERS.items()))
-def test_the_command_line_has_the_defaults_of_the_functions(kind, make):
+@pytest.mark.parametrize(("kind", "claim"), list(CLAIMS.items()))
+def test_the_command_line_has_the_fields_of_the_claims(kind, claim):
     parameters = get_command(certify.app).commands[kind].params
-    line = {parameter.opts[0].removeprefix("--"): parameter.default for parameter in parameters}
-    own = {name: p.default for name, p in inspect.signature(make).parameters.items() if p.default is not p.empty}
-    own.pop("report", None)
-    for name in ("started", "draws"):  # when the command began, and what is on record
-        own.pop(name, None)
-    assert own == {name: line[name] for name in own}
+    line = {parameter.opts[0].removeprefix("--"): parameter for parameter in parameters}
+    assert dict(flags_of(claim)).keys() <= line.keys()
+    for flag, f in flags_of(claim):
+        assert line[flag].default == f.default
+        assert line[flag].help.startswith(f.metadata["doc"])
+    if kind == "tube":
+        assert dict(flags_of(LowerBound)).keys() <= line.keys()
 
 
 def test_the_command_says_every_option():
@@ -211,20 +208,6 @@ def test_the_command_says_every_option():
     line = SoundCertificate(controller, None, options).command("my run/best.ckpt", system="pendulum:Pendulum")
     assert line.startswith("lyapnet certify sound 'my run/best.ckpt' --alpha=0.95 --set=-1:1,-2:2")
     assert line.endswith("--seed=0 --system=pendulum:Pendulum")
-
-
-# As 0.1 had it
-
-
-@pytest.mark.parametrize("line", ["{} --kind sampled --samples 3", "--kind=sampled {} --samples=3"])
-def test_a_kind_that_is_an_option_is_read_for_one_version_more(line, checkpoint, capsys):
-    new = certificate(capsys, "sampled", checkpoint, "--samples", "3")
-    assert main(["certify", *line.format(checkpoint).split(), "--json"]) == 0
-    printed = capsys.readouterr()
-    assert json.loads(printed.out) == new
-    (note,) = printed.err.splitlines()
-    assert note.startswith("note: --kind")
-    assert f"lyapnet certify sampled {checkpoint} --samples" in note
 
 
 def test_without_a_kind_it_is_statistical_without_a_note(checkpoint, capsys):
@@ -237,7 +220,7 @@ def test_without_a_kind_it_is_statistical_without_a_note(checkpoint, capsys):
 
 def test_help_fits_a_terminal(monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
-    for kind in ("", *MAKERS):
+    for kind in ("", *CLAIMS):
         assert main(["certify", *kind.split(), "--help"]) == 0
         text = capsys.readouterr().out
         assert "…" not in text.replace("lower:upper,…", ""), "nothing is cut off"
@@ -256,12 +239,10 @@ def test_a_missing_checkpoint_is_refused(capsys):
 
 
 def test_sets_are_read():
-    box = parse_set("-1:2,-0.5:0.25")
-    assert box.lower.tolist() == [-1, -0.5]
-    assert box.upper.tolist() == [2, 0.25]
-    for text in ("", "1", "2:1", "1:2:3", "a:b"):
+    assert read_set("-1:2,-0.5:0.25") == [[-1, -0.5], [2, 0.25]]
+    for text in ("", "1", "2:1", "1:2:3", "a:b", "-inf:1", "nan:1"):
         with pytest.raises(UsageError, match="--set"):
-            parse_set(text)
+            read_set(text)
 
 
 @pytest.mark.gate

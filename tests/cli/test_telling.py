@@ -11,7 +11,8 @@ import time
 
 import pytest
 
-from lyapnet.claims.sound_certificate import sound_certificate
+from lyapnet.claims.certify import certify
+from lyapnet.claims.kinds import Funnel
 from lyapnet.claims.tables import progress_told_to
 from lyapnet.cli import main
 from lyapnet.cli.options import stages_of
@@ -80,7 +81,7 @@ def test_a_certificate_tells_its_stages_before_its_boxes(checkpoint, few_seconds
         told.append(progress)
         report(progress)
 
-    sound_certificate(load(checkpoint), delta=0.5, seconds=2.0, report=both)
+    certify(checkpoint, Funnel(delta=0.5), budget=2, report=both)
     boxes = [progress.boxes > 0 for progress in told]
     assert not boxes[0]
     assert not boxes[-1]

@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, DecreaseCondition, prove, sound_claim
+from lyapnet.claims.funnel import prove_funnel
 from lyapnet.prover.bounds import BoundedFunction
-from lyapnet.prover.condition import bounded_condition, require_own_gradient
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition, bounded_condition, require_own_gradient
+from lyapnet.prover.proof import prove
 from tests.claims.planted import domain, loop, problem, riccati
 from tests.marks import sample
 from tests.problems import Formula, hjb_loop, untrained
@@ -60,7 +62,7 @@ DISHONEST = {  # V, and the axis along which its gradient is wrong first
 
 
 def claim(V):
-    return sound_claim(
+    return prove_funnel(
         hjb_loop(loop(P).system, loop(P).cost, V), problem(), 0.9, 0.5, budget=Budget(60, boxes=2000),
         generator=torch.Generator().manual_seed(0),
     )  # fmt: skip

@@ -9,9 +9,12 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, DecreaseCondition, prove, violations
 from lyapnet.prover import bound_rules, bounds, branch_and_bound, condition, kept_proofs, proof, simplification, taylor
 from lyapnet.prover.boxes import CutTree, single
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.counterexamples import violations
+from lyapnet.prover.proof import prove
 from tests.claims.planted import Planted, domain, loop, riccati
 from tests.problems import AMPLE
 

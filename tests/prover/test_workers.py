@@ -10,13 +10,12 @@ import torch
 
 import lyapnet
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, DecreaseCondition, prove
 from lyapnet.claims.least_cost import RiseCondition
 from lyapnet.prover import proof
 from lyapnet.prover.boxes import Boxes, single
-from lyapnet.prover.branch_and_bound import Question
-from lyapnet.prover.condition import bounded_condition
-from lyapnet.prover.proof import WhereItHolds, bounded_again, proved_by
+from lyapnet.prover.branch_and_bound import Budget, Question
+from lyapnet.prover.condition import DecreaseCondition, bounded_condition
+from lyapnet.prover.proof import WhereItHolds, bounded_again, prove, proved_by
 from lyapnet.prover.workers import bounding
 from tests.claims.planted import domain, loop, riccati
 from tests.claims.test_least_cost import problem

@@ -7,7 +7,7 @@ import torch
 
 import lyapnet
 from lyapnet.base.random_streams import CERTIFICATION, TEST, TRAINING, VALIDATION, stream
-from lyapnet.claims import statistical_claim
+from lyapnet.claims.statistical import bound_share
 from lyapnet.experiment.checkpoint import read_checkpoint
 from tests.runs import SMALL, Desk, dies_at, logged, values, without_figures
 
@@ -38,7 +38,7 @@ def bounds_of(checkpoint, step, seed=0):
     controller = lyapnet.load(checkpoint)
     limits = controller.program.tolerances()
     draw = stream(seed, CERTIFICATION, step)
-    claim = statistical_claim(controller.rollout, controller.problem, limits, 40, 0.9, generator=draw)
+    claim = bound_share(controller.rollout, controller.problem, limits, 40, 0.9, generator=draw)
     return [claim.lower_bounds[event] for event in ("all", "decrease", "cost")]
 
 

@@ -19,8 +19,8 @@ from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import Interrupted, UsageError
-from lyapnet.claims import DecreaseCondition, SoundClaim, sound_certificate
-from lyapnet.claims.region import RegionClaim
+from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.region import ProvedRegion
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.cli import main
@@ -28,6 +28,7 @@ from lyapnet.experiment.assembly import Parts
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.experiment.config import load_config
 from lyapnet.loop.programs import RegionProgram
+from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
@@ -71,7 +72,11 @@ def claimed(
     controller = controller or lyapnet.load(checkpoint)
     D, centers = Box([-1.6, -2.6], [1.6, 2.6]), torch.tensor(undecided).reshape(-1, 3)
     duration = controller.horizon.duration
-    claim = SoundClaim(ALPHA, DELTA, duration, D, rho, level, level, 0.0, 0.0, None, 9, 1.0, 0.5, centers, [])
+    claim = ProvedFunnel(
+        alpha=ALPHA, delta=DELTA, duration=duration, states=D, rho=rho, wanted=level, least=level, volume_share=0.0,
+        terminal_excess=0.0, counterexample=None, boxes=9, seconds=1.0, remaining_volume=0.5, undecided=centers,
+        left_out=[],
+    )  # fmt: skip
     return SoundCertificate(controller, claim, {"seed": 0})
 
 
@@ -195,8 +200,8 @@ def test_a_region_is_refined_by_what_fails_in_it(region_run, capsys):
 def test_a_region_that_comes_up_to_the_boundary_is_complete(region_run):
     controller = lyapnet.load(best(region_run))
     claim = partial(
-        RegionClaim, 0.01, Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1, contraction=None,
-        slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
+        ProvedRegion, decay=0.01, states=Box([-1.0, -1.0], [1.0, 1.0]), rim=2.0, wanted=5.0, least=5.0, hole=0.1,
+        contraction=None, slowest=-1.0, volume_share=0.5, region_share=0.5, proof=None, seconds=1.0, left_out=[],
     )  # fmt: skip
     assert RegionCertificate(controller, claim(rho=1.9999), {"seed": 0}).complete
     assert not RegionCertificate(controller, claim(rho=1.5), {"seed": 0}).complete
@@ -277,10 +282,10 @@ def test_the_command(run, capsys, monkeypatch):
         def numbers(self):
             return {"alpha": self.options["alpha"], "trained with": self.controller.config.seed}
 
-    def certify(controller, alpha, *_, **options):
-        return Made(controller, claimed(best(run)).claim, {"alpha": alpha, "seed": 0})
+    def certify(controller, claim, **_):
+        return Made(controller, claimed(best(run)).claim, {"alpha": claim.alpha, "seed": 0})
 
-    monkeypatch.setattr(sound_certificate, "sound_certificate", certify)
+    monkeypatch.setattr("lyapnet.claims.certify.certify", certify)
     capsys.readouterr()
     command = ["certify", "sound", str(best(run)), *FEW, "--alpha=0.7", "--json"]
     assert main([*command, "--refine=1", "seed=5"]) == 0
@@ -334,11 +339,9 @@ TRAPS = {
 def undecided(monkeypatch):
     """A sound claim that takes no time and proves nothing."""
     monkeypatch.setattr(
-        sound_certificate,
-        "sound_certificate",
-        lambda controller, *_, **__: claimed(best(Path()), controller=controller),
+        "lyapnet.claims.certify.certify", lambda controller, *_, **__: claimed(best(Path()), controller=controller)
     )
-    monkeypatch.setattr("lyapnet.claims.tables.certificate_table", lambda *_: "")
+    monkeypatch.setattr(SoundCertificate, "table", lambda *_: "")
     monkeypatch.setattr(SoundCertificate, "numbers", lambda self: {"system": type(self.controller.system).__name__})
 
 

@@ -170,7 +170,7 @@ def test_making_strips_and_measures(tmp_path, monkeypatch):
     monkeypatch.setattr(making, "PRECISIONS", ("float64",))
     monkeypatch.setattr(making, "MULTIPLES", (1, 5))  # of T: longer closed loops are those of the test above
     certificate = SimpleNamespace(result={"probability_lower_bound": 0.5})
-    monkeypatch.setattr(making, "statistical_certificate", lambda controller: certificate)
+    monkeypatch.setattr(making, "certify", lambda *_: certificate)
     trained = tmp_path / "run" / "checkpoints" / "best.ckpt"
     trained.parent.mkdir(parents=True)
     shutil.copy(located(f"zoo:{ONE}"), trained)

@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 from lyapnet.base.drawing import BLUE, GREEN, VERMILION, legend_below, numpy_of
 from lyapnet.base.types import State, Value
-from lyapnet.claims.region import RegionClaim
+from lyapnet.claims.region import ProvedRegion
 from lyapnet.task.sets import Box
 
 GRID = 301
@@ -22,7 +22,7 @@ ENDS = "{V(0, x) ≤ c}, at most: entered, then not left"
 
 def regions(
     pushes: Sequence[float],
-    claims: Sequence[RegionClaim],
+    claims: Sequence[ProvedRegion],
     V: Value,
     initial_states: Box,
     goal: State,
@@ -47,7 +47,7 @@ def regions(
 
 
 def _draw_volumes(
-    panel: Axes, pushes: Sequence[float], claims: Sequence[RegionClaim], labels: Sequence[str], pushed: str
+    panel: Axes, pushes: Sequence[float], claims: Sequence[ProvedRegion], labels: Sequence[str], pushed: str
 ) -> None:
     volumes = [claim.volume for claim in claims]
     ends = [claim.ultimate_volume if claim.disturbance is not None else 0.0 for claim in claims]  # nan: not drawn
@@ -67,7 +67,7 @@ def _draw_volumes(
 
 
 def _draw_levels(
-    panel: Axes, pushes: Sequence[float], claims: Sequence[RegionClaim], V: Value, initial_states: Box, goal: State,
+    panel: Axes, pushes: Sequence[float], claims: Sequence[ProvedRegion], V: Value, initial_states: Box, goal: State,
     labels: Sequence[str], pushed: str,
 ) -> list[Line2D]:  # fmt: skip
     """{V ≤ ρ} as lines, and {V ≤ c} filled and dashed; handles of the legend."""

@@ -1,51 +1,29 @@
 """Certificates of tubes: where all closed loops from X₀ go, and what they cost."""
 
-import time
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar
 
+import torch
+
+from lyapnet.base.contracts import copied
 from lyapnet.base.random_streams import CERTIFICATION, stream
-from lyapnet.claims.certificates import FROZEN, Certificate
-from lyapnet.claims.sound_certificate import (
-    COMPARED,
-    listed,
-    optima_of,
-)
+from lyapnet.claims.arguments import COMPARED
+from lyapnet.claims.certificates import FROZEN, listed
+from lyapnet.claims.costs import CostCertificate, Inside
+from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.tables import floored
 from lyapnet.claims.tubes import figures
-from lyapnet.claims.tubes.tube import TubeClaim, tube_claim
-from lyapnet.controller.controller import Controller
-from lyapnet.evaluation.optimality import ratio_of_means
-from lyapnet.prover.branch_and_bound import Budget
-from lyapnet.prover.proof import Progress
+from lyapnet.claims.tubes.tube import ProvedTube
 
 
-class Compared:
-    """The proved bounds of the cost of some states of X₀, and the optimum of the first of them, where it is known."""
-
-    def __init__(self, controller: Controller, claim: TubeClaim, seconds: float):
-        x0 = controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
-        low, high = claim.bounds_of_cost(x0)
-        inside = high.isfinite()
-        self.x0, self.low, self.high = x0[inside], low[inside], high[inside]
-        self.optimum, self.has_goal = optima_of(controller, self.x0, seconds), controller.problem.has_goal
-
-    @property
-    def ratio(self) -> float | None:
-        """Mean guaranteed cost over the mean optimum; None where costs may be of any sign."""
-        return (
-            None
-            if self.optimum is None or not self.has_goal
-            else ratio_of_means(self.high[: len(self.optimum)], self.optimum)
-        )
-
-
-class TubeCertificate(Certificate):
+class TubeCertificate(CostCertificate):
     """The tube of all closed loops from X₀, and their cost in it."""
 
-    kind: ClassVar[str] = "tube"
-    picture: ClassVar[str] = "tube.png"
+    kind: str = "tube"
+    picture: str = "tube.png"
+    picture_of_both: ClassVar[str] = "two_sided_tube.png"
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "states_left_out": "states that nothing depends on",
@@ -64,18 +42,48 @@ class TubeCertificate(Certificate):
         "seconds": "seconds",
         "fingerprint": "fingerprint of what was bounded",
     }
-    claim: TubeClaim
+    labels_beside: ClassVar[Mapping[str, str]] = {
+        "beta": "β", "delta": "δ in cost per second", "tube_in_set": "whether the tube lies in D",
+    }  # fmt: skip
+    claim: ProvedTube
 
     @cached_property
-    def compared(self) -> Compared:
-        """The guaranteed cost against the optimum, which is beside the claim."""
-        return Compared(self.controller, self.claim, max(1.0, 0.1 * self.options["seconds"]))
+    def inside(self) -> Inside:
+        x0 = self.controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
+        low, high = self.claim.bounds_of_cost(x0)
+        known = high.isfinite()
+        x0, low, high = x0[known], low[known], high[known]
+        with torch.no_grad():  # V as it is bounded
+            value = copied(self.controller.V)(x0.new_zeros(len(x0)).double(), x0.double())
+        return Inside(x0, value, high, low)
 
-    def numbers(self) -> dict[str, Any]:
+    def beside(self, lower: ProvedLowerBound) -> dict[str, Any]:
+        return {"beta": lower.beta, "delta": lower.delta, "tube_in_set": self.lies_in(lower)}
+
+    def lies_in(self, lower: ProvedLowerBound) -> bool:
+        """Whether the tube lies in the D of a bound from below, so that the controller keeps the state there."""
+        claim = self.claim
+        axes = [k for k, i in enumerate(claim.seen) if i not in lower.left_out]
+        D, ranges = lower.states, claim.ranges[:, axes]
+        low, high = (side.double()[[claim.seen[k] for k in axes]] for side in (D.lower, D.upper))
+        return bool(((low <= ranges[..., 0]) & (ranges[..., 1] <= high)).all())
+
+    def why_apart(self, lower: ProvedLowerBound) -> str:
+        both = lower.everywhere or self.lies_in(lower)
+        return "" if both else "But the tube leaves D: choose a larger one."
+
+    def in_short(self, lower: ProvedLowerBound) -> str:
+        return f"{self._proved()}; β = {lower.beta:g}, δ = {lower.delta:.3g}"
+
+    def figure_of_both(self, lower: ProvedLowerBound, whose: str, headline: str) -> figures.Figure:
+        least = (lower.least_cost(self.inside.value), whose) if lower.level > -math.inf else None
+        return figures.tube(self.claim, self.controller, self.inside, self.optimum, headline, least)
+
+    def proved(self) -> dict[str, Any]:
         claim, names = self.claim, self.controller.system.state_names
         proved = {
             "mean_cost": list(claim.mean_cost), "greatest_cost": claim.greatest_cost,
-            "guaranteed_cost_ratio": self.compared.ratio, "reach": claim.reach,
+            "reach": claim.reach,
             "ends": {
                 names[i]: [float(low), float(high)]
                 for i, low, high in zip(claim.seen, claim.ends[..., 0].amin(0), claim.ends[..., 1].amax(0), strict=True)
@@ -125,32 +133,9 @@ class TubeCertificate(Certificate):
         return f"The verdict is on the claim that each closed loop from X₀ is in a proved tube{asked}: {why}."
 
     def figure(self) -> figures.Figure:
-        return figures.tube(self.claim, self.controller, self.compared, f"{self.verdict}: {self._proved()}")
+        return figures.tube(
+            self.claim, self.controller, self.inside, self.optimum, f"{self.verdict}: {self._proved()}"
+        )  # fmt: skip
 
     def _proved(self) -> str:
         return f"{floored(self.claim.volume_share)} of X₀, {len(self.claim.slack):,} boxes"
-
-
-def tube_certificate(
-    controller: Controller,
-    radius: float | None = None,
-    seconds: float = 60.0,
-    workers: int = 1,
-    seed: int = 0,
-    report: Callable[[Progress], None] | None = None,
-    *,
-    started: float | None = None,
-) -> TubeCertificate:
-    """The tube of all closed loops from X₀.
-
-    Args:
-        radius: within which of the goal they are asked to end, in the norm of x; not asked for if None.
-        seconds: when to stop undecided, within a chunk of boxes.
-        workers: processes that enclose boxes side by side.
-        report: is told how far the proof is.
-        started: time.monotonic() from which the seconds count; now if None.
-    """
-    begun = time.monotonic() if started is None else started
-    claim = tube_claim(controller, Budget(seconds, workers=workers, started=begun), radius, report)
-    options = {"radius": radius, "seconds": seconds, "workers": workers, "seed": seed}
-    return TubeCertificate(controller, claim, options)

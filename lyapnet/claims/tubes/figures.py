@@ -9,19 +9,22 @@ from matplotlib.figure import Figure
 from lyapnet.base.drawing import BLUE, GREEN, GREY, VERMILION, legend_below, numpy_of
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import PerState
-from lyapnet.claims.tubes.tube import TubeClaim
+from lyapnet.claims.costs import Inside
+from lyapnet.claims.tubes.tube import ProvedTube
 from lyapnet.controller.controller import Controller
 
 SHOWN = 12  # closed loops
 
 
 def tube(
-    claim: TubeClaim, controller: Controller, compared: Any, headline: str, least: tuple[PerState, str] | None = None
-) -> Figure:
+    claim: ProvedTube, controller: Controller, inside: Inside, optimum: PerState | None, headline: str,
+    least: tuple[PerState, str] | None = None,
+) -> Figure:  # fmt: skip
     """Bounds of each state over time with some closed loops, and of the cost over the cost itself.
 
     Args:
-        compared: states of X₀ with their bounds and optima.
+        inside: states of X₀ with their bounds.
+        optimum: of the first of them.
         least: bounds of the optimum from below at these states, and which controls they are about.
     """
     labels = controller.system.state_labels
@@ -30,12 +33,12 @@ def tube(
     rows = -(-count // columns)
     figure = Figure(figsize=(3.3 * columns, 2.5 * rows + 0.6), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
-    x0 = compared.x0[:SHOWN] if len(compared.x0) else controller.initial_states.sample(SHOWN, stream(1, CERTIFICATION))
+    x0 = inside.x0[:SHOWN] if len(inside.x0) else controller.initial_states.sample(SHOWN, stream(1, CERTIFICATION))
     trajectory = controller.rollout(x0)
     for panel, k, i in zip(panels, range(len(claim.seen)), claim.seen, strict=False):
         _draw_state(panel, claim, k, trajectory, i)
         panel.set(xlabel="t (s)", ylabel=labels[i])
-    _draw_cost(panels[count - 1], compared, least)
+    _draw_cost(panels[count - 1], inside, optimum, least)
     for panel in panels[count:]:
         panel.set_visible(False)
     figure.suptitle(headline, fontsize=9)
@@ -44,7 +47,7 @@ def tube(
     return figure
 
 
-def _draw_state(panel: Axes, claim: TubeClaim, k: int, trajectory: Any, i: int) -> None:
+def _draw_state(panel: Axes, claim: ProvedTube, k: int, trajectory: Any, i: int) -> None:
     low, high = claim.ranges[:, k].unbind(-1)
     if bool(low.isfinite().all()):
         edges = torch.linspace(0, claim.duration, len(low) + 1)
@@ -58,29 +61,29 @@ def _draw_state(panel: Axes, claim: TubeClaim, k: int, trajectory: Any, i: int) 
         lines[0].set_label("some, simulated by steps of Δt")
 
 
-def _draw_cost(panel: Axes, compared: Any, least: tuple[PerState, str] | None) -> None:
+def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tuple[PerState, str] | None) -> None:
     """Bounds over the middle between them, relative to it, and the optima; nothing where nothing is proved."""
     panel.set(xlabel="cost from x₀, proved", ylabel="relative to it")
-    if not len(compared.x0):
+    lowest, highest = inside.low, inside.guaranteed
+    if lowest is None or not len(inside.x0):
         return
-    middle = (compared.low + compared.high) / 2
+    middle = (lowest + highest) / 2
     order = middle.argsort()
-    x, low, high = (numpy_of(y[order]) for y in (middle, compared.low / middle, compared.high / middle))
+    x, low, high = (numpy_of(y[order]) for y in (middle, lowest / middle, highest / middle))
     panel.fill_between(x, low, high, color=BLUE, alpha=0.2, linewidth=0)
     panel.plot(x, high, color=BLUE, linewidth=1, label="proved: the closed loop costs at most, and at least")
     panel.plot(x, low, color=BLUE, linewidth=1)
-    lowest = compared.low
     if least is not None:
         lowest, whose = least
         shown = f"proved: {whose} costs at least"
         panel.plot(x, numpy_of((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=shown)
     telling = (middle > 0.1 * middle.mean()) & lowest.isfinite()  # where any bound is wide, states leave the picture
     if bool(telling.any()):
-        bottom, top = (lowest / middle)[telling].min(), (compared.high / middle)[telling].max()
+        bottom, top = (lowest / middle)[telling].min(), (highest / middle)[telling].max()
         panel.set_ylim(min(0.95, float(bottom)), max(1.05, float(top)))
-    if compared.optimum is not None:
-        some = middle[: len(compared.optimum)]
-        best = compared.optimum / some
+    if optimum is not None:
+        some = middle[: len(optimum)]
+        best = optimum / some
         panel.plot(
             numpy_of(some), numpy_of(best), ".", color=VERMILION, markersize=4, label="optimum of the steps of Δt"
         )

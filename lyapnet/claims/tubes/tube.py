@@ -32,8 +32,8 @@ SMALLEST = 1e-9  # share of X₀ at which a cell is cut no more
 NOTHING_KEPT = "Stopped while certifying: a tube keeps nothing."
 
 
-@dataclass(frozen=True)
-class TubeClaim:
+@dataclass(frozen=True, kw_only=True)
+class ProvedTube:
     """Of ẋ = f + g u with u = policy(t, x) read at every t, in continuous time, for every x₀ in one of the cells, which
     are boxes in X₀, with ε_k ∈ [−1, 1] along each of their axes:
 
@@ -143,12 +143,12 @@ class _Found:
             self.share += float(share[ok].sum())
 
 
-def tube_claim(
+def prove_tube(
     controller: Controller,
     budget: Budget | None = None,
     radius: float | None = None,
     report: Callable[[Progress], None] | None = None,
-) -> TubeClaim:
+) -> ProvedTube:
     """The tube of all closed loops from X₀, as far as a budget goes.
 
     X₀ is cut into cells; one whose tube comes to no end is cut in two along the axis that F bends along most.
@@ -233,7 +233,7 @@ def _axis(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: 
 def _claim(
     controller: Controller, about: Enclosing, X0: Box, seen: list[int], axes: list[int], found: _Found,
     budget: Budget, radius: float | None, set_up: float,
-) -> TubeClaim:  # fmt: skip
+) -> ProvedTube:  # fmt: skip
     n, terms = len(seen), len(places(len(axes), DEGREE))
     empty = [torch.zeros(0, *shape, dtype=torch.float64) for shape in ((n,), (n,), (terms,), (2,), (n, 2))]
     lower, upper, cost, slack, ends = (torch.cat(parts) for parts in zip(empty, *found.parts, strict=True))
@@ -242,12 +242,13 @@ def _claim(
     missing = None
     if radius is not None and bool((near > radius).any()):
         missing = ((lower + upper)[near.argmax()] / 2).tolist()
-    return TubeClaim(
-        about.duration, X0, seen, axes, Cells(lower, upper), cost.T, slack, ends, found.ranges,
-        min(1.0, found.share) if found.share < 1 - 1e-12 else 1.0, found.violating, found.boxes, found.steps,
-        time.monotonic() - budget.started, about.field.defect.fingerprint, names_of(controller.problem.constraints),
-        radius, float(far.max()) if len(far) else float("nan"), missing,
-        set_up,
+    return ProvedTube(
+        duration=about.duration, initial_states=X0, seen=seen, axes=axes, cells=Cells(lower, upper), cost=cost.T,
+        slack=slack, ends=ends, ranges=found.ranges,
+        volume_share=min(1.0, found.share) if found.share < 1 - 1e-12 else 1.0,
+        violating=found.violating, boxes=found.boxes, steps=found.steps, seconds=time.monotonic() - budget.started,
+        fingerprint=about.field.defect.fingerprint, constraints=names_of(controller.problem.constraints), radius=radius,
+        reach=float(far.max()) if len(far) else float("nan"), missing=missing, set_up=set_up,
     )  # fmt: skip
 
 

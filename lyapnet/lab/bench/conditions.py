@@ -9,11 +9,11 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 from lyapnet.base.types import PerState, State, Time
-from lyapnet.claims import DecreaseCondition
-from lyapnet.claims.sound_certificate import default_delta
+from lyapnet.claims.arguments import slack_of
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.oracles import continuous_riccati
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
 from lyapnet.task.problem import Problem
@@ -73,7 +73,7 @@ def condition_of_network(seed: int = 0) -> Bounded:
 def condition_of_controller(controller: Controller) -> Bounded:
     """The condition that `lyapnet certify` proves of a checkpoint, at α = 0.9 and its default δ, on [0, T] × X₀."""
     closed_loop = copy.deepcopy(controller.closed_loop).double().requires_grad_(False)
-    condition, X0 = DecreaseCondition(closed_loop, ALPHA, default_delta(controller)), controller.initial_states
+    condition, X0 = DecreaseCondition(closed_loop, ALPHA, slack_of(None, controller)), controller.initial_states
     ends = torch.tensor([[0.0], [controller.horizon.duration]], dtype=torch.float64)
     lower, upper = (torch.cat(pair) for pair in zip(ends, (X0.lower.double(), X0.upper.double()), strict=True))
     return Bounded(controller.config.experiment, condition, lower, upper)

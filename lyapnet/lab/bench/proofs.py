@@ -5,10 +5,11 @@ from dataclasses import dataclass
 
 import torch
 
-from lyapnet.claims import Budget, prove
 from lyapnet.lab.bench.conditions import Bounded, condition_of_chain
 from lyapnet.lab.bench.enclosures import ENCLOSURES, Enclosure, enclosure
 from lyapnet.prover.boxes import single
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.proof import prove
 
 CERTIFIER = "certifier"
 METHODS = (CERTIFIER, *ENCLOSURES)

@@ -11,10 +11,11 @@ import torch
 from torch import nn
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims import Budget, region_claim
+from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.cli import main
 from lyapnet.exchange.importing import controller_of, imported_controller
+from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.task.sets import Box, ControlBox
 from lyapnet.task.systems import DoubleIntegrator, Linear
 from tests.claims.planted import cost, riccati
@@ -44,7 +45,7 @@ def files(folder, V=None, u=None, config=CONFIG):
 
 def claimed(controller, boxes=4000, seconds=60.0, states=D):
     budget = Budget(seconds, boxes, chunk=512)
-    return region_claim(controller.closed_loop, controller.problem, None, states, budget)
+    return prove_region(controller.closed_loop, controller.problem, None, states, budget)
 
 
 def certified(folder, capsys, *options, V=None, u=None, config=CONFIG):

@@ -1,0 +1,78 @@
+"""lyapnet.certify: what can be said of a controller, proved or by a draw."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from lyapnet.base.errors import Interrupted, UsageError
+from lyapnet.claims.certificates import Certificate
+from lyapnet.claims.claim import Claim, Run
+from lyapnet.claims.costs import CostCertificate
+from lyapnet.claims.kinds import LowerBound
+from lyapnet.claims.two_sided import TwoSidedCertificate
+from lyapnet.controller.controller import Controller
+from lyapnet.controller.loading import load
+from lyapnet.prover.branch_and_bound import Budget
+from lyapnet.prover.proof import Progress
+
+NOTHING_KEPT = "Stopped while certifying: a {} keeps nothing."
+
+
+def certify(
+    controller: Controller | str | Path,
+    *claims: Claim,
+    budget: float | Budget = 60.0,
+    seed: int = 0,
+    keep: str | Path | None = None,
+    report: Callable[[Progress], None] | None = None,
+) -> Certificate:
+    """What can be said of a controller within a budget; the verdict is certified, falsified or unknown.
+
+        certificate = lyapnet.certify(controller, lyapnet.Funnel(alpha=0.9), lyapnet.LowerBound())
+        print(certificate, certificate.verdict)
+
+    Args:
+        controller: or the path of its checkpoint.
+        claims: one, or two sides: one that bounds the cost from above, and LowerBound().
+        budget: seconds, set-up included, or a Budget, which counts from when it was made.
+        seed: of all that is drawn.
+        keep: a file in which the proof is kept, and from which the same call goes on.
+        report: is told how far the proof is.
+
+    Raises:
+        UsageError: the claims do not fit the controller, each other or the budget.
+        Interrupted: Ctrl-C or SIGTERM; says what is kept.
+    """
+    budget = budget if isinstance(budget, Budget) else Budget(budget)
+    run = Run(budget=budget, seed=seed, keep=None if keep is None else Path(keep), report=report)
+    controller = controller if isinstance(controller, Controller) else load(controller)
+    below = [claim for claim in claims if isinstance(claim, LowerBound)]
+    above = [claim for claim in claims if not isinstance(claim, LowerBound)]
+    for claim in claims:
+        run.require_used_by(claim)
+    if len(claims) == 1:
+        certificate = claims[0].establish(controller, run)
+    elif len(above) == len(below) == 1 and above[0].share_of_two is not None:
+        certificate = _from_two_sides(controller, above[0], below[0], run)
+    else:
+        got = " and ".join(claim.kind for claim in claims) or "none"
+        raise UsageError(
+            f"Expected one claim, or a funnel or a tube and a LowerBound, got {got}; call certify for each of them."
+        )
+    certificate.claims = claims
+    return certificate
+
+
+def _from_two_sides(controller: Controller, above: Claim, given: LowerBound, run: Run) -> Certificate:
+    """What the controller costs at most, and what any control costs at least."""
+    below, options = given.beside(above), run.options(above, **{"two-sided": True}, **given.options_beside(above))
+    below.require_fitting(controller)
+    upper = above.establish(controller, run.share(above.share_of_two or 1.0))
+    if not isinstance(upper, CostCertificate):
+        raise TypeError(f"Expected a CostCertificate of {type(above).__name__}.establish, got {type(upper).__name__}.")
+    try:
+        lower = below.establish(controller, run)
+    except Interrupted as error:
+        if "keep" in above.means:
+            raise
+        raise Interrupted(NOTHING_KEPT.format(above.kind), error.exit_status) from error
+    return TwoSidedCertificate(upper, lower, options)

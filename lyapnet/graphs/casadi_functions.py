@@ -90,8 +90,8 @@ class _Reader(Interpreter):
             return RULES[name](*args, **kwargs)
         except (KeyError, TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise OracleError(
-                f"Expected operations that can be handed to CasADi, got {target}; write it in others, or add a rule to "
-                "lyapnet.graphs.casadi_functions.RULES."
+                f"Expected operations that can be handed to CasADi, got {target}; write it in others, or add it to the "
+                "table of operators (docs/operators.md)."
             ) from error
 
 

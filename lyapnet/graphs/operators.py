@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 
 ANY = (-3.0, 3.0)
 POSITIVE = (0.1, 9.0)
 UNIT = (-0.99, 0.99)
+TRUTH = None
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class Operator:
         c: an expression in C99 and JavaScript, of operands {0}, {1}, …
         casadi: the name of CasADi's function, or (casadi, *operands) ↦ an expression.
         numbers: an expression of vectors x, y, z in C++ (see program.cpp); else `c` is computed number by number.
-        domain: intervals of the operands, in which a test holds the columns against torch.
+        domain: intervals of the operands, or TRUTH, in which the columns are held against torch.
         namespace: of torch.ops.
     """
 
@@ -36,7 +38,7 @@ class Operator:
     c: str | None = None
     casadi: str | Callable[..., Any] | None = None
     numbers: str | None = None
-    domain: tuple[tuple[float, float], ...] = (ANY,)
+    domain: tuple[tuple[float, float] | None, ...] = (ANY,)
     namespace: str = "aten"
 
     @property
@@ -55,10 +57,24 @@ class Operator:
 
     @property
     def overloads(self) -> list[Any]:
-        """torch's operators of this name that return a new tensor."""
+        """torch's operators of this name that return a new tensor, that of tensors alone first."""
         packet = getattr(getattr(torch.ops, self.namespace), self.name)
         every = [getattr(packet, name) for name in packet.overloads()]
-        return [overload for overload in every if not overload._schema.is_mutable]
+        return sorted((each for each in every if not each._schema.is_mutable), key=_takes_numbers)
+
+    def __call__(self, *operands: Tensor) -> Tensor:
+        """What torch computes."""
+        return self.overloads[0](*operands)
+
+    def at(self, unit: Tensor) -> list[Tensor]:
+        """Operands in the domain at points of the unit cube, (*, operands)."""
+        pairs = zip(unit.unbind(-1), self.domain, strict=True)
+        return [u > 0.5 if sides is None else sides[0] + (sides[1] - sides[0]) * u for u, sides in pairs]
+
+
+def _takes_numbers(overload: Any) -> bool:
+    """Whether an operator needs something else than tensors."""
+    return any(str(each.type) != "Tensor" for each in overload._schema.arguments if not each.has_default_value())
 
 
 def _of_library(name: str, domain: tuple[float, float] = ANY, casadi: Any = "", numbers: str | None = None) -> Operator:
@@ -73,7 +89,13 @@ def _comparison(name: str, sign: str, casadi: Callable[..., Any]) -> Operator:
 def _logical(name: str, sign: str, casadi: str) -> list[Operator]:
     """Of truths; the kernel for numbers has rules of its own, which refuse numbers."""
     c = f"{{0}} != 0 {sign} {{1}} != 0"
-    return [Operator(f"{kind}_{name}", c, casadi, domain=(ANY, ANY)) for kind in ("logical", "bitwise")]
+    return [Operator(f"{kind}_{name}", c, casadi, domain=(TRUTH, TRUTH)) for kind in ("logical", "bitwise")]
+
+
+def _remainder(casadi: Any, a: Any, b: Any) -> Any:
+    """With the sign of b; a − b ⌊a/b⌋ would be b off where a/b is rounded up to a whole number."""
+    r = casadi.fmod(a, b)
+    return casadi.if_else(casadi.logic_and(r != 0, (r < 0) != (b < 0)), r + b, r)
 
 
 _SIGN = "({0} > 0) - ({0} < 0)", "sign", "x > 0 ? ONE : (x < 0 ? -ONE : ZERO)"
@@ -133,7 +155,7 @@ _ROWS = [
     ),
     Operator("fmod", "fmod({0}, {1})", "fmod", domain=(ANY, POSITIVE)),
     Operator(
-        "remainder", "remainder_of({0}, {1})", lambda casadi, a, b: a - b * casadi.floor(a / b),
+        "remainder", "remainder_of({0}, {1})", _remainder,
         "each<T>(remainder_like<T>, x, y)", (ANY, POSITIVE),
     ),
     Operator("maximum", "larger({0}, {1})", "fmax", "x != x ? x : (y != y ? y : (x > y ? x : y))", (ANY, ANY)),
@@ -146,9 +168,9 @@ _ROWS = [
     _comparison("ge", ">=", lambda casadi, a, b: a >= b),
     *_logical("and", "&&", "logic_and"),
     *_logical("or", "||", "logic_or"),
-    Operator("logical_not", "{0} == 0", "logic_not", "x == 0 ? ONE : ZERO"),
-    Operator("bitwise_not", "{0} == 0", "logic_not"),
-    Operator("where", "{0} != 0 ? {1} : {2}", "if_else", "x != 0 ? y : z", (ANY, ANY, ANY)),
+    Operator("logical_not", "{0} == 0", "logic_not", "x == 0 ? ONE : ZERO", (TRUTH,)),
+    Operator("bitwise_not", "{0} == 0", "logic_not", domain=(TRUTH,)),
+    Operator("where", "{0} != 0 ? {1} : {2}", "if_else", "x != 0 ? y : z", (TRUTH, ANY, ANY)),
 ]  # fmt: skip
 OPERATORS = {row.name: row for row in _ROWS}
 
@@ -184,7 +206,7 @@ READERS: dict[str, Rules] = {}
 
 
 def add(row: Operator) -> None:
-    """Put a row into the table, for all readers.
+    """Put a row into the table, for all readers; see lyapnet.prover.operators.register.
 
     Raises:
         UsageError: there is one, or a reader has a rule of its own for it; or torch has no such operator.
@@ -199,3 +221,10 @@ def add(row: Operator) -> None:
     OPERATORS[row.name] = row
     for rules in READERS.values():
         rules.add(row)
+
+
+def remove(row: Operator) -> None:
+    """Take a row out again."""
+    del OPERATORS[row.name]
+    for rules in READERS.values():
+        rules.pop(row.name, None)

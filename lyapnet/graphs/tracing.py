@@ -111,7 +111,7 @@ def core_trace(
 def _has_row(target: Any) -> bool:
     """Whether the table of operators has C and CasADi for an operator of tensors alone."""
     row = OPERATORS.get(name_of(target))
-    return row is not None and row.c is not None and row.casadi is not None and target in row.overloads
+    return row is not None and row.c is not None and row.casadi is not None and target is row.overloads[0]
 
 
 # torch counts them among its core, but has them in simpler operators too

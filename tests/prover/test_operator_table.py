@@ -24,13 +24,14 @@ from lyapnet.graphs.javascript_functions import JavaScriptTables, javascript_fun
 from lyapnet.graphs.number_kernel import rules as number_rules
 from lyapnet.graphs.number_kernel.kernel import NumberKernel
 from lyapnet.graphs.operators import OPERATORS, READERS, Operator, add, remove
-from lyapnet.graphs.tracing import SHAPED, core_trace, is_view, name_of, trace
+from lyapnet.graphs.tracing import NOT_CORE, SHAPED, core_trace, is_view, name_of, trace
 from lyapnet.prover import kept_proofs
 from lyapnet.prover.bound_kernel import writing
 from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_SHAPE, RULES
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.elementary_functions import Elementary
 from lyapnet.prover.operators import complaints, forget, has_bounds, register
+from lyapnet.prover.simplification import COPIES
 from tests.pages import PAGES, ROOT, blocks
 
 aten = torch.ops.aten
@@ -334,11 +335,11 @@ COLUMNS = ("bounds", "machine code", "numbers", "C", "CasADi")
 
 def coverage():
     """name ↦ for each of COLUMNS: ✓ a rule, ◦ written in other operators, or nothing."""
-    bounds = {name_of(each) for each in (RULES | ARRANGEMENTS).keys() | OF_SHAPE}
-    code = {name_of(each) for each in (writing.RULES | ARRANGEMENTS).keys() | OF_SHAPE}
+    bounds = {name_of(each) for each in (RULES | ARRANGEMENTS).keys() | OF_SHAPE | COPIES}
+    code = {name_of(each) for each in (writing.RULES | ARRANGEMENTS).keys() | OF_SHAPE | COPIES}
     rules = {"bounds": bounds, "machine code": code, **READERS}
     rules["CasADi"] = READERS["CasADi"].keys() | casadi_functions.MOVES
-    core = {name_of(each) for each in core_aten_decompositions()}
+    core = {name_of(each) for each in core_aten_decompositions()} | {name_of(each) for each in NOT_CORE}
     simpler = {"C": core, "CasADi": core, "numbers": {name_of(each) for each in decomposition_table}}
     names = sorted({*bounds, *code, *(name for reader in READERS.values() for name in reader), *casadi_functions.MOVES})
     return {

@@ -27,8 +27,9 @@ class Operators:
     def __getattr__(self, name: str) -> Rule:
         packet = getattr(aten, name)
         overloads = (getattr(packet, each) for each in ("default", "Tensor", "self") if each in packet.overloads())
-        rule = next(self._rules[each] for each in overloads if each in self._rules)
-        return lambda *arguments: rule(*self._first, *arguments)
+        for rule in (self._rules[each] for each in overloads if each in self._rules):
+            return lambda *arguments: rule(*self._first, *arguments)
+        raise NotImplementedError(f"no rule for bounds of {name}")
 
 
 def on_forms(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:

@@ -281,6 +281,20 @@ def test_wrong_composed_bounds_are_refused():
     assert not RULES.keys() & {*SOFT.overloads}
 
 
+def test_an_operator_without_bounds_makes_up_none():
+    with pytest.raises(UsageError, match="no rule for bounds of logaddexp2"):
+        register(SOFT, lambda operators, x, y: operators.logaddexp2(x, y))
+
+
+@needs_compiler
+def test_a_kernel_from_before_goes_on(registered):
+    before = NumberKernel(trace(lambda x: (x.sin().sum() * x,), (torch.ones(3),)), (torch.ones(3),))
+    registered(SOFT, soft)
+    assert are_equal(by_numbers(SOFT), SOFT)
+    x = torch.tensor([1.0, 2.0, 3.0])
+    assert_close(before(x)[0], x.sin().sum() * x)
+
+
 def test_what_is_there_or_no_operator_is_refused():
     with pytest.raises(UsageError, match="that lyapnet lacks, got sin"):
         register(Operator("sin", "cos({0})"))

@@ -11,23 +11,30 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
-_AS_OPERATORS = ContextVar("functions are traced as operators", default=False)
-OPERATORS = set[Any]()  # as they stand in a trace
+NUMBERS, BOUNDS = "numbers", "bounds"
+"""The readers that have instructions or rules of their own for some functions."""
+
+_READERS = ContextVar("readers for which their functions are traced as operators", default=frozenset[str]())
+WHOLE = set[Any]()
+"""What `operator` makes, as it stands in a trace."""
 
 
 @contextmanager
-def as_operators() -> Iterator[None]:
-    """Within it, functions under `operator` are one operator each; elsewhere they are what they are written as."""
-    token = _AS_OPERATORS.set(True)
+def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
+    """Within it, the functions that a reader has are one operator each, or none is; elsewhere none is.
+
+    Those of the kernel for numbers are made by `operator`; that of bounds is lyapnet.prover.rounding.rounded.
+    """
+    token = _READERS.set(_READERS.get() | {reader} if on else _READERS.get() - {reader})
     try:
         yield
     finally:
-        _AS_OPERATORS.reset(token)
+        _READERS.reset(token)
 
 
-def are_operators() -> bool:
-    """Whether functions under `operator` are one operator each."""
-    return _AS_OPERATORS.get()
+def are_operators(reader: str = NUMBERS) -> bool:
+    """Whether the functions that a reader has are one operator each."""
+    return reader in _READERS.get()
 
 
 def is_transformed(x: Tensor) -> bool:
@@ -44,7 +51,7 @@ def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
     named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
     whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")
     whole.register_fake(lambda first, *_: first.new_empty(first.shape))
-    OPERATORS.add(whole._opoverload)
+    WHOLE.add(whole._opoverload)
 
     @functools.wraps(function)
     def called(*tensors: Tensor) -> Tensor:

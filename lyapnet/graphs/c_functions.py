@@ -167,7 +167,7 @@ class _Reader(Interpreter):
         except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise ExportError(
                 f"Expected operations that can be written in {self.text.language}, got {target}; write f, g, the cost "
-                f"or V in others, add a rule to lyapnet.graphs.c_rules.RULES, or {self.text.otherwise}."
+                f"or V in others, add it to the table of operators (docs/operators.md), or {self.text.otherwise}."
             ) from error
         except Exception as error:  # of any kind: shapes that no rule expected
             raise ExportError(

@@ -9,6 +9,7 @@ import torch
 from torch.utils._pytree import tree_leaves
 
 from lyapnet.graphs.c_text import Array, Text, literal, shape_of
+from lyapnet.graphs.operators import Rules
 
 aten = torch.ops.aten
 
@@ -283,43 +284,11 @@ def _cumulative_sum(text: Text, x: Array, dim: int, *, dtype: Any = None) -> Arr
     return total
 
 
-RULES: dict[str, Callable[..., Any]] = {
-    **{
-        name: _elementwise(f"{name}({{0}})")
-        for name in (
-            "acos", "acosh", "asin", "asinh", "atan", "atanh", "ceil", "cos", "cosh", "erf", "erfc", "exp", "exp2",
-            "expm1", "floor", "log", "log10", "log1p", "log2", "sin", "sinh", "sqrt", "tan", "tanh", "trunc",
-        )
-    },
-    "abs": _elementwise("fabs({0})"),
-    "isnan": _elementwise("{0} != {0}"),
-    "hypot": _elementwise("hypot({0}, {1})"),
-    "neg": _elementwise("-{0}"),
-    "sign": _elementwise("({0} > 0) - ({0} < 0)"),
-    "reciprocal": _elementwise("1.0 / {0}"),
-    "rsqrt": _elementwise("1.0 / sqrt({0})"),
-    "relu": _elementwise("larger({0}, 0.0)"),
-    "sigmoid": _elementwise("1.0 / (1.0 + exp(-{0}))"),
+RULES = Rules("C", lambda row: None if row.c is None else _elementwise(row.c), {
     "add": _sum("+"),
     "sub": _sum("-"),
-    "mul": _elementwise("{0} * {1}"),
     "div": _divided,
     "pow": _power,
-    "atan2": _elementwise("atan2({0}, {1})"),
-    "fmod": _elementwise("fmod({0}, {1})"),
-    "remainder": _elementwise("remainder_of({0}, {1})"),
-    "maximum": _elementwise("larger({0}, {1})"),
-    "minimum": _elementwise("smaller({0}, {1})"),
-    "eq": _elementwise("{0} == {1}"),
-    "ne": _elementwise("{0} != {1}"),
-    "lt": _elementwise("{0} < {1}"),
-    "le": _elementwise("{0} <= {1}"),
-    "gt": _elementwise("{0} > {1}"),
-    "ge": _elementwise("{0} >= {1}"),
-    **{f"{kind}_and": _elementwise("{0} != 0 && {1} != 0") for kind in ("logical", "bitwise")},
-    **{f"{kind}_or": _elementwise("{0} != 0 || {1} != 0") for kind in ("logical", "bitwise")},
-    **{f"{kind}_not": _elementwise("{0} == 0") for kind in ("logical", "bitwise")},
-    "where": _elementwise("{0} != 0 ? {1} : {2}"),
     "clamp": _clamp,
     "sum": _reduction(0.0, "{into} += {0};"),
     "prod": _reduction(1.0, "{into} *= {0};"),
@@ -356,4 +325,4 @@ RULES: dict[str, Callable[..., Any]] = {
         for name in ("flip", "index", "index_select", "repeat", "roll")
     },
     "getitem": lambda text, results, index: results[index],
-}  # fmt: skip
+})  # fmt: skip

@@ -4,6 +4,7 @@ An operation on constants alone is torch's own. One that only moves entries is d
 hence no rule for views, slices, concatenations or indices. What is left is arithmetic, which RULES has.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch.fx import GraphModule, Interpreter
 from torch.utils._pytree import tree_leaves, tree_map
 
 from lyapnet.base.errors import OracleError
+from lyapnet.graphs.operators import Operator, Rules
 from lyapnet.graphs.tracing import SHAPED, Tensors, core_trace, is_view, name_of
 
 Symbols = np.ndarray  # dtype object: its entries are scalar casadi.SX
@@ -88,8 +90,8 @@ class _Reader(Interpreter):
             return RULES[name](*args, **kwargs)
         except (KeyError, TypeError, NotImplementedError) as error:  # no rule, or not for these options
             raise OracleError(
-                f"Expected operations that can be handed to CasADi, got {target}; write it in others, or add a rule to "
-                "lyapnet.graphs.casadi_functions.RULES."
+                f"Expected operations that can be handed to CasADi, got {target}; write it in others, or add it to the "
+                "table of operators (docs/operators.md)."
             ) from error
 
 
@@ -143,6 +145,13 @@ MOVES = {
 def _elementwise(rule: Callable[..., Any], operands: int) -> Callable[..., Symbols]:
     function = np.frompyfunc(rule, operands, 1)
     return lambda *args: _boxed(function(*map(_symbols, args)))
+
+
+def _of_row(row: Operator) -> Callable[..., Symbols] | None:
+    if row.casadi is None:
+        return None
+    rule = getattr(casadi, row.casadi) if isinstance(row.casadi, str) else functools.partial(row.casadi, casadi)
+    return _elementwise(rule, row.operands)
 
 
 def _sum(sign: int) -> Callable[..., Symbols]:
@@ -225,63 +234,9 @@ def _determinant(A: Symbols) -> list[Symbols]:
     return [_of_each(casadi.det, A)[..., 0, 0]]
 
 
-RULES: dict[str, Callable[..., Any]] = {
-    **{
-        name: _elementwise(getattr(casadi, name), 1)
-        for name in (
-            "acos",
-            "acosh",
-            "asin",
-            "asinh",
-            "atan",
-            "atanh",
-            "ceil",
-            "cos",
-            "cosh",
-            "erf",
-            "exp",
-            "expm1",
-            "floor",
-            "log",
-            "log10",
-            "log1p",
-            "sign",
-            "sin",
-            "sinh",
-            "sqrt",
-            "tan",
-            "tanh",
-            "trunc",
-        )
-        if hasattr(casadi, name)
-    },
-    "abs": _elementwise(casadi.fabs, 1),
-    "neg": _elementwise(lambda a: -a, 1),
-    "reciprocal": _elementwise(lambda a: 1 / a, 1),
-    "rsqrt": _elementwise(lambda a: 1 / casadi.sqrt(a), 1),
-    "log2": _elementwise(lambda a: casadi.log(a) / np.log(2), 1),
-    "relu": _elementwise(lambda a: casadi.fmax(a, 0), 1),
-    "sigmoid": _elementwise(lambda a: (1 + casadi.tanh(a / 2)) / 2, 1),
+RULES = Rules("CasADi", _of_row, {
     "add": _sum(1),
     "sub": _sum(-1),
-    "mul": _elementwise(lambda a, b: a * b, 2),
-    "div": _elementwise(lambda a, b: a / b, 2),
-    "pow": _elementwise(lambda a, b: a**b, 2),
-    "atan2": _elementwise(casadi.atan2, 2),
-    "fmod": _elementwise(casadi.fmod, 2),
-    "remainder": _elementwise(lambda a, b: a - b * casadi.floor(a / b), 2),
-    "maximum": _elementwise(casadi.fmax, 2),
-    "minimum": _elementwise(casadi.fmin, 2),
-    "eq": _elementwise(lambda a, b: a == b, 2),
-    "ne": _elementwise(lambda a, b: a != b, 2),
-    "lt": _elementwise(lambda a, b: a < b, 2),
-    "le": _elementwise(lambda a, b: a <= b, 2),
-    "gt": _elementwise(lambda a, b: a > b, 2),
-    "ge": _elementwise(lambda a, b: a >= b, 2),
-    **{f"{kind}_and": _elementwise(casadi.logic_and, 2) for kind in ("logical", "bitwise")},
-    **{f"{kind}_or": _elementwise(casadi.logic_or, 2) for kind in ("logical", "bitwise")},
-    **{f"{kind}_not": _elementwise(casadi.logic_not, 1) for kind in ("logical", "bitwise")},
-    "where": _elementwise(casadi.if_else, 3),
     "clamp": _clamp,
     "sum": _reduction(lambda a, b: a + b),
     "prod": _reduction(lambda a, b: a * b),
@@ -296,4 +251,4 @@ RULES: dict[str, Callable[..., Any]] = {
     "_linalg_det": _determinant,
     "_to_copy": _converted,
     "getitem": lambda results, index: results[index],
-}
+})  # fmt: skip

@@ -55,8 +55,8 @@ def javascript_function(
 
 
 HELPERS = """"use strict";
-const {acos, acosh, asin, asinh, atan, atan2, ceil, cos, cosh, exp, expm1, floor, hypot, log, log10, log1p, log2, pow,
-       sin, sinh, sqrt, tan, tanh, trunc, abs: fabs} = Math;
+const {acos, acosh, asin, asinh, atan, atan2, atanh, ceil, cos, cosh, exp, expm1, floor, hypot, log, log10, log1p, log2,
+       pow, sin, sinh, sqrt, tan, tanh, trunc, abs: fabs} = Math;
 const INFINITY = Infinity, NAN = NaN;
 const exp2 = (a) => pow(2, a), fmod = (a, b) => a % b;
 const larger = (a, b) => (a > b || a !== a ? a : b), smaller = (a, b) => (a < b || a !== a ? a : b);

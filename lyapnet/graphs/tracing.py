@@ -16,8 +16,9 @@ from torch.fx.node import map_arg
 from torch.overrides import TorchFunctionMode
 
 from lyapnet.base.errors import LyapnetError, UntraceableError, UsageError, one_line, own_line, place_of, running_line
-from lyapnet.base.operators import OPERATORS, as_operators
+from lyapnet.base.operators import WHOLE, as_operators
 from lyapnet.graphs.agreement import are_close
+from lyapnet.graphs.operators import OPERATORS
 
 Tensors = tuple[Tensor, ...]
 
@@ -76,7 +77,7 @@ def trace(
             graph_module.graph.erase_node(node)
     graph_module = _tidied(graph_module, graph_module.graph)
     _require_written_memory(graph_module.graph)
-    if not OPERATORS.isdisjoint(node.target for node in graph_module.graph.nodes):
+    if not WHOLE.isdisjoint(node.target for node in graph_module.graph.nodes):
         _require_same(graph_module, function, arguments)  # an operator may be another function of wrong arguments
     for others in elsewhere:
         _require_same(graph_module, function, [*arguments[: -len(others)], *others])
@@ -93,6 +94,7 @@ def core_trace(
         refusal: raised where there is no trace.
     """
     simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
+    simpler = {target: others for target, others in simpler.items() if not _has_row(target)}
     try:
         with torch.no_grad():
             return trace(lambda *a: function(*a), arguments, decompositions=simpler)  # lambda: make_fx would count self
@@ -104,6 +106,12 @@ def core_trace(
             f"Expected {what} that torch can trace, got {type(error).__name__}: {line}; write them in torch "
             "operations, with torch.where for a course that depends on values."
         ) from error
+
+
+def _has_row(target: Any) -> bool:
+    """Whether the table of operators has C and CasADi for an operator of tensors alone."""
+    row = OPERATORS.get(name_of(target))
+    return row is not None and row.c is not None and row.casadi is not None and target is row.overloads[0]
 
 
 # torch counts them among its core, but has them in simpler operators too

@@ -14,6 +14,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.prover import elementary_functions as functions
 from lyapnet.prover import taylor
 from lyapnet.prover.branches import CHOICES, JUMPS, KINKS
+from lyapnet.prover.composed_rules import COMPOSED, on_forms
 from lyapnet.prover.linear_systems import LINEAR_SYSTEMS
 from lyapnet.prover.rounding import ROUNDED
 from lyapnet.prover.taylor import TaylorForm
@@ -54,12 +55,6 @@ def _subtract(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
     return _add(x, taylor.negate(y) if isinstance(y, TaylorForm) else -_tensor(y), alpha)
 
 
-@rule(aten.rsub.Scalar, aten.rsub.Tensor)
-def _subtract_from(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
-    """y − αx."""
-    return _subtract(y, x, alpha)
-
-
 @rule(aten.mul.Tensor, aten.mul.Scalar)
 def _multiply(x: Any, y: Any) -> TaylorForm:
     """x · y; a square where both are one value."""
@@ -76,23 +71,6 @@ def _divide(x: Any, y: Any) -> TaylorForm:
     if isinstance(y, TaylorForm):
         return _multiply(x, functions.reciprocal(y))
     return taylor.scale(x, 1 / _tensor(y)).rounded()
-
-
-@rule(aten.pow.Tensor_Scalar)
-def _power(x: TaylorForm, exponent: float) -> Any:
-    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal; x⁰ = 1."""
-    if exponent == 0:
-        return torch.ones_like(x.radius[0])
-    if exponent < 0:
-        return functions.reciprocal(_power(x, -exponent))
-    if exponent == 0.5:
-        return functions.sqrt(x)
-    if not float(exponent).is_integer():
-        raise UsageError(f"Expected a whole exponent or ±½ in a power, got {exponent}; write it with exp or sqrt.")
-    if exponent == 1:
-        return x
-    half = _power(x, exponent // 2)
-    return functions.square(half) if exponent % 2 == 0 else taylor.multiply(functions.square(half), x)
 
 
 @rule(aten.mm.default, aten.bmm.default)
@@ -112,24 +90,10 @@ def _matrix_vector_product(x: Any, y: Any) -> TaylorForm:
     return ARRANGEMENTS[aten.squeeze.dim](_matrix_product(x, _unsqueezed(y, -1)), -1)
 
 
-@rule(aten.dot.default)
-def _dot(x: Any, y: Any) -> TaylorForm:
-    """Σ_i x_i y_i."""
-    return _sum(_multiply(x, y))
-
-
 @rule(aten._to_copy.default)
 def _to_copy(x: TaylorForm, **keywords: Any) -> TaylorForm:
     """x: truths as numbers; the gate refuses any dtype but float64."""
     return x
-
-
-@rule(aten.addmm.default)
-def _add_matrix_product(offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> TaylorForm:
-    """β · offset + α · xy."""
-    product = _matrix_product(x, y)
-    product = product if alpha == 1 else _multiply(product, alpha)
-    return _add(product, offset, beta)
 
 
 @rule(aten.neg.default)
@@ -149,13 +113,6 @@ def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False,
     return x.with_parts(x.terms.sum([axis + 2 for axis in axes], keepdim), radius)
 
 
-@rule(aten.mean.default, aten.mean.dim)
-def _mean(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
-    """Σ x over some axes, divided by their length."""
-    total = _sum(x, dim, keepdim)
-    return _multiply(total, total.shape.numel() / x.shape.numel())
-
-
 # Rounding in another arithmetic
 
 
@@ -170,21 +127,7 @@ def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) 
 
 # Functions of one number
 
-rule(aten.exp.default)(functions.exp)
-rule(aten.log.default)(functions.log)
-rule(aten.log1p.default)(functions.log1p)
-rule(aten.sqrt.default)(functions.sqrt)
-rule(aten.reciprocal.default)(functions.reciprocal)
-rule(aten.sigmoid.default)(functions.sigmoid)
-rule(aten.sin.default)(functions.sin)
-rule(aten.cos.default)(functions.cos)
-rule(aten.tan.default)(functions.tan)
-
-
-@rule(aten.rsqrt.default)
-def _rsqrt(x: TaylorForm) -> TaylorForm:
-    """1/√x."""
-    return functions.reciprocal(functions.sqrt(x))
+RULES.update({getattr(aten, name).default: function for name, function in functions.ELEMENTARY.items()})
 
 
 @rule(aten.tanh.default)
@@ -206,31 +149,6 @@ def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: flo
     """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
     y = _multiply(x, beta) if beta != 1 else x
     return _multiply(gradient, _loosened_above(functions.sigmoid(y), y, threshold, 1.0))
-
-
-@rule(aten.silu.default)
-def _silu(x: TaylorForm) -> TaylorForm:
-    """x σ(x)."""
-    return taylor.multiply(x, functions.sigmoid(x))
-
-
-@rule(aten.silu_backward.default)
-def _silu_backward(gradient: Any, x: TaylorForm) -> TaylorForm:
-    """gradient · σ(1 + x(1 − σ))."""
-    s = functions.sigmoid(x)
-    return _multiply(gradient, _multiply(s, _add(_multiply(x, _subtract(1.0, s)), 1.0)))
-
-
-@rule(aten.sigmoid_backward.default)
-def _sigmoid_backward(gradient: Any, s: TaylorForm) -> TaylorForm:
-    """gradient · s(1 − s)."""
-    return _multiply(gradient, _subtract(s, functions.square(s)))
-
-
-@rule(aten.tanh_backward.default)
-def _tanh_backward(gradient: Any, y: TaylorForm) -> TaylorForm:
-    """gradient · (1 − y²)."""
-    return _multiply(gradient, _subtract(1.0, functions.square(y)))
 
 
 def _loosened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
@@ -357,6 +275,9 @@ OF_SHAPE = {
 }  # fmt: skip
 for _operation in OF_SHAPE:
     rule(_operation)(_of_shape(_operation))
+
+
+RULES.update({operation: on_forms(composed, RULES) for operation, composed in COMPOSED.items()})
 
 
 def _transposed(x: TaylorForm) -> TaylorForm:

@@ -187,8 +187,8 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         rule = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
     if rule is None:
         raise UsageError(
-            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add its rule to "
-            "lyapnet.prover.bound_rules.RULES."
+            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add it to the "
+            "table of operators (docs/operators.md)."
         )
     try:
         result = rule(*arguments, **keywords)  # pyright: ignore[reportCallIssue]

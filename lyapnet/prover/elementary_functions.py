@@ -4,6 +4,7 @@ What torch's own functions are trusted with is in lyapnet.prover.taylor.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -24,6 +25,27 @@ class Derivatives(NamedTuple):
     fourth_range: Range
 
 
+@dataclass(frozen=True)
+class Elementary:
+    """A function f of one number, and what bounds need to know of it; called with a Taylor form, f of it.
+
+    Args:
+        function, derivative: f and f'.
+        stationary: (a, lo, hi) ↦ points that include each solution of f'(x) = a in [lo, hi]; any others do no harm.
+        defined: (lo, hi) ↦ whether f is smooth on [lo, hi]; the remainder is infinite where it is not.
+        derivatives: those beyond the first; without them forms stay linear in x.
+    """
+
+    function: Callable[[Tensor], Tensor]
+    derivative: Callable[[Tensor], Tensor]
+    stationary: Callable[[Tensor, Tensor, Tensor], Sequence[Tensor]]
+    defined: Callable[[Tensor, Tensor], Tensor] | None = None
+    derivatives: Derivatives | None = None
+
+    def __call__(self, x: TaylorForm) -> TaylorForm:
+        return linearised(x, self.function, self.derivative, self.stationary, self.defined, self.derivatives)
+
+
 def linearised(
     x: TaylorForm,
     function: Callable[[Tensor], Tensor],
@@ -39,10 +61,7 @@ def linearised(
     concave f the smallest possible. A point where f' = a is found up to rounding, within η = 1e-12 (1 + |x|): h there
     differs from the extreme by at most |h'|η (and terms in η², which are beyond double precision).
 
-    Args:
-        stationary: (a, lo, hi) ↦ points that include each solution of f'(x) = a in [lo, hi]; any others do no harm.
-        defined: (lo, hi) ↦ whether f is smooth on [lo, hi]; the remainder is infinite where it is not.
-        derivatives: those beyond the first; without them forms stay linear in x.
+    Args: those of Elementary.
     """
     lo, hi = x.interval()
     known = torch.isfinite(lo) & torch.isfinite(hi)
@@ -130,111 +149,6 @@ def square(x: TaylorForm) -> TaylorForm:
     return linearised(x, lambda v: v * v, lambda v: 2 * v, lambda a, lo, hi: [a / 2])
 
 
-def exp(x: TaylorForm) -> TaylorForm:
-    """eˣ; eˣ = a."""
-    grows = _monotone(torch.exp)
-    return linearised(
-        x, torch.exp, torch.exp, lambda a, lo, hi: [torch.log(a)],
-        derivatives=Derivatives(torch.exp, torch.exp, grows, grows),
-    )  # fmt: skip
-
-
-def log(x: TaylorForm) -> TaylorForm:
-    """log x for x > 0; 1/x = a."""
-    third, fourth = (lambda v: 2 / v**3), (lambda v: -6 / v**4)
-    return linearised(
-        x, torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], lambda lo, hi: lo > 0,
-        Derivatives(lambda v: -1 / v**2, third, _monotone(third), _monotone(fourth)),
-    )  # fmt: skip
-
-
-def log1p(x: TaylorForm) -> TaylorForm:
-    """log(1 + x) for x > −1; 1/(1 + x) = a."""
-    third, fourth = (lambda v: 2 / (1 + v) ** 3), (lambda v: -6 / (1 + v) ** 4)
-    return linearised(
-        x, torch.log1p, lambda v: 1 / (1 + v), lambda a, lo, hi: [1 / a - 1], lambda lo, hi: lo > -1,
-        Derivatives(lambda v: -1 / (1 + v) ** 2, third, _monotone(third), _monotone(fourth)),
-    )  # fmt: skip
-
-
-def sqrt(x: TaylorForm) -> TaylorForm:
-    """√x for x > 0; 1/(2√x) = a."""
-    third, fourth = (lambda v: 0.375 * v**-2.5), (lambda v: -0.9375 * v**-3.5)
-    return linearised(
-        x, torch.sqrt, lambda v: 0.5 / v.sqrt(), lambda a, lo, hi: [1 / (4 * a * a)], lambda lo, hi: lo > 0,
-        Derivatives(lambda v: -0.25 * v**-1.5, third, _monotone(third), _monotone(fourth)),
-    )  # fmt: skip
-
-
-def reciprocal(x: TaylorForm) -> TaylorForm:
-    """1/x for x of one sign; −1/x² = a."""
-    third, fourth = (lambda v: -6 / v**4), (lambda v: 24 / v**5)
-
-    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
-        return [torch.copysign((-a).rsqrt(), lo)]
-
-    return linearised(
-        x, torch.reciprocal, lambda v: -1 / (v * v), stationary, lambda lo, hi: (lo > 0) | (hi < 0),
-        Derivatives(lambda v: 2 / v**3, third, _monotone(third), _monotone(fourth)),
-    )  # fmt: skip
-
-
-def sigmoid(x: TaylorForm) -> TaylorForm:
-    """σ(x) = 1/(1 + e⁻ˣ); σ(1 − σ) = a at x = ±(log s − log(1 − s)), s = 2a/(1 + √(1 − 4a))."""
-
-    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
-        s = 2 * a / (1 + (1 - 4 * a).clamp_min(0).sqrt())  # the smaller root, without cancellation
-        point = _logit(s)
-        return [point, -point]
-
-    def fourth(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
-        # σ⁗ = p (12 p − 1) tanh(x/2), each factor with the range of its own
-        p = _steepness(lo, hi)
-        ranges = p, (12 * p[0] - 1, 12 * p[1] - 1), (torch.tanh(lo / 2), torch.tanh(hi / 2))
-        ends = torch.stack([a * b * c for a in ranges[0] for b in ranges[1] for c in ranges[2]])
-        return _between(ends.amin(0), ends.amax(0))
-
-    derivatives = Derivatives(_sigmoid_curvature, _sigmoid_third, _sigmoid_third_range, fourth)
-    return linearised(x, torch.sigmoid, _sigmoid_derivative, stationary, None, derivatives)
-
-
-def softplus(x: TaylorForm) -> TaylorForm:
-    """log(1 + eˣ); σ(x) = a."""
-
-    def third(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
-        # σ'' has its extremes where σ' = 1/6
-        steepest = torch.log(torch.tensor(2 + 3**0.5, dtype=lo.dtype))
-        points = torch.stack([lo, hi, steepest.clamp(lo, hi), (-steepest).clamp(lo, hi)])
-        values = _sigmoid_curvature(points)
-        return _between(values.amin(0), values.amax(0))
-
-    derivatives = Derivatives(_sigmoid_derivative, _sigmoid_curvature, third, _sigmoid_third_range)
-    return linearised(x, softplus_of, torch.sigmoid, lambda a, lo, hi: [_logit(a)], None, derivatives)
-
-
-def sin(x: TaylorForm) -> TaylorForm:
-    """sin x on at most two periods; cos x = a at x = ±arccos a + 2πk."""
-
-    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
-        return _periodic(torch.acos(a.clamp(-1, 1)), lo, hi)
-
-    derivatives = Derivatives(
-        lambda v: -torch.sin(v), lambda v: -torch.cos(v), _around(lambda v: -torch.cos(v)), _around(torch.sin)
-    )
-    return linearised(x, torch.sin, torch.cos, stationary, _two_periods, derivatives)
-
-
-def cos(x: TaylorForm) -> TaylorForm:
-    """cos x on at most two periods; −sin x = a at x = −π/2 ± arccos a + 2πk."""
-
-    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
-        quarter = torch.pi / 2
-        return [point - quarter for point in _periodic(torch.acos(a.clamp(-1, 1)), lo + quarter, hi + quarter)]
-
-    derivatives = Derivatives(lambda v: -torch.cos(v), torch.sin, _around(torch.sin), _around(torch.cos))
-    return linearised(x, torch.cos, lambda v: -torch.sin(v), stationary, _two_periods, derivatives)
-
-
 def _between(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
     """A range with room for the rounding of its ends."""
     room = 64 * EPSILON * torch.maximum(low.abs(), high.abs()) + TINY
@@ -259,22 +173,6 @@ def _around(wave: Callable[[Tensor], Tensor]) -> Range:
         return _between((middle - reach).clamp_min(-1), (middle + reach).clamp_max(1))
 
     return around_middle
-
-
-def tan(x: TaylorForm) -> TaylorForm:
-    """tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
-
-    def branch(lo: Tensor, hi: Tensor) -> Tensor:
-        return ((lo + hi) / (2 * torch.pi)).round() * torch.pi
-
-    def stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
-        base = torch.atan((a - 1).clamp_min(0).sqrt())
-        return [branch(lo, hi) - base, branch(lo, hi) + base]
-
-    def defined(lo: Tensor, hi: Tensor) -> Tensor:
-        return (lo - branch(lo, hi) > -1.57) & (hi - branch(lo, hi) < 1.57)
-
-    return linearised(x, torch.tan, lambda v: 1 + torch.tan(v) ** 2, stationary, defined)
 
 
 def _two_periods(lo: Tensor, hi: Tensor) -> Tensor:
@@ -322,3 +220,139 @@ def _sigmoid_curvature(v: Tensor) -> Tensor:
 def softplus_of(v: Tensor) -> Tensor:
     """log(1 + eᵛ) of plain numbers, without overflow."""
     return v.clamp_min(0) + torch.log1p(torch.exp(-v.abs()))
+
+
+# The functions, each with the solutions of f'(x) = a
+
+exp = Elementary(
+    torch.exp, torch.exp, lambda a, lo, hi: [torch.log(a)],
+    derivatives=Derivatives(torch.exp, torch.exp, _monotone(torch.exp), _monotone(torch.exp)),
+)  # fmt: skip
+"""eˣ; eˣ = a."""
+
+
+def _log_third(v: Tensor) -> Tensor:
+    return 2 / v**3
+
+
+def _log_fourth(v: Tensor) -> Tensor:
+    return -6 / v**4
+
+
+log = Elementary(
+    torch.log, torch.reciprocal, lambda a, lo, hi: [1 / a], lambda lo, hi: lo > 0,
+    Derivatives(lambda v: -1 / v**2, _log_third, _monotone(_log_third), _monotone(_log_fourth)),
+)  # fmt: skip
+"""log x for x > 0; 1/x = a."""
+
+log1p = Elementary(
+    torch.log1p, lambda v: 1 / (1 + v), lambda a, lo, hi: [1 / a - 1], lambda lo, hi: lo > -1,
+    Derivatives(
+        lambda v: -1 / (1 + v) ** 2, lambda v: _log_third(1 + v),
+        _monotone(lambda v: _log_third(1 + v)), _monotone(lambda v: _log_fourth(1 + v)),
+    ),
+)  # fmt: skip
+"""log(1 + x) for x > −1; 1/(1 + x) = a."""
+
+
+def _sqrt_third(v: Tensor) -> Tensor:
+    return 0.375 * v**-2.5
+
+
+sqrt = Elementary(
+    torch.sqrt, lambda v: 0.5 / v.sqrt(), lambda a, lo, hi: [1 / (4 * a * a)], lambda lo, hi: lo > 0,
+    Derivatives(
+        lambda v: -0.25 * v**-1.5, _sqrt_third, _monotone(_sqrt_third), _monotone(lambda v: -0.9375 * v**-3.5)
+    ),
+)  # fmt: skip
+"""√x for x > 0; 1/(2√x) = a."""
+
+
+def _reciprocal_third(v: Tensor) -> Tensor:
+    return -6 / v**4
+
+
+reciprocal = Elementary(
+    torch.reciprocal, lambda v: -1 / (v * v), lambda a, lo, hi: [torch.copysign((-a).rsqrt(), lo)],
+    lambda lo, hi: (lo > 0) | (hi < 0),
+    Derivatives(lambda v: 2 / v**3, _reciprocal_third, _monotone(_reciprocal_third), _monotone(lambda v: 24 / v**5)),
+)  # fmt: skip
+"""1/x for x of one sign; −1/x² = a."""
+
+
+def _sigmoid_stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+    s = 2 * a / (1 + (1 - 4 * a).clamp_min(0).sqrt())  # the smaller root, without cancellation
+    point = _logit(s)
+    return [point, -point]
+
+
+def _sigmoid_fourth_range(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    """The range of σ⁗ = p (12 p − 1) tanh(x/2), each factor with the range of its own."""
+    p = _steepness(lo, hi)
+    ranges = p, (12 * p[0] - 1, 12 * p[1] - 1), (torch.tanh(lo / 2), torch.tanh(hi / 2))
+    ends = torch.stack([a * b * c for a in ranges[0] for b in ranges[1] for c in ranges[2]])
+    return _between(ends.amin(0), ends.amax(0))
+
+
+sigmoid = Elementary(
+    torch.sigmoid, _sigmoid_derivative, _sigmoid_stationary, None,
+    Derivatives(_sigmoid_curvature, _sigmoid_third, _sigmoid_third_range, _sigmoid_fourth_range),
+)  # fmt: skip
+"""σ(x) = 1/(1 + e⁻ˣ); σ(1 − σ) = a at x = ±(log s − log(1 − s)), s = 2a/(1 + √(1 − 4a))."""
+
+
+def _sigmoid_curvature_range(lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    """The range of σ'', which has its extremes where σ' = 1/6."""
+    steepest = torch.log(torch.tensor(2 + 3**0.5, dtype=lo.dtype))
+    points = torch.stack([lo, hi, steepest.clamp(lo, hi), (-steepest).clamp(lo, hi)])
+    values = _sigmoid_curvature(points)
+    return _between(values.amin(0), values.amax(0))
+
+
+softplus = Elementary(
+    softplus_of, torch.sigmoid, lambda a, lo, hi: [_logit(a)], None,
+    Derivatives(_sigmoid_derivative, _sigmoid_curvature, _sigmoid_curvature_range, _sigmoid_third_range),
+)  # fmt: skip
+"""log(1 + eˣ); σ(x) = a."""
+
+
+def _cos_stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+    quarter = torch.pi / 2
+    return [point - quarter for point in _periodic(torch.acos(a.clamp(-1, 1)), lo + quarter, hi + quarter)]
+
+
+sin = Elementary(
+    torch.sin, torch.cos, lambda a, lo, hi: _periodic(torch.acos(a.clamp(-1, 1)), lo, hi), _two_periods,
+    Derivatives(
+        lambda v: -torch.sin(v), lambda v: -torch.cos(v), _around(lambda v: -torch.cos(v)), _around(torch.sin)
+    ),
+)  # fmt: skip
+"""sin x on at most two periods; cos x = a at x = ±arccos a + 2πk."""
+
+cos = Elementary(
+    torch.cos, lambda v: -torch.sin(v), _cos_stationary, _two_periods,
+    Derivatives(lambda v: -torch.cos(v), torch.sin, _around(torch.sin), _around(torch.cos)),
+)  # fmt: skip
+"""cos x on at most two periods; −sin x = a at x = −π/2 ± arccos a + 2πk."""
+
+
+def _branch(lo: Tensor, hi: Tensor) -> Tensor:
+    return ((lo + hi) / (2 * torch.pi)).round() * torch.pi
+
+
+def _tan_stationary(a: Tensor, lo: Tensor, hi: Tensor) -> Sequence[Tensor]:
+    base = torch.atan((a - 1).clamp_min(0).sqrt())
+    return [_branch(lo, hi) - base, _branch(lo, hi) + base]
+
+
+tan = Elementary(
+    torch.tan, lambda v: 1 + torch.tan(v) ** 2, _tan_stationary,
+    lambda lo, hi: (lo - _branch(lo, hi) > -1.57) & (hi - _branch(lo, hi) < 1.57),
+)  # fmt: skip
+"""tan x on one branch, kept off its poles; 1 + tan² x = a at x = ±atan √(a − 1) + πk."""
+
+ELEMENTARY = {
+    "exp": exp, "log": log, "log1p": log1p, "sqrt": sqrt, "reciprocal": reciprocal, "sigmoid": sigmoid, "sin": sin,
+    "cos": cos, "tan": tan,
+}  # fmt: skip
+"""By the names of torch's operators; softplus has options of its own there."""

@@ -34,6 +34,7 @@ from lyapnet.prover.boxes import CutTree
 from lyapnet.prover.branch_and_bound import Search, just_below
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.prover.counterexamples import Counterexample
+from lyapnet.prover.operators import files
 
 SOURCES = (Path(__file__).parent,)
 """The folder of what a proof is made by: the search, the bounds and their kernel.
@@ -44,8 +45,8 @@ the fingerprint of the traced function, operation by operation and number by num
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
-    """A hash of every source file in some folders, with their names, and of how C++ is compiled."""
-    found = hashlib.sha256(repr(FLAGS).encode())
+    """A hash of every source file in some folders, with their names, of how C++ is compiled, and of own operators."""
+    found = hashlib.sha256(repr((FLAGS, *files())).encode())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):
             content = path.read_bytes()

@@ -4,24 +4,17 @@ Functions that stand for what another program computes mark their results as rou
 of the exact function; the bounds of lyapnet.prover.bounds hold for every function whose results are rounded as marked.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from contextlib import AbstractContextManager
 
 import torch
 from torch import Tensor
 
-_counted = ContextVar("counted", default=False)
+from lyapnet.base.operators import BOUNDS, are_operators, as_operators
 
 
-@contextmanager
-def rounding(counted: bool) -> Iterator[None]:
+def rounding(counted: bool) -> AbstractContextManager[None]:
     """Whether `rounded` leaves an operator in what is traced within; outside it leaves none."""
-    token = _counted.set(counted)
-    try:
-        yield
-    finally:
-        _counted.reset(token)
+    return as_operators(BOUNDS, counted)
 
 
 def rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
@@ -34,7 +27,7 @@ def rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: fl
         y: in float64; a constant too.
         at: the point, on which the errors may depend.
     """
-    return torch.ops.lyapnet.rounded(y, at, relative, absolute, largest) if _counted.get() else y
+    return torch.ops.lyapnet.rounded(y, at, relative, absolute, largest) if are_operators(BOUNDS) else y
 
 
 @torch.library.custom_op("lyapnet::rounded", mutates_args=())

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.graphs.compilation import file_of_library, library_of
-from lyapnet.graphs.number_kernel.program import Instruction, Place, Program
+from lyapnet.graphs.number_kernel.program import Instruction, Place, Program, elementwise_instructions
 from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
 
@@ -21,18 +21,24 @@ NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
 
 
 @cache
-def library(dtype: torch.dtype) -> ctypes.CDLL:
-    """The compiled C++ for one type of numbers, from disk, or compiled now: one file for each machine.
+def library(*definitions: str) -> ctypes.CDLL:
+    """The compiled C++ by what it leaves open, from disk, or compiled now: one file for each machine.
 
     Raises:
         CompilationError: as library_of.
     """
-    return library_of("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}")
+    return library_of("numbers", (SOURCE,), *definitions)
+
+
+def definitions(dtype: torch.dtype) -> tuple[str, str]:
+    """What program.cpp leaves open: the type of its numbers, and the elementwise instructions."""
+    rows = (f"OPERANDS_{count}({name}, {of})" for name, (count, of) in elementwise_instructions().items())
+    return f"NUMBER={NUMBERS[dtype]}", f"ELEMENTWISE={' '.join(rows)}"
 
 
 def is_built(dtype: torch.dtype) -> bool:
     """Whether the C++ for one type of numbers was compiled before."""
-    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), f"NUMBER={NUMBERS[dtype]}").is_file()
+    return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), *definitions(dtype)).is_file()
 
 
 class _Memory(NamedTuple):
@@ -53,6 +59,7 @@ class AssembledProgram:
         self.dtype = next(each.dtype for each in reversed(arguments) if each.is_floating_point())
         if self.dtype not in NUMBERS or any(each.device.type != "cpu" for each in arguments):
             raise NotImplementedError(f"{self.dtype} on {arguments[-1].device}")
+        self._definitions = definitions(self.dtype)
         self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
         self.result_shapes: list[torch.Size] = []
         self._given, self._results = list[int](), list[int]()  # buffers
@@ -86,7 +93,7 @@ class AssembledProgram:
             if k < len(results) - sums:
                 program.elementwise("copy", result.shape, out, [place])
             else:
-                program.elementwise("sum", result.shape, out, [out, place])
+                program.elementwise("add", result.shape, out, [out, place])
             self._results.append(buffer)
             self.result_shapes.append(result.shape)
         program.without_unread(self._results)
@@ -180,7 +187,7 @@ class AssembledProgram:
         return table
 
     def _function(self, name: str) -> Any:
-        return getattr(library(self.dtype), f"lyapnet_{name}")
+        return getattr(library(*self._definitions), f"lyapnet_{name}")
 
 
 def _array(instructions: Sequence[Instruction]) -> np.ndarray:

@@ -104,17 +104,15 @@ inline auto total(V x) {
 
 // --- Operations on the numbers of a vector; truths are 1 and 0 ---
 
-template <class T, class V, double (*F)(double)>
-V each(V x) {
-    for (int i = 0; i < Of<T>::LANES; i++) x[i] = F(x[i]);
-    return x;
+template <class T, class F, class V, class... More>
+V each(F f, V x, More... others) {
+    V y;
+    for (int i = 0; i < Of<T>::LANES; i++) y[i] = f(x[i], others[i]...);
+    return y;
 }
 
-template <class T, class V, class F>
-V each_pair(V x, V y, F f) {
-    for (int i = 0; i < Of<T>::LANES; i++) x[i] = f(x[i], y[i]);
-    return x;
-}
+template <class T, class V>
+inline V root(V x) { return each<T>([](double x) { return std::sqrt(x); }, x); }
 
 template <class T>
 T remainder_like(T x, T y) {  // with the sign of y, as torch has it
@@ -167,106 +165,44 @@ inline Of<float>::V exponential(Of<float>::V x) {
     return x > high ? V{} + INFINITY : (x < low ? V{} : (x != x ? x : y));
 }
 
-#define UNARY(NAME, VALUE)                          \
-    template <class T>                              \
-    struct NAME {                                   \
-        typedef typename Of<T>::V V;                \
-        static V of(V x) { return VALUE; }          \
-    };
-#define BINARY(NAME, VALUE)                         \
-    template <class T>                              \
-    struct NAME {                                   \
-        typedef typename Of<T>::V V;                \
-        static V of(V x, V y) { return VALUE; }     \
-    };
+template <class T, class V>
+inline V logistic(V x) {
+    const V u = exponential(-absolute<T, V>(x)), large = 1 / (1 + u);
+    return x < 0 ? u * large : (x != x ? x : large);
+}
+
+// (1 − u)/(1 + u) with u = e^(−2|x|), and where that loses digits e/(e + 2) with e = e^(2|x|) − 1
+template <class T, class V>
+inline V hyperbolic_tangent(V x) {
+    const V size = absolute<T, V>(x), u = exponential(-2 * size), e = exponential_less_one(2 * size);
+    const V t = (size > T(0.17) ? 1 - u : e) / (size > T(0.17) ? 1 + u : e + 2);
+    return x < 0 ? -t : (x == 0 ? x : t);  // which keeps the sign of −0
+}
+
+inline double larger(double a, double b) { return a > b || a != a ? a : b; }
+inline double smaller(double a, double b) { return a < b || a != a ? a : b; }
+inline double remainder_of(double a, double b) { return remainder_like(a, b); }
+
+// ELEMENTWISE is OPERANDS_n(NAME, expression of n vectors x, y, z) for every elementwise instruction, as program.py has
+// them: here a type for each, and in INSTRUCTIONS the place of each.
 #define ONE (V{} + 1)
 #define ZERO (V{})
-#define LIBRARY(F) (each<T, V, F>(x))
-
-UNARY(Copy, x)
-UNARY(Negative, -x)
-UNARY(Absolute, (absolute<T, V>(x)))
-UNARY(Reciprocal, 1 / x)
-UNARY(Square, x *x)
-UNARY(Cube, x *x *x)
-UNARY(Root, LIBRARY(std::sqrt))
-UNARY(InverseRoot, 1 / LIBRARY(std::sqrt))
-UNARY(Exp, exponential(x))
-UNARY(Exp2, LIBRARY(std::exp2))
-UNARY(Expm1, LIBRARY(std::expm1))
-UNARY(Log, LIBRARY(std::log))
-UNARY(Log1p, LIBRARY(std::log1p))
-UNARY(Log2, LIBRARY(std::log2))
-UNARY(Log10, LIBRARY(std::log10))
-UNARY(Sin, LIBRARY(std::sin))
-UNARY(Cos, LIBRARY(std::cos))
-UNARY(Tan, LIBRARY(std::tan))
-UNARY(Asin, LIBRARY(std::asin))
-UNARY(Acos, LIBRARY(std::acos))
-UNARY(Atan, LIBRARY(std::atan))
-UNARY(Sinh, LIBRARY(std::sinh))
-UNARY(Cosh, LIBRARY(std::cosh))
-UNARY(Asinh, LIBRARY(std::asinh))
-UNARY(Acosh, LIBRARY(std::acosh))
-UNARY(Atanh, LIBRARY(std::atanh))
-UNARY(Erf, LIBRARY(std::erf))
-UNARY(Floor, LIBRARY(std::floor))
-UNARY(Ceil, LIBRARY(std::ceil))
-UNARY(Round, LIBRARY(std::nearbyint))
-UNARY(Truncate, LIBRARY(std::trunc))
-UNARY(Relu, x > 0 ? x : (x != x ? x : ZERO))
-UNARY(Sign, x > 0 ? ONE : (x < 0 ? -ONE : ZERO))
-UNARY(Not, x == 0 ? ONE : ZERO)
-UNARY(IsNan, x != x ? ONE : ZERO)
-UNARY(Truth, x != 0 ? ONE : ZERO)
-
-template <class T>
-struct Sigmoid {
-    typedef typename Of<T>::V V;
-    static V of(V x) {
-        const V u = exponential(-absolute<T, V>(x)), large = 1 / (1 + u);
-        return x < 0 ? u * large : (x != x ? x : large);
-    }
-};
-
-template <class T>
-struct Tanh {  // (1 − u)/(1 + u) with u = e^(−2|x|), and where that loses digits e/(e + 2) with e = e^(2|x|) − 1
-    typedef typename Of<T>::V V;
-    static V of(V x) {
-        const V size = absolute<T, V>(x), u = exponential(-2 * size), e = exponential_less_one(2 * size);
-        const V t = (size > T(0.17) ? 1 - u : e) / (size > T(0.17) ? 1 + u : e + 2);
-        return x < 0 ? -t : (x == 0 ? x : t);  // which keeps the sign of −0
-    }
-};
-
-BINARY(Sum, x + y)
-BINARY(Difference, x - y)
-BINARY(Product, x *y)
-BINARY(Quotient, x / y)
-BINARY(Larger, x != x ? x : (y != y ? y : (x > y ? x : y)))
-BINARY(Smaller, x != x ? x : (y != y ? y : (x < y ? x : y)))
-BINARY(Less, x < y ? ONE : ZERO)
-BINARY(LessOrEqual, x <= y ? ONE : ZERO)
-BINARY(Equal, x == y ? ONE : ZERO)
-BINARY(Unequal, x != y ? ONE : ZERO)
-BINARY(SigmoidSlope, x *(y * (1 - y)))  // of a costate x and σ = y
-BINARY(TanhSlope, x *(1 - y * y))
-
-BINARY(Power, (each_pair<T>(x, y, [](T a, T b) { return std::pow(a, b); })))
-BINARY(Atan2, (each_pair<T>(x, y, [](T a, T b) { return std::atan2(a, b); })))
-BINARY(Remainder, (each_pair<T>(x, y, remainder_like<T>)))
-
-template <class T>
-struct Where {
-    typedef typename Of<T>::V V;
-    static V of(V condition, V x, V y) { return condition != 0 ? x : y; }
-};
-
-template <class T>
-struct ProductAndSum {
-    typedef typename Of<T>::V V;
-    static V of(V x, V y, V z) { return x + y * z; }
-};
+#define TYPE(NAME, DECLARED, ...)                    \
+    template <class T>                               \
+    struct Of_##NAME {                               \
+        typedef typename Of<T>::V V;                 \
+        static V of DECLARED { return __VA_ARGS__; } \
+    };
+#define OPERANDS_1(NAME, ...) TYPE(NAME, (V x), __VA_ARGS__)
+#define OPERANDS_2(NAME, ...) TYPE(NAME, (V x, V y), __VA_ARGS__)
+#define OPERANDS_3(NAME, ...) TYPE(NAME, (V x, V y, V z), __VA_ARGS__)
+ELEMENTWISE
+#undef OPERANDS_1
+#undef OPERANDS_2
+#undef OPERANDS_3
+#define OPERANDS_1(NAME, ...) elementwise<T, Of_##NAME<T>, 1>,
+#define OPERANDS_2(NAME, ...) elementwise<T, Of_##NAME<T>, 2>,
+#define OPERANDS_3(NAME, ...) elementwise<T, Of_##NAME<T>, 3>,
 
 // --- Instructions ---
 
@@ -743,67 +679,12 @@ void active_set(const Machine<T> &machine, const Integer *row) {
 template <class T>
 using Instruction = void (*)(const Machine<T> &, const Integer *);
 
-// In the order of OPERATIONS in program.py
+// In the order of `operations_in_order` in program.py
 template <class T>
 const Instruction<T> INSTRUCTIONS[] = {
-    elementwise<T, Copy<T>, 1>,
-    elementwise<T, Negative<T>, 1>,
-    elementwise<T, Absolute<T>, 1>,
-    elementwise<T, Reciprocal<T>, 1>,
-    elementwise<T, Square<T>, 1>,
-    elementwise<T, Cube<T>, 1>,
-    elementwise<T, Root<T>, 1>,
-    elementwise<T, InverseRoot<T>, 1>,
-    elementwise<T, Exp<T>, 1>,
-    elementwise<T, Exp2<T>, 1>,
-    elementwise<T, Expm1<T>, 1>,
-    elementwise<T, Log<T>, 1>,
-    elementwise<T, Log1p<T>, 1>,
-    elementwise<T, Log2<T>, 1>,
-    elementwise<T, Log10<T>, 1>,
-    elementwise<T, Sin<T>, 1>,
-    elementwise<T, Cos<T>, 1>,
-    elementwise<T, Tan<T>, 1>,
-    elementwise<T, Asin<T>, 1>,
-    elementwise<T, Acos<T>, 1>,
-    elementwise<T, Atan<T>, 1>,
-    elementwise<T, Sinh<T>, 1>,
-    elementwise<T, Cosh<T>, 1>,
-    elementwise<T, Asinh<T>, 1>,
-    elementwise<T, Acosh<T>, 1>,
-    elementwise<T, Atanh<T>, 1>,
-    elementwise<T, Erf<T>, 1>,
-    elementwise<T, Floor<T>, 1>,
-    elementwise<T, Ceil<T>, 1>,
-    elementwise<T, Round<T>, 1>,
-    elementwise<T, Truncate<T>, 1>,
-    elementwise<T, Relu<T>, 1>,
-    elementwise<T, Sign<T>, 1>,
-    elementwise<T, Not<T>, 1>,
-    elementwise<T, IsNan<T>, 1>,
-    elementwise<T, Truth<T>, 1>,
-    elementwise<T, Sigmoid<T>, 1>,
-    elementwise<T, Tanh<T>, 1>,
-    elementwise<T, Sum<T>, 2>,
-    elementwise<T, Difference<T>, 2>,
-    elementwise<T, Product<T>, 2>,
-    elementwise<T, Quotient<T>, 2>,
-    elementwise<T, Larger<T>, 2>,
-    elementwise<T, Smaller<T>, 2>,
-    elementwise<T, Less<T>, 2>,
-    elementwise<T, LessOrEqual<T>, 2>,
-    elementwise<T, Equal<T>, 2>,
-    elementwise<T, Unequal<T>, 2>,
-    elementwise<T, SigmoidSlope<T>, 2>,
-    elementwise<T, TanhSlope<T>, 2>,
-    elementwise<T, Power<T>, 2>,
-    elementwise<T, Atan2<T>, 2>,
-    elementwise<T, Remainder<T>, 2>,
-    elementwise<T, Where<T>, 3>,
-    elementwise<T, ProductAndSum<T>, 3>,
-    reduction<T, Sum<T>>,
-    reduction<T, Larger<T>>,
-    reduction<T, Smaller<T>>,
+    reduction<T, Of_add<T>>,
+    reduction<T, Of_maximum<T>>,
+    reduction<T, Of_minimum<T>>,
     extreme<T, true>,
     extreme<T, false>,
     indexed<T, false>,
@@ -815,6 +696,7 @@ const Instruction<T> INSTRUCTIONS[] = {
     products<T>,
     symmetric_inverse<T>,
     active_set<T>,
+    ELEMENTWISE
 };
 
 template <class T>

@@ -8,86 +8,31 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# in the order of INSTRUCTIONS in program.cpp
-OPERATIONS = {
-    name: code
-    for code, name in enumerate(
-        (
-            "copy",
-            "negative",
-            "absolute",
-            "reciprocal",
-            "square",
-            "cube",
-            "root",
-            "inverse_root",
-            "exp",
-            "exp2",
-            "expm1",
-            "log",
-            "log1p",
-            "log2",
-            "log10",
-            "sin",
-            "cos",
-            "tan",
-            "asin",
-            "acos",
-            "atan",
-            "sinh",
-            "cosh",
-            "asinh",
-            "acosh",
-            "atanh",
-            "erf",
-            "floor",
-            "ceil",
-            "round",
-            "truncate",
-            "relu",
-            "sign",
-            "not",
-            "is_nan",
-            "truth",
-            "sigmoid",
-            "tanh",
-            "sum",
-            "difference",
-            "product",
-            "quotient",
-            "larger",
-            "smaller",
-            "less",
-            "less_or_equal",
-            "equal",
-            "unequal",
-            "sigmoid_slope",
-            "tanh_slope",
-            "power",
-            "atan2",
-            "remainder",
-            "where",
-            "product_and_sum",
-            "reduce_sum",
-            "reduce_larger",
-            "reduce_smaller",
-            "index_of_largest",
-            "index_of_least",
-            "take_at_index",
-            "put_at_index",
-            "move",
-            "add_moved",
-            "pack",
-            "product_with_packed",
-            "products",
-            "symmetric_inverse",
-            "active_set",
-        )
-    )
-}
+from lyapnet.graphs.operators import OPERATORS
+
+# in the order of INSTRUCTIONS in program.cpp, where those of `elementwise_instructions` follow
+OPERATIONS = (
+    "reduce_sum", "reduce_maximum", "reduce_minimum", "index_of_largest", "index_of_least", "take_at_index",
+    "put_at_index", "move", "add_moved", "pack", "product_with_packed", "products", "symmetric_inverse", "active_set",
+)  # fmt: skip
+OWN = {  # beside those of the table of operators: (operands, expression of x, y, z)
+    "copy": (1, "x"), "cube": (1, "x * x * x"), "truth": (1, "x != 0 ? ONE : ZERO"),
+    "product_and_sum": (3, "x + y * z"),
+}  # fmt: skip
 MOST_RANK = 8  # as in program.cpp
 MOST_UNKNOWNS = 32  # of a small linear system, as in program.cpp
 LINE = 64  # bytes of a line of the cache, at which buffers begin
+
+
+def elementwise_instructions() -> dict[str, tuple[int, str]]:
+    """name ↦ (operands, expression) of every instruction that computes number by number."""
+    rows = [row for row in OPERATORS.values() if row.instruction is not None]
+    return {**OWN, **{row.name: (row.operands, str(row.instruction)) for row in rows}}
+
+
+def operations_in_order() -> list[str]:
+    """The names of all instructions, each at its code."""
+    return [*OPERATIONS, *elementwise_instructions()]
 
 
 class Place(NamedTuple):
@@ -130,6 +75,7 @@ class Program:
         self.repeated: list[Instruction] = []  # done at every step
         self.tables: list[np.ndarray] = []
         self._positions = 0
+        self._codes = {name: code for code, name in enumerate(operations_in_order())}
         self._packed = dict[tuple[Place, int, int], int]()
 
     def new_buffer(self, numbers: int, varies: bool, constant: Tensor | None = None, given: bool = False) -> int:
@@ -236,7 +182,7 @@ class Program:
     def _append(self, operation: str, row: list[int], reads: Sequence[int], writes: int) -> None:
         self.buffers[writes].varies |= any(self.buffers[each].varies for each in reads)
         part = self.repeated if self.buffers[writes].varies else self.shared
-        part.append(Instruction([OPERATIONS[operation], len(row) + 2, *row], tuple(reads), writes))
+        part.append(Instruction([self._codes[operation], len(row) + 2, *row], tuple(reads), writes))
 
     def without_unread(self, results: Iterable[int]) -> None:
         """Leave out instructions that write what no later one reads, and no result is."""

@@ -9,33 +9,25 @@ from torch.utils._pytree import tree_leaves
 
 from lyapnet.graphs.number_kernel.program import Place
 from lyapnet.graphs.number_kernel.writing import Number, Writer
+from lyapnet.graphs.operators import Rules
 
-UNARY = {
-    "abs": "absolute", "acos": "acos", "acosh": "acosh", "asin": "asin", "asinh": "asinh", "atan": "atan",
-    "atanh": "atanh", "ceil": "ceil", "clone": "copy", "cos": "cos", "cosh": "cosh", "erf": "erf", "exp": "exp",
-    "exp2": "exp2", "expm1": "expm1", "floor": "floor", "isnan": "is_nan", "lift_fresh_copy": "copy", "log": "log",
-    "log10": "log10", "log1p": "log1p", "log2": "log2", "neg": "negative", "reciprocal": "reciprocal", "relu": "relu",
-    "round": "round", "rsqrt": "inverse_root", "sigmoid": "sigmoid", "sign": "sign", "sgn": "sign", "sin": "sin",
-    "sinh": "sinh", "sqrt": "root", "square": "square", "tan": "tan", "tanh": "tanh", "trunc": "truncate",
-    "logical_not": "not", "_to_copy": "copy", "contiguous": "copy",
-}  # fmt: skip
-BINARY = {
-    "atan2": "atan2", "eq": "equal", "le": "less_or_equal", "lt": "less", "maximum": "larger", "minimum": "smaller",
-    "mul": "product", "ne": "unequal", "remainder": "remainder", "sigmoid_backward": "sigmoid_slope",
-    "tanh_backward": "tanh_slope",
-}  # fmt: skip
-SWAPPED = {"ge": "less_or_equal", "gt": "less"}
 OF_MEMORY = {"memory_format", "dtype", "layout", "device", "pin_memory", "non_blocking"}  # options without a part in it
-POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "root", -0.5: "inverse_root"}
+POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "sqrt", -0.5: "rsqrt"}
 
 
-def _unary(operation: str) -> Callable[..., None]:
-    def write(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
-        if options.keys() - OF_MEMORY:
+def _elementwise(operation: str) -> Callable[..., None]:
+    def write(writer: Writer, out: Tensor, *values: Number, **options: Any) -> None:
+        if options:
             raise NotImplementedError(f"{operation} with {', '.join(options)}")
-        _copy(writer, out, x) if operation == "copy" else writer.elementwise(operation, out, x)
+        writer.elementwise(operation, out, *values)
 
     return write
+
+
+def _same(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
+    if options.keys() - OF_MEMORY:
+        raise NotImplementedError(f"a copy with {', '.join(options)}")
+    _copy(writer, out, x)
 
 
 def _copy(writer: Writer, out: Tensor, x: Number) -> None:
@@ -44,8 +36,8 @@ def _copy(writer: Writer, out: Tensor, x: Number) -> None:
     if out.dtype == torch.bool and given != torch.bool:
         writer.elementwise("truth", out, x)
     elif out.dtype == torch.int64 and given not in (torch.int64, torch.bool):
-        writer.elementwise("truncate", out, x)
-        writer.elementwise("sum", out, out, 0)  # an integer has one zero
+        writer.elementwise("trunc", out, x)
+        writer.elementwise("add", out, out, 0)  # an integer has one zero
     else:
         writer.elementwise("copy", out, x)
 
@@ -54,26 +46,18 @@ def _assign(writer: Writer, out: Tensor, x: Tensor, source: Tensor, non_blocking
     _copy(writer, out, source)
 
 
-def _binary(operation: str) -> Callable[..., None]:
-    return lambda writer, out, x, y: writer.elementwise(operation, out, x, y)
-
-
-def _swapped(operation: str) -> Callable[..., None]:
-    return lambda writer, out, x, y: writer.elementwise(operation, out, y, x)
-
-
 def _add(writer: Writer, out: Tensor, x: Number, y: Number, alpha: float = 1) -> None:
     if out.dtype == torch.bool:
         raise NotImplementedError("a sum of truths")
     if alpha == 1:
-        writer.elementwise("sum", out, x, y)
+        writer.elementwise("add", out, x, y)
     else:
         writer.elementwise("product_and_sum", out, x, alpha, y)
 
 
 def _subtract(writer: Writer, out: Tensor, x: Number, y: Number, alpha: float = 1) -> None:
     if alpha == 1:
-        writer.elementwise("difference", out, x, y)
+        writer.elementwise("sub", out, x, y)
     else:
         writer.elementwise("product_and_sum", out, x, -alpha, y)
 
@@ -85,33 +69,29 @@ def _subtract_from(writer: Writer, out: Tensor, x: Number, y: Number, alpha: flo
 def _divide(writer: Writer, out: Tensor, x: Number, y: Number, rounding_mode: str | None = None) -> None:
     if rounding_mode == "floor":  # which is not ⌊x/y⌋ where x/y is rounded up to an integer
         raise NotImplementedError("a floor division")
-    writer.elementwise("quotient", out, x, y)
+    writer.elementwise("div", out, x, y)
     if rounding_mode is not None:
-        writer.elementwise("truncate", out, out)
+        writer.elementwise("trunc", out, out)
 
 
 def _power(writer: Writer, out: Tensor, x: Number, exponent: Number) -> None:
     if not isinstance(exponent, Tensor) and exponent in POWERS:
         writer.elementwise(POWERS[exponent], out, x)
     else:
-        writer.elementwise("power", out, x, exponent)
+        writer.elementwise("pow", out, x, exponent)
 
 
 def _clamp(writer: Writer, out: Tensor, x: Tensor, least: Number | None = None, most: Number | None = None) -> None:
     if least is not None:
-        writer.elementwise("larger", out, x, least)
+        writer.elementwise("maximum", out, x, least)
         x = out
-    writer.elementwise("copy", out, x) if most is None else writer.elementwise("smaller", out, x, most)
+    writer.elementwise("copy", out, x) if most is None else writer.elementwise("minimum", out, x, most)
 
 
 def _threshold_backward(writer: Writer, out: Tensor, costate: Tensor, x: Tensor, threshold: float) -> None:
     below = writer.new_tensor(x)
-    writer.elementwise("less_or_equal", below, x, threshold)
+    writer.elementwise("le", below, x, threshold)
     writer.elementwise("where", out, below, 0, costate)
-
-
-def _where(writer: Writer, out: Tensor, condition: Tensor, x: Number, y: Number) -> None:
-    writer.elementwise("where", out, condition, x, y)
 
 
 def _masked_fill(writer: Writer, out: Tensor, x: Tensor, mask: Tensor, value: Number) -> None:
@@ -205,7 +185,7 @@ def _truth_of(extreme: str) -> Callable[..., None]:
 
 def _mean(writer: Writer, out: Tensor, x: Tensor, dim: Any = None, keepdim: bool = False, dtype: Any = None) -> None:
     RULES["sum"](writer, out, x, dim, keepdim)
-    writer.elementwise("product", out, out, out.numel() / x.numel())
+    writer.elementwise("mul", out, out, out.numel() / x.numel())
 
 
 def _matrix_product(writer: Writer, out: Tensor, A: Tensor, B: Tensor, add: bool = False) -> None:
@@ -337,11 +317,9 @@ ARRANGED = {
     "repeat": torch.ops.aten.repeat.default, "tril": torch.ops.aten.tril.default, "triu": torch.ops.aten.triu.default,
 }  # fmt: skip
 
-RULES: dict[str, Callable[..., None]] = {
-    **{name: _unary(operation) for name, operation in UNARY.items()},
-    **{name: _binary(operation) for name, operation in BINARY.items()},
-    **{name: _swapped(operation) for name, operation in SWAPPED.items()},
+RULES = Rules("numbers", lambda row: None if row.instruction is None else _elementwise(row.name), {
     **{name: _arranged(target) for name, target in ARRANGED.items()},
+    **dict.fromkeys(("_to_copy", "clone", "contiguous", "lift_fresh_copy"), _same),
     "add": _add,
     "sub": _subtract,
     "rsub": _subtract_from,
@@ -351,22 +329,21 @@ RULES: dict[str, Callable[..., None]] = {
     "clamp_min": _clamp,
     "clamp_max": lambda writer, out, x, most: _clamp(writer, out, x, None, most),
     "threshold_backward": _threshold_backward,
-    "where": _where,
     "masked_fill": _masked_fill,
     "copy": _assign,
-    "bitwise_and": _logical("product"),
-    "bitwise_or": _logical("larger"),
-    "bitwise_xor": _logical("unequal"),
-    "bitwise_not": lambda writer, out, x: _logical("unequal")(writer, out, x, torch.ones_like(x)),
-    "logical_and": _logical("product"),
-    "logical_or": _logical("larger"),
-    "logical_xor": _logical("unequal"),
+    "bitwise_and": _logical("mul"),
+    "bitwise_or": _logical("maximum"),
+    "bitwise_xor": _logical("ne"),
+    "bitwise_not": lambda writer, out, x: _logical("ne")(writer, out, x, torch.ones_like(x)),
+    "logical_and": _logical("mul"),
+    "logical_or": _logical("maximum"),
+    "logical_xor": _logical("ne"),
     "fill": _fill,
     "sum": _reduction("reduce_sum", 0.0),
-    "amax": _reduction("reduce_larger", -torch.inf),
-    "amin": _reduction("reduce_smaller", torch.inf),
-    "max": _extreme("reduce_larger", -torch.inf, "index_of_largest"),
-    "min": _extreme("reduce_smaller", torch.inf, "index_of_least"),
+    "amax": _reduction("reduce_maximum", -torch.inf),
+    "amin": _reduction("reduce_minimum", torch.inf),
+    "max": _extreme("reduce_maximum", -torch.inf, "index_of_largest"),
+    "min": _extreme("reduce_minimum", torch.inf, "index_of_least"),
     "argmax": _index_of_extreme("index_of_largest"),
     "argmin": _index_of_extreme("index_of_least"),
     "gather": _gather,
@@ -389,4 +366,4 @@ RULES: dict[str, Callable[..., None]] = {
     "slice_scatter": _slice_scatter,
     "index_put": _index_put,
     "index_add": _index_add,
-}
+})  # fmt: skip

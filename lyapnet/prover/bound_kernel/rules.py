@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lyapnet.prover.bound_kernel.program import Entry, Forms, Program
+from lyapnet.prover.composed_rules import COMPOSED, in_programs
 from lyapnet.prover.rounding import ROUNDED
 from lyapnet.prover.taylor import TINY
 
@@ -86,11 +87,6 @@ def subtract(program: Program, x: Any, y: Any, alpha: float = 1) -> Forms:
     return add(program, x, y, -alpha)
 
 
-@rule(aten.rsub.Scalar, aten.rsub.Tensor)
-def _subtract_from(program: Program, x: Any, y: Any, alpha: float = 1) -> Forms:
-    return subtract(program, y, x, alpha)
-
-
 @rule(aten.mul.Tensor, aten.mul.Scalar)
 def multiply(program: Program, x: Any, y: Any) -> Forms:
     """x · y; a square where both are one value."""
@@ -117,21 +113,6 @@ def _divide(program: Program, x: Any, y: Any) -> Forms:
     return each(lambda a, factor: program.combine([(factor, a)], operations=2), x, 1 / tensor_of(y))
 
 
-@rule(aten.pow.Tensor_Scalar)
-def _power(program: Program, x: Forms, exponent: float) -> Any:
-    if exponent == 0:
-        return torch.ones(x.shape, dtype=torch.float64)
-    if exponent < 0:
-        return reciprocal(program, _power(program, x, -exponent))
-    if exponent == 0.5:
-        return function_of("sqrt")(program, x)
-    if exponent == 1:
-        return x
-    half = _power(program, x, exponent // 2)
-    even = square(program, half)
-    return even if exponent % 2 == 0 else multiply(program, even, x)
-
-
 @rule(aten.mm.default, aten.bmm.default)
 def _matrix_product(program: Program, x: Any, y: Any) -> Forms:
     if not isinstance(x, Forms):
@@ -147,17 +128,6 @@ def _matrix_product(program: Program, x: Any, y: Any) -> Forms:
 def _matrix_vector_product(program: Program, x: Any, y: Any) -> Forms:
     column = Forms(y.entries.unsqueeze(-1)) if isinstance(y, Forms) else y.unsqueeze(-1)
     return Forms(_matrix_product(program, x, column).entries.squeeze(-1))
-
-
-@rule(aten.dot.default)
-def _dot(program: Program, x: Any, y: Any) -> Forms:
-    return total(program, multiply(program, x, y))
-
-
-@rule(aten.addmm.default)
-def _add_matrix_product(program: Program, offset: Any, x: Any, y: Any, beta: float = 1, alpha: float = 1) -> Forms:
-    product = _matrix_product(program, x, y)
-    return add(program, product if alpha == 1 else multiply(program, product, alpha), offset, beta)
 
 
 @rule(aten.neg.default)
@@ -177,14 +147,6 @@ def total(
     sums = [program.combine([(1, Entry(a)) for a in group], operations=max(1, len(group) - 1)) for group in groups]
     shape = [1 if axis in gone else x.shape[axis] for axis in range(rank) if keepdim or axis in kept]
     return Forms(torch.tensor(sums, dtype=torch.int64).reshape(shape))
-
-
-@rule(aten.mean.default, aten.mean.dim)
-def _mean(
-    program: Program, x: Forms, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None
-) -> Forms:
-    y = total(program, x, dim, keepdim)
-    return multiply(program, y, y.shape.numel() / x.shape.numel())
 
 
 @rule(aten._to_copy.default)
@@ -212,11 +174,6 @@ for _name in ("exp", "log", "log1p", "sqrt", "sin", "cos", "tan"):
     rule(getattr(aten, _name).default)(function_of(_name))
 
 
-@rule(aten.rsqrt.default)
-def _rsqrt(program: Program, x: Forms) -> Forms:
-    return reciprocal(program, function_of("sqrt")(program, x))
-
-
 @rule(aten.tanh.default)
 def _tanh(program: Program, x: Forms) -> Forms:
     double = each(lambda a: program.combine([(2, a)], operations=0), x)
@@ -241,28 +198,6 @@ def _softplus_backward(program: Program, gradient: Any, x: Forms, beta: float, t
     return multiply(program, gradient, function_of("sigmoid", *_threshold(threshold))(program, y))
 
 
-@rule(aten.silu.default)
-def _silu(program: Program, x: Forms) -> Forms:
-    return multiply(program, x, sigmoid(program, x))
-
-
-@rule(aten.silu_backward.default)
-def _silu_backward(program: Program, gradient: Any, x: Forms) -> Forms:
-    s = sigmoid(program, x)
-    inner = add(program, multiply(program, x, subtract(program, 1.0, s)), 1.0)
-    return multiply(program, gradient, multiply(program, s, inner))
-
-
-@rule(aten.sigmoid_backward.default)
-def _sigmoid_backward(program: Program, gradient: Any, s: Forms) -> Forms:
-    return multiply(program, gradient, subtract(program, s, square(program, s)))
-
-
-@rule(aten.tanh_backward.default)
-def _tanh_backward(program: Program, gradient: Any, y: Forms) -> Forms:
-    return multiply(program, gradient, subtract(program, 1.0, square(program, y)))
-
-
 # Entries that are added to
 
 
@@ -283,3 +218,6 @@ def _added(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor]
     if bool((put(nothing, torch.ones_like(source.entries)) > 1).any()):
         raise NotImplementedError("several numbers are added to one")
     return add(program, x, Forms(put(nothing, source.entries)))
+
+
+RULES.update({operation: in_programs(composed, RULES) for operation, composed in COMPOSED.items()})

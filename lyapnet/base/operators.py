@@ -1,4 +1,4 @@
-"""Functions of tensors that can stay one operator in a trace, for a reader that has an instruction for them."""
+"""Functions of tensors that may be a single operator in a trace, for backends with an instruction for them."""
 
 import functools
 import inspect
@@ -12,12 +12,12 @@ from torch import Tensor
 from torch.library import custom_op
 
 _AS_OPERATORS = ContextVar("functions are traced as operators", default=False)
-OPERATORS = set[Any]()  # as they stand in a trace
+OPERATORS = set[Any]()  # all of them, as they appear in a trace
 
 
 @contextmanager
 def as_operators() -> Iterator[None]:
-    """Within it, functions under `operator` are one operator each; elsewhere they are what they are written as."""
+    """A context in which functions decorated by `operator` are traced as single operators."""
     token = _AS_OPERATORS.set(True)
     try:
         yield
@@ -26,20 +26,20 @@ def as_operators() -> Iterator[None]:
 
 
 def are_operators() -> bool:
-    """Whether functions under `operator` are one operator each."""
+    """Whether functions decorated by `operator` are traced as single operators."""
     return _AS_OPERATORS.get()
 
 
 def is_transformed(x: Tensor) -> bool:
-    """Whether a tensor is one of torch.func's, under vmap or grad."""
+    """Whether a tensor is a wrapper of torch.func, under vmap or grad."""
     return torch._C._functorch.is_functorch_wrapped_tensor(x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Make a function torch's operator lyapnet::NAME too, which it is `as_operators`.
+    """A decorator that registers a function as the torch operator lyapnet::NAME, used inside `as_operators`.
 
-    Its arguments are tensors, its result has the shape and the type of the first one, and no gradient runs through it.
-    Under torch.func.vmap and the like it is what it is written as.
+    Its arguments are tensors; its result has the shape and dtype of the first one, and no gradient. Under torch.func
+    transforms the Python function is used.
     """
     named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
     whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")

@@ -1,1 +1,1 @@
-"""What everything else rests on: errors, files, shapes, small matrices, tables; knows no control."""
+"""General tools without control theory: errors, files, shapes, small matrices, tables."""

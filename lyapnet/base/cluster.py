@@ -1,4 +1,4 @@
-"""A Ray cluster, connected to for as long as it is needed."""
+"""Connection to a Ray cluster."""
 
 import logging
 import signal
@@ -27,14 +27,14 @@ def connected(address: str) -> Iterator[Any]:
     except ImportError as error:
         raise UsageError("Expected Ray for --ray, got none; pip install 'lyapnet[ray]'.") from error
     _require_listening(address)
-    asked = signal.getsignal(signal.SIGTERM)  # which ray.init makes its own
+    handler = signal.getsignal(signal.SIGTERM)  # ray.init replaces it
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
-    except Exception as error:  # ConnectionError, or one of its many own
+    except Exception as error:  # ConnectionError, or one of Ray's own errors
         line = one_line(error)
         raise UsageError(f"Expected a Ray cluster at {address!r}, got {type(error).__name__}: {line}") from error
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, asked)
+        signal.signal(signal.SIGTERM, handler)
     try:
         yield ray
     finally:
@@ -42,7 +42,7 @@ def connected(address: str) -> Iterator[Any]:
 
 
 def _require_listening(address: str) -> None:
-    """Refuse host:port where nothing listens: ray.init tries for minutes."""
+    """Raise UsageError if nothing listens at host:port; ray.init would try for minutes."""
     place = urlsplit(address if "://" in address else f"//{address}")
     try:
         host, port = place.hostname, place.port

@@ -1,4 +1,4 @@
-"""The one gate for devices: what does not compute here is refused by its name."""
+"""The check of torch devices."""
 
 import torch
 
@@ -6,16 +6,16 @@ from lyapnet.base.errors import UsageError, one_line
 
 
 def require_device(device: str | torch.device, dtype: torch.dtype) -> None:
-    """Refuse a device on which no sum of numbers is computed, and a CPU with a number: torch takes cpu:7 for cpu.
+    """Check that a device can compute, and that a CPU has no index, because torch reads cpu:7 as cpu.
 
     Raises:
-        UsageError: naming it.
+        UsageError: the device is not usable.
     """
     try:
         named = torch.device(device)
         if named.type == "cpu" and named.index is not None:
             raise RuntimeError("the CPU has no number")
-        torch.ones(1, dtype=dtype, device=named).sum().item()  # the device meta has tensors without numbers in them
+        torch.ones(1, dtype=dtype, device=named).sum().item()  # fails on the device meta, whose tensors have no values
     except (RuntimeError, AssertionError, TypeError) as error:
         raise UsageError(
             f"Expected a device that computes here, cpu or cuda, got {str(device)!r} ({one_line(error)}); choose one."

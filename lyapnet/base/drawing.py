@@ -1,4 +1,4 @@
-"""What all figures share: colours, arrays, legends, pixels."""
+"""Common parts of all figures: colours, arrays, legends, pixels."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
-# Okabe and Ito's colours, which colour-blind readers can tell apart.
+# Okabe and Ito's colours, which colour-blind readers can distinguish.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#777777"
 SKY, PURPLE = "#56B4E9", "#CC79A7"
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY, GREY)
 
 
 def legend_below(figure: Figure, shown: Axes | Sequence[Artist], columns: int = 4) -> None:
-    """One legend for a figure, under its panels: the labelled artists of one panel, or those that are given."""
+    """Add one legend below the panels of a figure, for the labelled artists of a panel or for given artists."""
     handles = shown.get_legend_handles_labels()[0] if isinstance(shown, Axes) else list(shown)
     figure.legend(
         handles=handles, loc="outside lower center", ncols=columns, fontsize=7, frameon=False, columnspacing=1
@@ -24,7 +24,7 @@ def legend_below(figure: Figure, shown: Axes | Sequence[Artist], columns: int = 
 
 
 def pixels(figure: Figure) -> np.ndarray:
-    """The figure as (height, width, 4) bytes, as TensorBoard takes it."""
+    """The figure as (height, width, 4) bytes, for TensorBoard."""
     canvas = FigureCanvasAgg(figure)
     figure.set_dpi(110)
     canvas.draw()
@@ -32,5 +32,5 @@ def pixels(figure: Figure) -> np.ndarray:
 
 
 def numpy_of(tensor: Tensor) -> np.ndarray:
-    """A tensor for matplotlib."""
+    """A tensor as an array, for matplotlib."""
     return tensor.detach().cpu().numpy()

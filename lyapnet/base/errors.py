@@ -1,4 +1,4 @@
-"""What lyapnet raises for its users: one line that says what was expected, what came, what to do."""
+"""Errors for users: one line that says what was expected, what was got, and what to do."""
 
 import difflib
 import re
@@ -15,23 +15,23 @@ _INSTALLED = (str(Path(__file__).parents[1]), "site-packages", "/lib/python")
 _REQUEST = re.compile(
     r"[^.;:]*(please|feel free to)[^.;]*(file|open|report|submit)[^.;]*(issue|bug|ticket).*", re.I | re.S
 )
-LONGEST = 400  # characters of a foreign message that a line repeats
+LONGEST = 400  # largest number of characters of another library's message that is quoted
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
-    """How a message about an unknown name ends: with the nearest known one after its prefix, or with another advice."""
+    """The end of a message about an unknown name: the nearest known name with a prefix, or else another advice."""
     near = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {prefix}{near[0]}?" if near else otherwise
 
 
 def one_line(error: BaseException | str) -> str:
-    """The message of an error that another library raised: its words alone, and not its requests to report it."""
+    """The message of another library's error on one line, without its requests to report an issue."""
     text = " ".join(_REQUEST.sub("", str(error)).split())
     return text if len(text) <= LONGEST else f"{text[:LONGEST]} …"
 
 
 def raised(error: BaseException) -> str:
-    """What code of the user's own raised, and in which line of it: "ValueError: no such mass (drone.py:12)"."""
+    """Describe an error of a user's code with its line: "ValueError: no such mass (drone.py:12)"."""
     line = own_line(error)
     place = None if line is None else (line.filename, line.lineno)
     if isinstance(error, SyntaxError) and error.filename:
@@ -41,13 +41,13 @@ def raised(error: BaseException) -> str:
 
 
 def own_line(error: BaseException) -> traceback.FrameSummary | None:
-    """The innermost line of the user's own code that an error came through; None if it came through none."""
+    """The innermost line of the user's code in an error's traceback; None if there is none."""
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if is_own_file(frame.filename)]
     return own[-1] if own else None
 
 
 def running_line(frame: FrameType | None = None) -> traceback.FrameSummary | None:
-    """The innermost line of the user's own code that runs now, or ran in a frame; None where there is none."""
+    """The innermost line of the user's code that is running now, or in a frame; None if there is none."""
     frame = sys._getframe(1) if frame is None else frame
     while frame is not None and not is_own_file(frame.f_code.co_filename):
         frame = frame.f_back
@@ -57,13 +57,13 @@ def running_line(frame: FrameType | None = None) -> traceback.FrameSummary | Non
 
 
 def place_of(line: traceback.FrameSummary | None) -> str:
-    """ " at file:line (its text)"; nothing where there is no line."""
+    """Format a line as " at file:line (its text)"; empty if there is none."""
     return "" if line is None else f" at {Path(line.filename).name}:{line.lineno} ({line.line})"
 
 
 def is_own_file(name: str) -> bool:
-    """Whether code of this file is the user's own: neither lyapnet's, nor of an installed library, nor Python's."""
-    written = not name.startswith("<") or name.startswith(("<stdin>", "<ipython"))  # and not made by a program
+    """Whether a file is the user's own, and not part of lyapnet, of an installed library, or of Python."""
+    written = not name.startswith("<") or name.startswith(("<stdin>", "<ipython"))  # not generated code
     return written and not any(part in name for part in _INSTALLED)
 
 
@@ -74,39 +74,39 @@ class LyapnetError(Exception):
 
 
 class UsageError(LyapnetError, ValueError):
-    """The request itself cannot be met: a misspelt key, a missing file, an impossible combination."""
+    """An invalid request: a misspelt key, a missing file, an impossible combination."""
 
     exit_status = 2
 
 
 class CheckpointError(LyapnetError):
-    """A checkpoint cannot be read, written, or used for what was asked."""
+    """A checkpoint cannot be read, written, or used for the request."""
 
 
 class DivergenceError(LyapnetError):
-    """A rollout, a loss term or a gradient left the finite numbers."""
+    """A rollout, a loss term or a gradient is not finite."""
 
 
 class CompilationError(LyapnetError):
-    """A closed loop cannot be compiled; it runs without."""
+    """A closed loop cannot be compiled; it runs uncompiled."""
 
 
 class UntraceableError(CompilationError):
-    """A function reads the values of tensors, for its control flow say; a closed loop then runs eagerly."""
+    """A function depends on the values of tensors, for example in its control flow; a closed loop then runs eagerly."""
 
 
 class ExportError(LyapnetError):
-    """A control law cannot be written in another language, or what was written is not that law."""
+    """A control law cannot be exported, or the exported law differs from it."""
 
 
 class OracleError(LyapnetError):
-    """There is no ground truth for a task; what is measured without it can still be reported."""
+    """There is no optimum for a task; measures without the optimum can still be reported."""
 
 
 class Interrupted(BaseException):
-    """Ctrl-C or SIGTERM: status 0 where the run was saved, 130 where it was stopped at once.
+    """Ctrl-C or SIGTERM: status 0 if the run was saved, 130 if it was stopped at once.
 
-    No Exception, as KeyboardInterrupt is none: what stops in the midst of a compiler or a user's function gets through.
+    Like KeyboardInterrupt it is no Exception, so that handlers in a compiler or a user's function do not catch it.
     """
 
     def __init__(self, message: str, exit_status: int = 0):
@@ -116,7 +116,7 @@ class Interrupted(BaseException):
 
 @contextmanager
 def signals_taken(handler: Callable[..., None]) -> Iterator[None]:
-    """Have a handler take Ctrl-C and SIGTERM, where this is the main thread; who took them before does afterwards."""
+    """Install a handler for Ctrl-C and SIGTERM in the main thread, and restore the previous ones afterwards."""
     main = threading.current_thread() is threading.main_thread()
     previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM) if main}
     try:

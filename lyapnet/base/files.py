@@ -1,7 +1,7 @@
-"""Files: read only where they are files, written whole or not at all; digests, and numbers as JSON has them.
+"""Safe reading and atomic writing of files, digests, and JSON.
 
-All that others may have written is read by way of `read_file`: what is no file with an end (a folder, a fifo, a socket,
-a device) would be waited for without one, and what is larger than the memory would take all of it.
+All files from outside are read by `read_file`. It refuses fifos, sockets and devices, on which reading could wait for
+ever, and files that are larger than the memory.
 """
 
 import contextlib
@@ -23,20 +23,20 @@ import psutil
 from lyapnet.base import sizes
 from lyapnet.base.errors import LyapnetError
 
-LARGEST_TEXT = 2**24  # bytes of a config or record that a person or lyapnet wrote: 16 MiB, read in seconds
+LARGEST_TEXT = 2**24  # largest config or record in bytes: 16 MiB, which are read in seconds
 NO_FILES = {
     stat.S_IFIFO: "a fifo", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
 }  # fmt: skip
 
 
 def require_file(path: Path, most: int | None = None) -> None:
-    """Refuse what cannot be read to its end; nothing is opened.
+    """Check that a path is a regular file of limited size, without opening it.
 
     Args:
-        most: bytes that it may have; half of the free memory if None.
+        most: largest size in bytes; None: half of the free memory.
 
     Raises:
-        OSError: it is not there, no regular file, or larger; strerror says which.
+        OSError: it does not exist, is no regular file, or is too large; strerror says which.
     """
     status = path.stat()
     kind, most = stat.S_IFMT(status.st_mode), sizes.free_memory() // 2 if most is None else most
@@ -60,12 +60,12 @@ def read_file(path: Path, most: int | None = None) -> bytes:
 
 @contextlib.contextmanager
 def appending(path: Path) -> Iterator[io.TextIOWrapper]:
-    """A text file to append to, made where there is none: this one, and no other that a link in its place names.
+    """Open a text file for appending, creating it if necessary; links are not followed.
 
     Raises:
         OSError: it is a link, no regular file, or cannot be written.
     """
-    # a fifo would be waited for without O_NONBLOCK, which regular files ignore
+    # without O_NONBLOCK, which regular files ignore, opening a fifo would wait
     flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     with os.fdopen(os.open(path, flags, 0o644), "a", newline="", encoding="utf-8") as file:
         require_file(path)
@@ -75,11 +75,11 @@ def appending(path: Path) -> Iterator[io.TextIOWrapper]:
 def write_atomically(path: Path, content: bytes | memoryview) -> None:
     """Write to a temporary file beside the target, synchronise, then rename it over the target.
 
-    Whatever stops this, a full disk or a lost process, the target holds its old content or the new one. The temporary
-    name is this call's own and names the process: what a killed one left behind, the next write replaces.
+    If this is interrupted, the target has either its old or its new content. The temporary name contains the process
+    id, so that the next write removes files that killed processes left behind.
 
     Raises:
-        OSError: the disk is full, the folder cannot be written; the temporary file is gone.
+        OSError: the file cannot be written; the temporary file is removed.
     """
     prefix = f".{path.name[:60]}.{socket.gethostname()[:60]}."
     temporary = path.with_name(f"{prefix}{os.getpid()}.{secrets.token_hex(4)}.tmp")
@@ -97,7 +97,7 @@ def write_atomically(path: Path, content: bytes | memoryview) -> None:
     for other in [other for other in path.parent.iterdir() if other.name.startswith(prefix)]:
         try:
             alive = psutil.pid_exists(int(other.name.split(".")[-3]))
-        except (IndexError, ValueError, OverflowError):  # no name of ours
+        except (IndexError, ValueError, OverflowError):  # another file
             continue
         if not alive:
             other.unlink(missing_ok=True)
@@ -118,7 +118,7 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
-        LyapnetError: it cannot be read, or holds something else; ends with the remedy.
+        LyapnetError: it cannot be read, or is no object; the message ends with the remedy.
     """
     try:
         content = json.loads(read_file(path))
@@ -133,12 +133,12 @@ def read_json(path: Path, remedy: str) -> dict[str, Any]:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write an object as JSON, all or nothing."""
+    """Write an object as JSON, atomically."""
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def plain(value: Any) -> Any:
-    """The value with None for every number that JSON does not have: NaN and the infinities."""
+    """Replace every number that JSON lacks, NaN and the infinities, by None."""
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):

@@ -1,10 +1,10 @@
-"""What is found out about a problem once, for it and all its copies."""
+"""Cached facts about a problem, shared by all its copies."""
 
 from typing import Any
 
 
 class Findings(dict[str, Any]):
-    """Facts about the functions of a problem, by name, and programs that were written of them in this process."""
+    """Facts about the functions of a problem by name, and the compiled programs of these functions."""
 
     programs: dict[Any, Any]
 

@@ -1,4 +1,4 @@
-"""Interpolation in torch, with a derivative, bounds and a translation: tables of measurements, and curves in time."""
+"""Interpolation in torch, differentiable, boundable and exportable: measured tables, and curves in time."""
 
 import math
 from collections.abc import Sequence
@@ -14,21 +14,21 @@ DEGREES = {"linear": 1, "cubic": 3}
 class Table(nn.Module):
     """y(x₁, …, x_d) through measured values on a grid: piecewise linear, or a natural cubic spline along each axis.
 
-    On interval i of an axis, the share s_i = min(max((x − x_i)/(x_{i+1} − x_i), 0), 1) of it lies behind x. Every
-    interpolation of this kind is a linear map of 1, s_i (and s_i², s_i³ for cubic): y is a product of these maps, made
-    of operators that autograd, bounds and CasADi know. Beyond its ends a table keeps the value at the end. At a kink,
-    where a linear one has its nodes, its derivative is that from the left; certificates cover both sides.
+    Let s_i = min(max((x − x_i)/(x_{i+1} − x_i), 0), 1), the share of interval i of an axis below x. The interpolation
+    along an axis is a linear map of 1 and s_i (and s_i², s_i³ for cubic), and y is the product of these maps. It uses
+    only operators that autograd, interval bounds and CasADi support. Beyond its ends a table is constant. At the kinks
+    of a linear table, its nodes, the derivative is that from the left; certificates cover both sides.
 
     friction = Table([[-2.0, 0.0, 1.0, 2.0]], [-0.4, 0.0, 0.3, 0.35])  # in __init__; one grid for each axis
     f = friction(x[..., 1:2])  # the coordinates along the last axis: (*batch, d) ↦ (*batch,)
 
     Args:
-        grid: for each of d axes its nodes, rising.
+        grid: the increasing nodes of each of the d axes.
         values: (K₁, …, K_d), one at each node.
         method: linear, or cubic (d²y/dx² continuous, 0 at the ends).
 
     Raises:
-        ValueError: nodes do not rise, numbers are not finite, or the values do not fit the grid.
+        ValueError: nodes are not increasing, numbers are not finite, or the values do not fit the grid.
     """
 
     values: Float[Tensor, "*nodes"]
@@ -67,18 +67,18 @@ class Table(nn.Module):
     def _at(self, axis: int, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch K"]:
         """The weight of each node along an axis."""
         nodes, weights = getattr(self, f"nodes_{axis}"), getattr(self, f"weights_{axis}")
-        s = _share_behind(x, nodes)
+        s = _share_below(x, nodes)
         basis = torch.cat([torch.ones_like(s[..., :1]), *(s**k for k in range(1, self.degree + 1))], -1)
         return (weights * basis[..., None, :]).sum(-1)
 
 
 class Curve(nn.Module):
-    """t (*batch) ↦ (*batch, *shape): piecewise linear between nodes, and constant beyond them.
+    """t (*batch) ↦ (*batch, *shape), piecewise linear between nodes and constant beyond them.
 
-    Its nodes and values are part of a checkpoint, unlike a Table's, which belong to a system.
+    Its nodes and values are stored in checkpoints, unlike those of a Table, which belongs to a system.
 
     Args:
-        nodes: (K,), rising.
+        nodes: (K,), increasing.
         values: (K, *shape).
     """
 
@@ -92,13 +92,13 @@ class Curve(nn.Module):
 
     def forward(self, t: Float[Tensor, "*batch"]) -> Tensor:
         y = self.values.flatten(1)
-        return (y[0] + _share_behind(t, self.nodes) @ y.diff(dim=0)).unflatten(-1, self.values.shape[1:])
+        return (y[0] + _share_below(t, self.nodes) @ y.diff(dim=0)).unflatten(-1, self.values.shape[1:])
 
     @torch.no_grad()
     def fit(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
-        """Become the curve through as many of these points as there are nodes, those that leave the least error.
+        """Interpolate a greedy selection of the given points, as many as the curve has nodes, with small error.
 
-        With fewer points than nodes, further ones are put between them.
+        If there are fewer points than nodes, midpoints are inserted.
         """
         kept = [0, len(nodes) - 1]
         unit = values.flatten(1) / values.flatten(1).abs().amax(0).clamp_min(torch.finfo(values.dtype).tiny)
@@ -119,13 +119,13 @@ class SmoothCurve(nn.Module):
 
         τ = log(1 + (T − t)/s) / log(1 + T/s)
 
-    the time that is left, drawn out where it is short of s. Unlike a Curve it has no kinks, at which V_t would jump and
-    bounds of V̇ would hold both slopes possible, and follows a solution of Riccati's equation to five digits or six. Its
-    numbers are part of a checkpoint.
+    the remaining time on a logarithmic scale, stretched where it is below s. Unlike a Curve it has no kinks, at which
+    V_t would jump and bounds of V̇ would have to include both slopes. It approximates a solution of the Riccati equation
+    to five or six digits. Its coefficients are stored in checkpoints.
 
     Args:
         duration: T.
-        shape: of y.
+        shape: shape of y.
     """
 
     scale: Float[Tensor, ""]  # s
@@ -134,9 +134,9 @@ class SmoothCurve(nn.Module):
 
     STEPS = torch.arange(-2, 27, dtype=torch.float64) / 24  # τ_k
     WIDTH = 1.5 / 24  # w
-    SCALES = (0.025, 0.05, 0.1, 0.2, 0.4)  # of T, that are tried for s
-    RIDGE = 1e-9  # of Σ a² beside Σ error², in units of y
-    BETWEEN = 8  # points for each interval of the nodes, on a cubic spline: no step is finer than what it is fitted to
+    SCALES = (0.025, 0.05, 0.1, 0.2, 0.4)  # candidates for s, relative to T
+    RIDGE = 1e-9  # weight of the regularisation Σ a² relative to Σ error², in units of y
+    BETWEEN = 8  # points of the fit in each interval between nodes
 
     def __init__(self, duration: float, shape: Sequence[int]):
         super().__init__()
@@ -146,40 +146,40 @@ class SmoothCurve(nn.Module):
         self.register_buffer("weights", torch.zeros(len(self.STEPS), *shape))
 
     def forward(self, t: Float[Tensor, "*batch"]) -> Tensor:
-        y = self.end.flatten() + self._rises(t, self.scale) @ self.weights.flatten(1)
+        y = self.end.flatten() + self._basis(t, self.scale) @ self.weights.flatten(1)
         return y.unflatten(-1, self.end.shape)
 
-    def _rises(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
-        """What each a_k is multiplied with."""
-        return self._risen(t, scale) - torch.sigmoid(-self.STEPS.to(t) / self.WIDTH)
+    def _basis(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
+        """The basis functions: the factor of each a_k."""
+        return self._sigmoids(t, scale) - torch.sigmoid(-self.STEPS.to(t) / self.WIDTH)
 
-    def _risen(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
+    def _sigmoids(self, t: Float[Tensor, "*batch"], scale: Tensor) -> Float[Tensor, "*batch K"]:
         """σ((τ − τ_k)/w)."""
         left = torch.log(1 + (self.duration - t) / scale) / torch.log(1 + self.duration / scale)
         return torch.sigmoid((left[..., None] - self.STEPS.to(left)) / self.WIDTH)
 
     @torch.no_grad()
     def fit(self, nodes: Float[Tensor, " N"], values: Float[Tensor, "N *shape"]) -> None:
-        """Become the curve closest by least squares, in y and dy/dτ, to a cubic spline through these points.
+        """Fit the curve by least squares, in y and dy/dτ, to a cubic spline through the given points.
 
-        It passes the last of them, at T. Of numbers that are none it is none.
+        It passes through the last point, at T. If a value is not finite, the curve is NaN.
         """
         if not values.isfinite().all():
             self.end.copy_(values[-1])
             self.weights.fill_(torch.nan)
             return
-        from scipy.interpolate import CubicSpline  # takes a third of a second: only where there is a spline
+        from scipy.interpolate import CubicSpline  # imported here because it takes 0.3 s
 
         spline = CubicSpline(nodes.double().cpu(), values.double().cpu().flatten(1))
-        t = _refined(nodes.double().cpu(), self.BETWEEN)
+        t = _subdivide(nodes.double().cpu(), self.BETWEEN)
         y, y_t = (torch.from_numpy(spline(t, order)) for order in (0, 1))
         end, unit = y[-1], y.abs().amax(0).clamp_min(torch.finfo(y.dtype).tiny)
         best = math.inf
         for share in self.SCALES:
             scale = torch.tensor(share * self.duration, dtype=torch.float64)
             t_tau = -(self.duration - t + scale) * torch.log(1 + self.duration / scale)
-            risen = self._risen(t, scale)
-            rows = torch.cat([self._rises(t, scale), risen * (1 - risen) / self.WIDTH])
+            risen = self._sigmoids(t, scale)
+            rows = torch.cat([self._basis(t, scale), risen * (1 - risen) / self.WIDTH])
             wanted = torch.cat([y - end, t_tau[:, None] * y_t]) / unit
             gram = rows.mT @ rows + self.RIDGE * torch.eye(rows.shape[-1]).to(rows)
             weights = torch.linalg.solve(gram, rows.mT @ wanted)
@@ -191,27 +191,27 @@ class SmoothCurve(nn.Module):
         self.end.copy_(values[-1])
 
 
-def _refined(nodes: Tensor, parts: int) -> Tensor:
-    """The nodes with each interval in so many parts."""
+def _subdivide(nodes: Tensor, parts: int) -> Tensor:
+    """The nodes with each interval divided into `parts` equal parts."""
     shares = torch.arange(parts) / parts
     return torch.cat([(nodes[:-1, None] + shares * nodes.diff()[:, None]).flatten(), nodes[-1:]])
 
 
 def _furthest_from(nodes: Tensor, values: Tensor, kept: list[int]) -> int:
-    """The index of the other point furthest from the curve through some, relative to what values are around it."""
-    share = _share_behind(nodes, nodes[kept])
+    """The index of the point with the largest relative distance from the piecewise linear curve through some points."""
+    share = _share_below(nodes, nodes[kept])
     error = (values - values[kept][0] - share @ values[kept].diff(dim=0)).abs() / (values.abs() + 1e-3)
     return int(error.amax(1).index_fill(0, torch.tensor(kept, device=error.device), -1).argmax())
 
 
-def _share_behind(x: Tensor, nodes: Tensor) -> Tensor:
-    """The share of each interval between nodes that lies behind x, (*batch, K − 1)."""
+def _share_below(x: Tensor, nodes: Tensor) -> Tensor:
+    """The share of each interval between nodes that lies below x, (*batch, K − 1)."""
     r = (x[..., None] - nodes[:-1]) / nodes.diff()
-    return torch.relu(r) - torch.relu(r - 1)  # at a node one interval alone has a slope; with clamp two would
+    return torch.relu(r) - torch.relu(r - 1)  # at a node only one interval has a nonzero slope; with clamp two would
 
 
 def _cardinal(nodes: Tensor, degree: int) -> Tensor:
-    """(K, 1 + (K − 1)·degree): the interpolations of the K unit vectors, as maps of 1 and the powers of each s_i."""
+    """(K, 1 + (K − 1)·degree): the cardinal functions of the K nodes, as coefficients of 1 and the powers of s_i."""
     unit, h = torch.eye(len(nodes), dtype=torch.float64), nodes.diff()
     if degree == 1:
         powers = [unit[:, 1:] - unit[:, :-1]]

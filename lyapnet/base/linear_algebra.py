@@ -1,7 +1,7 @@
-"""Linear algebra in the sizes that mechanics asks for: small matrices, one for each state of a batch.
+"""Linear algebra for batches of small matrices, one for each state, as in mechanics.
 
-A library takes such matrices one after the other. Written as multiplications of whole batches, the same work is
-faster, and a compiler joins it with its neighbours. Large matrices go to torch.
+Libraries process such matrices one by one. Elementwise operations on whole batches are faster, and a compiler can fuse
+them with neighbouring operations. Large matrices use torch.
 """
 
 from typing import Any
@@ -12,26 +12,26 @@ from torch.overrides import handle_torch_function, has_torch_function_unary
 
 from lyapnet.base.operators import are_operators, is_transformed, operator
 
-SMALL = 16  # products of entries that are cheaper without the library
-CONVEX = 0.1  # share of what u costs by which a curvature in u has to exceed zero
-UNROLLED = 6  # unknowns of a linear system, up to which it is solved in whole batches
+SMALL = 16  # largest number of scalar products for which elementwise operations are faster
+CONVEX = 0.1  # smallest curvature in u relative to that of the control cost
+UNROLLED = 6  # largest number of unknowns of linear systems that are solved by elementwise operations
 
 
 def norm(v: Tensor, dim: int = -1) -> Tensor:
-    """‖v‖ = √(Σ v²) along an axis, exactly, with slope 0 at v = 0 and all further derivatives finite there.
+    """‖v‖ = √(Σ v²) along an axis, with slope 0 at v = 0 and finite higher derivatives there.
 
-    The root's own slope is infinite at 0, and autograd makes not a number of it: at rest, v‖v‖ has no derivative with
-    torch.sqrt, and no second one with torch.linalg.vector_norm.
+    The slope of the root is infinite at 0, and autograd then gives NaN: at rest, v‖v‖ has no derivative with
+    torch.sqrt, and no second derivative with torch.linalg.vector_norm.
 
     Args:
         v: (…, k, …), in any unit.
-        dim: the axis that is summed over, the last one unless said otherwise.
+        dim: the axis of the sum.
     """
-    if has_torch_function_unary(v):  # a cost that is rounded, say, wants a norm and not what it is computed by
+    if has_torch_function_unary(v):  # a TorchFunctionMode, as for smoothed costs, sees the norm as one function
         return handle_torch_function(norm, (v,), v, dim=dim)
     squared = (v * v).sum(dim)
     away = squared > 0
-    # the root of 1 in the place of that of 0, so that its infinite slope is not even computed
+    # the root of 1 replaces the root of 0, so that no infinite slope is computed
     return torch.where(away, torch.sqrt(torch.where(away, squared, 1.0)), 0.0)
 
 
@@ -50,7 +50,7 @@ def apply(A: Tensor, v: Tensor) -> Tensor:
 
 
 def solve(A: Tensor, B: Tensor) -> Tensor:
-    """A⁻¹B for A of shape (*batch, d, d) and B of shape (*batch, d, k); symmetric positive definite A for d > 2."""
+    """A⁻¹B for A (*batch, d, d) and B (*batch, d, k); A has to be symmetric positive definite for d > 2."""
     d = A.shape[-1]
     if d == 1:
         return B / A
@@ -76,16 +76,17 @@ def is_positive_definite(A: Tensor) -> Tensor:
 
 
 def convex_or(A: Tensor, floor: Tensor, otherwise: Tensor) -> Tensor:
-    """Each symmetric A (*batch, d, d) that exceeds CONVEX times a positive definite floor, else another matrix."""
+    """A where the symmetric A (*batch, d, d) exceeds CONVEX times a positive definite floor, else another matrix."""
     return torch.where(is_positive_definite(A - CONVEX * floor)[..., None, None], A, otherwise)
 
 
 @operator
 def symmetric_inverse(A: Tensor) -> Tensor:
-    """A⁻¹ of symmetric positive definite A (*batch, d, d), from its lower triangle, entry by entry over the batch.
+    """A⁻¹ of symmetric positive definite A (*batch, d, d) from its lower triangle, by the sweep operator.
 
-    Each pivot p in turn takes a_pp to −1/a_pp, a_ip to a_ip/a_pp and a_ij to a_ij − a_ip a_jp/a_pp: after the last one
-    the matrix is −A⁻¹. No rows are exchanged, which such matrices do not need.
+    For each pivot p: a_pp becomes −1/a_pp, a_ip becomes a_ip/a_pp, and a_ij becomes a_ij − a_ip a_jp/a_pp. After the
+    last pivot the matrix is −A⁻¹. Pivoting is not necessary for such matrices.
+
     Source: Goodnight, "A tutorial on the SWEEP operator", The American Statistician 1979.
     """
     d = A.shape[-1]
@@ -123,5 +124,5 @@ class _Inverse(torch.autograd.Function):
 
 
 def has_values(x: Tensor) -> bool:
-    """Whether a tensor has numbers that may be looked at, as none has in a trace or under vmap."""
+    """Whether a tensor has values that can be read; in a trace and under vmap it has none."""
     return type(x) is Tensor and not is_transformed(x)

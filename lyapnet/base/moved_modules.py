@@ -1,4 +1,4 @@
-"""Modules of lyapnet under the names that they had until 0.3: imports, configs and checkpoints that name them go on."""
+"""Aliases for the module names of version 0.3, so that old imports, configs and checkpoints still work."""
 
 import sys
 from importlib import import_module
@@ -7,7 +7,7 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-_FOLDERS = {  # of today ↦ what was beside them
+_FOLDERS = {  # current folder ↦ modules that were outside of it
     "base": "cluster contracts devices drawing errors files findings interpolation linear_algebra machine operators "
     "provenance random_streams shapes sizes tables types",
     "task": "constraints cost domain family horizon operating_points problem sets systems",
@@ -30,7 +30,7 @@ MOVED = {
     "comparison.tuning": "lab.tuning",
     "zoo.making": "lab.zoo_making",
 }
-"""A module of 0.3 ↦ that of today, both without "lyapnet."; modules within it move along."""
+"""Module name in 0.3 ↦ current name, both without "lyapnet."; submodules move along."""
 
 
 class MovedModules(MetaPathFinder):
@@ -49,11 +49,11 @@ class MovedModules(MetaPathFinder):
         for k in (2, 1):
             if (today := MOVED.get(".".join(parts[:k]))) is not None:
                 name = ".".join(["lyapnet", today, *parts[k:]])
-                return ModuleSpec(fullname, _ModuleOfToday(name), is_package=True)
+                return ModuleSpec(fullname, _CurrentModule(name), is_package=True)
         return None
 
 
-class _ModuleOfToday(Loader):
+class _CurrentModule(Loader):
     def __init__(self, name: str):
         self.name = name
 
@@ -63,10 +63,10 @@ class _ModuleOfToday(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        module.__spec__ = self.spec  # importlib has put the former name there
+        module.__spec__ = self.spec  # importlib has set the former name
 
 
 def find_moved_modules() -> None:
-    """Have Python look here first: a former name leads to a folder of today, in which it would load a copy."""
+    """Register the finder with precedence, because Python would load a second copy of a module by its former name."""
     if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
         sys.meta_path.insert(0, MovedModules())

@@ -1,4 +1,4 @@
-"""Files of torch that hold plain data only, read without executing anything in them."""
+"""Reading of torch files with plain data only, without executing code of the file."""
 
 import io
 import os
@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-# What torch.load raises on files that it cannot read, by their first bytes
+# errors of torch.load for unreadable files, depending on their first bytes
 UNREADABLE = (
     RuntimeError, EOFError, LookupError, ValueError, TypeError, AttributeError,
     pickle.UnpicklingError, zipfile.BadZipFile,
@@ -20,11 +20,11 @@ UNREADABLE = (
 
 
 def plain_data_of(file: io.BytesIO | io.BufferedReader, device: str | torch.device = "cpu") -> Any:
-    """What torch.save wrote, of tensors, numbers, strings, lists and dictionaries only; nothing in it is executed.
+    """Read a file of torch.save that contains only tensors, numbers, strings, lists and dictionaries.
 
     Raises:
-        One of UNREADABLE: it is another file; or it asks for far more memory than its own size, by compression, by
-            tensors that are larger than their storage, or by lists that name one another again and again.
+        One of UNREADABLE: it is another kind of file, or its content needs far more memory than the file has bytes, by
+            compression, by tensors larger than their storage, or by nested references to the same lists.
     """
     size = file.seek(0, os.SEEK_END)
     with zipfile.ZipFile(file) as archive:
@@ -34,22 +34,25 @@ def plain_data_of(file: io.BytesIO | io.BufferedReader, device: str | torch.devi
         if sum(entry.file_size for entry in entries) > size:
             raise zipfile.BadZipFile("its archive is larger than the file")
     file.seek(0)
-    with warnings.catch_warnings():  # about foreign pickles, which are refused
+    with warnings.catch_warnings():  # warnings about foreign pickles, which are refused
         warnings.simplefilter("ignore")
         content = torch.load(file, map_location=device, weights_only=True)
-    if (needed := _bytes_of(content, {})) > (most := SMALL + EXPANSION * size):
+    if (needed := _bytes_of(content, {})) > (most := ALLOWANCE + EXPANSION * size):
         raise ValueError(f"it holds {needed:.3g} bytes, more than {most:.3g}")
     return content
 
 
-SMALL, EXPANSION = 10**6, 100  # bytes, and times the bytes of its file: more than numbers and texts of a file take
+ALLOWANCE, EXPANSION = 10**6, 100  # largest memory of a content: bytes, plus a multiple of the file's bytes
 
 
 def _bytes_of(value: Any, counted: dict[int, int | None]) -> int:
-    """The bytes of nested data in which what is named several times counts as often; `counted` has those of its parts.
+    """The bytes of nested data, where an object counts once for each reference.
+
+    Args:
+        counted: id ↦ bytes of containers that were counted already; None while one is being counted.
 
     Raises:
-        ValueError: something contains itself.
+        ValueError: a container contains itself.
     """
     if isinstance(value, Tensor):
         return value.nbytes

@@ -1,4 +1,4 @@
-"""With what a result was made: versions, platform, and the commit of lyapnet's own source tree."""
+"""The provenance of results: versions, platform, and the commit of lyapnet's source tree."""
 
 import platform
 import subprocess
@@ -7,17 +7,17 @@ from pathlib import Path
 
 from lyapnet import __version__
 
-RUN_RECORD = "run.json"  # what made a run; its presence marks a run's folder
+RUN_RECORD = "run.json"  # record of a run; its presence marks a run's folder
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """The versions of lyapnet, of those packages that are installed, and of Python; and the platform."""
+    """The versions of lyapnet, Python and some packages, if installed; and the platform."""
     found = {name: known for name in packages if (known := _version(name))}
     return {"lyapnet": __version__, **found, "python": platform.python_version(), "platform": platform.platform()}
 
 
 def commit() -> str | None:
-    """The commit of lyapnet's own source tree, where it is one."""
+    """The commit of lyapnet's source tree; None if it is no git repository."""
     try:
         here = Path(__file__).parents[1]
         git = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=True)

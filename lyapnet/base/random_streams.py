@@ -7,6 +7,6 @@ TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST = range(
 
 
 def stream(seed: int, *path: int) -> torch.Generator:
-    """A generator for one purpose: streams of different (seed, path) are independent, on every machine the same."""
+    """A generator for one purpose; streams of different (seed, path) are independent, and equal on every machine."""
     state = np.random.SeedSequence(seed, spawn_key=path).generate_state(1, np.uint64)[0]
     return torch.Generator().manual_seed(int(state))

@@ -1,4 +1,4 @@
-"""What a system looks like: shapes in a plane, in metres, from which a closed loop is animated."""
+"""Shapes in a plane, in metres, with which systems draw themselves in animations."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -13,8 +13,8 @@ class Line(NamedTuple):
     """A line through points (k, 2): a rod, a rope, the ground.
 
     Args:
-        width: in points of print, whatever the scale.
-        faint: of what only stands there.
+        width: in typographic points, independent of the scale.
+        faint: whether it is background, drawn in grey.
     """
 
     points: Points
@@ -53,19 +53,19 @@ def rectangle(center: Point, width: float, height: float, angle: float = 0.0) ->
 
 
 def chain(lengths: Sequence[float], angles: Sequence[float] | np.ndarray) -> np.ndarray:
-    """The joints (k + 1, 2) of links in a row from the origin, at absolute angles in rad, counterclockwise from →."""
+    """The joints (k + 1, 2) of a chain of links from the origin, at absolute angles in rad, counterclockwise from →."""
     links = [(length * np.cos(angle), length * np.sin(angle)) for length, angle in zip(lengths, angles, strict=True)]
     return np.cumsum([(0.0, 0.0), *links], 0)
 
 
 def oblique(points: Points) -> np.ndarray:
-    """Points (*batch, 3) of space in the plane: x to the right, z up, y away from the viewer, halved, at 30°."""
+    """Oblique projection of points (*batch, 3) to the plane: x to the right, z up, y at 30° and half its length."""
     x, y, z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
     return np.stack([x + 0.5 * y * np.cos(np.pi / 6), z + 0.5 * y * np.sin(np.pi / 6)], -1)
 
 
 def corners_of(shape: Shape) -> np.ndarray:
-    """Points (k, 2) between which a shape lies."""
+    """Points (k, 2) whose bounding box contains a shape."""
     match shape:
         case Disk(center, radius):
             return np.asarray(center, dtype=float) + radius * np.array([(-1, -1), (1, 1)])

@@ -1,6 +1,6 @@
-"""The one gate for sizes: what cannot fit into memory is refused by an estimate, before anything is allocated.
+"""Checks of memory sizes by estimates, before anything is allocated.
 
-The estimates are lower bounds: what they refuse cannot work, and what they let through may still be too much.
+The estimates are lower bounds: a refused size cannot work, but an accepted one may still be too large.
 """
 
 from pathlib import Path
@@ -8,13 +8,13 @@ from typing import Any
 
 from lyapnet.base.errors import UsageError
 
-NUMBER = 8  # bytes
-COPIES = 4  # of a weight in training: itself, its gradient, and two of Adam
-THREADS = 1024  # more than any machine that this runs on has cores
+NUMBER = 8  # bytes of a number
+COPIES = 4  # numbers for each weight in training: the weight, its gradient, and two of Adam
+THREADS = 1024  # largest number of threads, more than usual machines have cores
 
 
 def free_memory() -> int:
-    """Bytes that the machine has left, or that its container may hold."""
+    """The free memory of the machine or the limit of its container, in bytes."""
     found = [2**63]
     try:
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
@@ -26,10 +26,10 @@ def free_memory() -> int:
 
 
 def require_memory(name: str, got: Any, size: int, remedy: str) -> None:
-    """Refuse a size that would take more bytes than there are.
+    """Check that a size in bytes does not exceed the free memory.
 
     Raises:
-        UsageError: naming both.
+        UsageError: it does; states both.
     """
     free = free_memory()
     if size > free:
@@ -38,28 +38,28 @@ def require_memory(name: str, got: Any, size: int, remedy: str) -> None:
 
 
 def size_of_loops(states: int, steps: int, n: int) -> int:
-    """Bytes of closed loops: x, u and V at each node."""
+    """The bytes of closed loops: x, u and V at each node."""
     return NUMBER * states * (steps + 1) * (n + 2)
 
 
 def check_sizes(config: Any) -> None:
-    """Refuse a config of which not even the controller would fit: its weights, or one closed loop.
+    """Check that the weights and one closed loop of a config fit into memory.
 
     Raises:
-        UsageError: naming the key.
+        UsageError: they do not; names the key.
     """
     n, hidden = len(config.initial_states.lower), config.network.hidden or []
-    # twice: V, and the copy of it that is held against its contract
+    # twice: V, and its copy for the check of its contract
     require_memory("network.hidden", hidden, 2 * NUMBER * _weights(n, hidden), "choose smaller widths")
     steps = config.horizon.steps
     require_memory("horizon.steps", steps, size_of_loops(1, steps, n), "choose fewer")
 
 
 def check_training_sizes(config: Any) -> None:
-    """Refuse a config of which a training would not fit.
+    """Check that the training of a config fits into memory.
 
     Raises:
-        UsageError: naming the key.
+        UsageError: it does not; names the key.
     """
     n, steps, hidden, options = (
         len(config.initial_states.lower),
@@ -79,11 +79,11 @@ def check_training_sizes(config: Any) -> None:
     require_memory("evaluation.test_states", options.test_states, test, "choose fewer")
     certified = NUMBER * n * options.certified_states
     require_memory("evaluation.certified_states", options.certified_states, certified, "choose fewer")
-    if config.pointwise.weight != 0:  # null: the program's own
+    if config.pointwise.weight != 0:  # null: the program's default
         points = NUMBER * config.pointwise.points * max([n, *hidden])
         require_memory("pointwise.points", config.pointwise.points, points, "choose fewer")
 
 
 def _weights(n: int, hidden: list[int]) -> int:
-    """The number of weights between layers, at the least."""
+    """A lower bound of the number of weights: those between the layers."""
     return sum(one * other for one, other in zip([n, *hidden], [*hidden, 1], strict=True))

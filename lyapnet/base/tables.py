@@ -1,4 +1,4 @@
-"""A table once, as Markdown, LaTeX and comma-separated values; and how its numbers are written."""
+"""Tables as Markdown, LaTeX, CSV and terminal output, and the formatting of their numbers."""
 
 import csv
 import io
@@ -15,7 +15,7 @@ from rich.table import Table as RichTable
 NOTHING = "–"
 DIVERGED = "diverged"
 
-# what pdflatex does not know by itself
+# characters that pdflatex cannot print directly
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "–": "--", "−": "$-$", "±": r"$\pm$", "×": r"$\times$",
@@ -26,33 +26,33 @@ LATEX = {
 
 @dataclass(frozen=True)
 class Column:
-    """A heading, and how the row's values of some keys are shown under it."""
+    """A heading, and the formatting of a row's values for some keys."""
 
     heading: str
     keys: Sequence[str]
     show: Callable[..., str] = str
 
     def cell(self, row: Mapping[str, Any]) -> str:
-        """What a reader sees; nothing where the first key's value is missing."""
+        """The text of a cell; a dash if the first key's value is missing."""
         values = [row[key] for key in self.keys]
         return NOTHING if values[0] is None else self.show(*values)
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of numbers, and columns that show them. Readers see the columns; the CSV has the rows, unrounded."""
+    """Rows of numbers and the columns that show them; the CSV contains the rows without rounding."""
 
     title: str
     columns: Sequence[Column]
     rows: Sequence[Mapping[str, Any]]
-    section: str | None = None  # a rule wherever the row's value of this key changes
+    section: str | None = None  # key of the sections: a rule separates rows with different values
 
     def cells(self) -> list[list[str]]:
-        """What a reader sees, row by row."""
+        """The texts of all cells, row by row."""
         return [[column.cell(row) for column in self.columns] for row in self.rows]
 
     def breaks(self) -> list[bool]:
-        """Whether a section ends with a row."""
+        """For each row, whether a section ends with it."""
         if self.section is None:
             return [False] * len(self.rows)
         names = [row[self.section] for row in self.rows]
@@ -60,7 +60,7 @@ class Table:
 
 
 def markdown(table: Table) -> str:
-    """The table with its title; the first column to the left, numbers to the right."""
+    """The table as Markdown with its title; the first column is left-aligned, numbers are right-aligned."""
     heading = [column.heading for column in table.columns]
     rule = ["---", *["---:"] * (len(heading) - 1)]
     lines = (" | ".join(cell.replace("|", "\\|") for cell in line) for line in [heading, rule, *table.cells()])
@@ -68,7 +68,7 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    r"""The table as a table* environment, in ASCII; needs \usepackage{booktabs}, and graphicx if it is a wide one."""
+    r"""The table as a table* environment, in ASCII; needs \usepackage{booktabs}, and graphicx if it is wide."""
     wide, body = len(table.columns) > 9, []
     for cells, ends in zip(table.cells(), table.breaks(), strict=True):
         body += [_latex_row(cells), *([r"\midrule"] if ends else [])]
@@ -84,7 +84,7 @@ def latex(table: Table) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text as LaTeX takes it."""
+    """Escape text for LaTeX."""
     return "".join(LATEX.get(letter, letter) for letter in text)
 
 
@@ -93,7 +93,7 @@ def _latex_row(cells: Sequence[str]) -> str:
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows with the same keys, in full precision; empty where a value is missing, inf where a closed loop diverged."""
+    """Rows with the same keys as CSV in full precision; empty for a missing value, inf for a diverged closed loop."""
     text = io.StringIO()
     if rows:
         writer = csv.DictWriter(text, rows[0], lineterminator="\n")
@@ -103,7 +103,7 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def terminal(table: Table) -> RichTable:
-    """The table as `rich` prints it."""
+    """The table for `rich`."""
     first, *others = (column.heading for column in table.columns)
     columns = [RichColumn(first, no_wrap=True), *(RichColumn(name, justify="right", no_wrap=True) for name in others)]
     shown = RichTable(*columns, title=table.title, box=SIMPLE, padding=0)
@@ -116,7 +116,7 @@ def terminal(table: Table) -> RichTable:
 
 
 def number(value: float) -> str:
-    """Four significant digits, never in powers of ten below ten million."""
+    """Format a number with four significant digits; no exponent below ten million."""
     if math.isinf(value):
         return "∞"
     if value and not 1e-3 <= abs(value) < 1e7:
@@ -125,17 +125,17 @@ def number(value: float) -> str:
 
 
 def cost(value: float) -> str:
-    """A cost; inf is a closed loop that left the finite numbers."""
+    """Format a cost; inf means a diverged closed loop."""
     return DIVERGED if math.isinf(value) else number(value)
 
 
 def ratio(value: float) -> str:
-    """A cost in units of another: four decimals where it is near."""
+    """Format a ratio of costs: four decimals below 10."""
     return f"{value:.4f}" if value < 10 else cost(value)
 
 
 def mean_and_std(mean: float, std: float | None, diverged: int = 0, seeds: int = 0) -> str:
-    """mean ± std: std to two digits, mean to the same decimals, five digits at most; or how many seeds diverged."""
+    """Format mean ± std: std with two digits, mean with the same decimals (at most five digits); or diverged seeds."""
     if math.isinf(mean):
         return f"{DIVERGED} ({diverged} of {seeds})"
     if not std:
@@ -147,26 +147,26 @@ def mean_and_std(mean: float, std: float | None, diverged: int = 0, seeds: int =
 
 
 def with_interval(middle: float, low: float | None, high: float | None) -> str:
-    """A number and its interval, where there is one."""
+    """Format a number with its interval, if there is one."""
     return cost(middle) if low is None or high is None else f"{cost(middle)} [{cost(low)}, {cost(high)}]"
 
 
 def factor(value: float, at_least: bool = False) -> str:
-    """A ratio of two costs or times; a lower bound is marked."""
+    """Format a ratio of two costs or times; a lower bound is marked by >."""
     digits = ",.0f" if 100 <= value < 1e7 else ".3f" if 0.9 < value < 1.1 else ".3g"
     return f"{'> ' if at_least else ''}{value:{digits}}".replace("inf", "∞")
 
 
 def share(value: float) -> str:
-    """A share in percent."""
+    """Format a share in percent."""
     return f"{value:.1%}"
 
 
 def steps(value: float) -> str:
-    """A number of environment steps."""
+    """Format a number of environment steps."""
     return f"{value:,.0f}"
 
 
 def _decimals(value: float, digits: int = 4) -> int:
-    """Decimals that so many significant digits take."""
+    """The number of decimals for a number of significant digits."""
     return max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0

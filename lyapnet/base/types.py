@@ -1,4 +1,4 @@
-"""Shape aliases: the letters of the equations, checked by jaxtyping when the tests run.
+"""Shape aliases with the letters of the equations, checked by jaxtyping during tests.
 
 | letter  | meaning                                                              |
 |---------|----------------------------------------------------------------------|
@@ -6,7 +6,7 @@
 | N       | number of time steps of the horizon; t has N + 1 nodes               |
 | *batch  | any leading dimensions, one entry per state; may be empty            |
 
-A time broadcasts against the states it belongs to: one scalar for all of them, or one time each.
+A time broadcasts against its states: one scalar for all of them, or one time for each.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ ValuePath = Float[Tensor, "nodes *batch"]
 ControlPath = Float[Tensor, "steps *batch m"]
 StepPath = Float[Tensor, "steps *batch"]
 
-# Boxes of points (t, x), one number an axis, time first: 1 + n axes; and a value of any shape on each of them
+# Boxes of points (t, x) with 1 + n axes, time first; and values of any shape on each box
 Corner = Float[Tensor, " axes"]
 Corners = Float[Tensor, "boxes axes"]
 Points = Float[Tensor, "points axes"]
@@ -38,7 +38,7 @@ PerBox = Float[Tensor, " boxes"]
 OnBoxes = Float[Tensor, "boxes *shape"]
 Terms = Float[Tensor, "terms boxes *shape"]  # the coefficients of a polynomial on each box
 
-# What a discretised closed loop is linearised around: nodes of a block of steps, and the stages of each step.
+# Linearised closed loops: nodes of a block of steps, and the stages of each step.
 Scalar = Float[Tensor, ""]
 StagePath = Float[Tensor, "nodes stages *batch n"]
 StageControls = Float[Tensor, "nodes stages *batch m"]

@@ -1,4 +1,4 @@
-"""V, its control law and the closed loop as one object, and how a checkpoint becomes one."""
+"""The controller: V, its control law and the closed loop as one object; and its loading from a checkpoint."""
 
 from lyapnet.controller.controller import ArrayTrajectory, Controller
 from lyapnet.controller.loading import load

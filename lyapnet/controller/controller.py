@@ -1,4 +1,4 @@
-"""What training leaves behind: V, the control law, and the closed loop."""
+"""The controller, the result of training: V, its control law, and the closed loop."""
 
 import inspect
 import logging
@@ -28,14 +28,14 @@ from lyapnet.value.beyond import ContinuedPolicy, LaterPolicy, slack
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import HJBPolicy, ValuePolicy, gain_over_step, known_law
 
-ALIKE = 0.2  # share by which two control laws of a V may differ without a note: about 1 % of the cost
+MAX_LAW_DIFFERENCE = 0.2  # relative difference of V's HJB and sampled law without a note; about 1 % of the cost
 
 
 def parameters_of(system: ControlAffineSystem, config: SystemConfig) -> dict[str, Any]:
-    """The constructor's arguments, defaults included, of the system of a config; none where they do not fit it."""
+    """The constructor's arguments of a config's system, including defaults; empty if they do not fit the system."""
     try:
         bound = inspect.signature(type(system)).bind(**config.parameters)
-    except TypeError:  # a system of the user's own that was passed in the place of the config's
+    except TypeError:  # the user passed another system
         return {}
     bound.apply_defaults()
     return dict(bound.arguments)
@@ -56,7 +56,7 @@ class ArrayTrajectory(NamedTuple):
         return self.value
 
     @property
-    def cost(self) -> Any:  # an array, or of a single state a number of NumPy's
+    def cost(self) -> Any:  # an array, or a NumPy scalar for a single state
         """J_N = running cost plus terminal cost, (*batch,)."""
         return self.running_cost[-1] + self.terminal_cost
 
@@ -67,9 +67,9 @@ class ArrayTrajectory(NamedTuple):
 
 
 class Controller:
-    """V(t, x), u(t, x) and the closed loop they define.
+    """V(t, x), u(t, x) and their closed loop.
 
-    Tensors in, tensors out (of the controller's dtype); arrays and lists in, NumPy arrays out.
+    Methods return tensors (of the controller's dtype) for tensors, and NumPy arrays for arrays and lists.
     """
 
     problem: Problem
@@ -89,31 +89,31 @@ class Controller:
         policy: type[ValuePolicy] | None = None,
         after_horizon: AfterHorizon | None = None,
     ):
-        """A controller of parts.
+        """A controller from its parts.
 
-        Without a rollout it is the closed loop with steps of the horizon's method, as training and evaluation have it;
-        that of an adaptive method has to be given.
+        Without a rollout the closed loop uses steps of the horizon's method, as in training and evaluation; a rollout
+        with an adaptive method has to be given.
 
         Args:
-            problem: what it was made for.
-            V: its weights are frozen.
-            rollout: the closed loop of V; None: that of its law.
-            program: what V was trained for, and so what a certificate asks of it; None: the value program.
-            config: of the run that trained it, where there was one.
+            problem: the problem of V.
+            V: the value function; its weights are frozen.
+            rollout: the closed loop of V; None: the closed loop of its law.
+            program: the program that V was trained with, which certificates refer to; None: the value program.
+            config: the config of the run that trained V, if there was one.
             beyond: the law after T: hold, receding, riccati or error, as in lyapnet.load; None: the first of riccati,
-                receding and hold that holds closed loops, tried when it is first asked for.
-            parts: the user's own parts that stood in the place of the config's.
-            policy: the control law of V, where no rollout has one; None: the one that V is made for, and the HJB law
-                where nobody knows, with a note if that matters.
-            after_horizon: what an earlier choice of the law after T found.
+                receding and hold that keeps closed loops near the goal, chosen on first use.
+            parts: the user's parts that replaced those of the config.
+            policy: the control law of V, if there is no rollout; None: the law that V is made for, or the HJB law if
+                that is unknown, with a note if it matters.
+            after_horizon: the result of an earlier choice of the law after T.
 
         Raises:
-            UsageError: V says that it is made for what is no control law.
-            ValueError: the rollout is of another V or problem, or beside a policy.
+            UsageError: V.made_for is no control law.
+            ValueError: the rollout is of another V or problem, or both rollout and policy are given.
         """
         self.problem, self._config, self._beyond, self._parts = problem, config, beyond, parts or Parts()
         self.program = ValueProgram() if program is None else program
-        self._warned = False  # of parameters of a family that V was not told
+        self._warned = False  # whether a warning of parameters outside the family was logged
         self.V = V.requires_grad_(False).eval()
         if rollout is not None and policy is not None:
             raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
@@ -121,7 +121,7 @@ class Controller:
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
         law = self.closed_loop.policy
-        assert isinstance(law, ValuePolicy)  # as it has a V
+        assert isinstance(law, ValuePolicy)  # because it has a V
         self._after_horizon = after_horizon
         self._continued = ContinuedPolicy(problem, law, beyond, self.after_horizon, noted=after_horizon is not None)
 
@@ -132,10 +132,10 @@ class Controller:
 
     @property
     def config(self) -> Config:
-        """The config of the run that trained it.
+        """The config of the run that trained V.
 
         Raises:
-            UsageError: it was made from parts.
+            UsageError: there is none, because the controller was made from parts.
         """
         if self._config is None:
             raise UsageError("Expected a controller that a run left, got one made from parts; it has no config.")
@@ -143,7 +143,7 @@ class Controller:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The arguments of the system's constructor, as far as they are known."""
+        """The arguments of the system's constructor; empty if unknown."""
         return {} if self._config is None else parameters_of(self.system, self._config.system)
 
     @property
@@ -173,7 +173,7 @@ class Controller:
 
     @property
     def method(self) -> str:
-        """The integrator of its rollouts."""
+        """The integrator of the rollouts."""
         return self._rollout.method
 
     @property
@@ -183,7 +183,7 @@ class Controller:
 
     @property
     def step(self) -> Step:
-        """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V), one step of its rollouts; where they choose their own, one of rk4."""
+        """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V), one step of the rollouts; rk4 for an adaptive method."""
         return Step(self._rollout.stepped, TABLEAUX.get(self._rollout.solver_arguments["method"], TABLEAUX["rk4"]))
 
     @property
@@ -192,9 +192,9 @@ class Controller:
         return self._continued
 
     def after_horizon(self) -> AfterHorizon:
-        """What training found of the law after T, and of how many closed loops it holds up to 5 T; else it is sought.
+        """The law after T that training chose, and how many closed loops it holds up to 5 T; chosen now if unknown.
 
-        Where `beyond` was given, that law is followed all the same.
+        If `beyond` was given, the controller follows that law nevertheless.
         """
         if self._after_horizon is None:
             self._after_horizon = choose_law(
@@ -210,12 +210,12 @@ class Controller:
         """V(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch,).
 
         Args:
-            parameters: of a family, each by its name, scalar or (*batch,); none where x is (x, p).
+            parameters: parameters of a family by name, each a scalar or (*batch,); none if x is (x, p).
 
         Raises:
-            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
+            ValueError: the shapes do not fit, or t < 0.
         """
-        return self._answer(self.law.V, t, x, parameters)
+        return self._evaluate(self.law.V, t, x, parameters)
 
     @overload
     def policy(self, t: Tensor | float, x: Tensor, **parameters: Any) -> Tensor: ...
@@ -225,19 +225,19 @@ class Controller:
         """u(t, x): t ≥ 0 scalar or (*batch,) in s, x (*batch, n); returns (*batch, m).
 
         Args:
-            parameters: of a family, each by its name, scalar or (*batch,), as in policy(t, x, pole_mass=0.2); none
-                where x is (x, p).
+            parameters: parameters of a family by name, each a scalar or (*batch,), as in policy(t, x, pole_mass=0.2);
+                none if x is (x, p).
 
         Raises:
-            ValueError: the shapes do not fit; names the expected ones. Or t < 0.
+            ValueError: the shapes do not fit, or t < 0.
         """
-        return self._answer(self.law, t, x, parameters)
+        return self._evaluate(self.law, t, x, parameters)
 
     def with_(self, **parameters: float) -> "Controller":
-        """The controller of one member of a family: of its own problem, with V(t, (x, p)) at these parameters.
+        """The controller of a family's member: its problem, and V(t, (x, p)) at fixed parameters.
 
         Raises:
-            UsageError: it is of no family; or a parameter is missing, unknown, or outside the range that V was told.
+            UsageError: this is no family; or a parameter is missing, unknown, or outside the range of training.
         """
         system = self.system
         if not isinstance(system, FamilySystem) or self._config is None:
@@ -246,14 +246,14 @@ class Controller:
         problem = build_problem(config, parts).to(self.initial_states.lower.device)
         V = AtParameters(self.V, self.initial_states.lower.new_tensor(p))
         rollout = build_rollout(config, problem, V)
-        known = self._after_horizon  # of the family, and so of its members
+        known = self._after_horizon  # chosen for the family, used for its members
         return Controller(problem, V, rollout, self.program, config, self._beyond, parts, after_horizon=known)
 
     def continued(self, beyond: str) -> "Controller":
         """The controller with another law after T: hold, receding, riccati or error, as in lyapnet.load.
 
         Raises:
-            ValueError: another name; or riccati, and the goal is no equilibrium that a linear law can stabilise.
+            ValueError: unknown name; or riccati, and the goal is no equilibrium that a linear law can stabilise.
         """
         return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, self._parts)
 
@@ -265,13 +265,13 @@ class Controller:
         """The closed loop from x₀ (*batch, n): a Trajectory of tensors, an ArrayTrajectory of arrays and lists.
 
         Args:
-            steps: of Δt; None: the horizon's. Of a closed loop of any other length, φ is that of its last state; after
-                T it goes on as `beyond` says.
-            parameters: of a family, each by its name; none where x₀ is (x₀, p).
+            steps: number of steps of Δt; None: that of the horizon. φ is evaluated at the last state; after T the law
+                is `beyond`.
+            parameters: parameters of a family by name; none if x₀ is (x₀, p).
 
         Raises:
             ValueError: the shape does not fit.
-            DivergenceError: the closed loop leaves the finite numbers.
+            DivergenceError: the closed loop is not finite.
         """
         if parameters:
             return self.with_(**parameters).rollout(x0, steps)
@@ -282,8 +282,10 @@ class Controller:
             if steps is not None and steps < self.horizon.steps:
                 trajectory = self._cut(trajectory, steps)
             elif steps is not None and steps > self.horizon.steps:
-                trajectory = self._prolonged(trajectory, steps - self.horizon.steps)
-        return trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_like(x0, field) for field in trajectory))
+                trajectory = self._prolong(trajectory, steps - self.horizon.steps)
+        return (
+            trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_in_form_of(x0, field) for field in trajectory))
+        )
 
     def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
         """The first steps of a trajectory."""
@@ -291,15 +293,15 @@ class Controller:
         end, value = self.cost.terminal(whole.x[steps]), whole.require_value()[nodes]
         return Trajectory(whole.t[nodes], whole.x[nodes], whole.u[:steps], whole.running_cost[nodes], end, value)
 
-    def take_code_of(self, rollout: Rollout) -> None:
-        """Follow closed loops by the machine code of another rollout of this law, where it has some and agrees."""
+    def share_code_of(self, rollout: Rollout) -> None:
+        """Use the compiled code of another rollout of this law, if it has some and it agrees."""
         own, other = self._rollout.discrete, rollout.discrete
         if own is not None and other is not None and other.compiled_batch:
             draw = torch.Generator().manual_seed(0)
             own.share_code(other, self.problem.initial_states.sample(other.compiled_batch, draw))
 
-    def _prolonged(self, first: Trajectory, steps: int) -> Trajectory:
-        """A trajectory with further steps, under what follows the horizon."""
+    def _prolong(self, first: Trajectory, steps: int) -> Trajectory:
+        """Continue a trajectory after T by a number of steps, under the law after T."""
         problem = self.problem.in_steps(steps=steps)
         law, solver = LaterPolicy(problem, self.law, self.horizon.duration), self._rollout.solver_arguments
         rest = Rollout(problem, law, self.method, "backprop", solver["rtol"], solver["atol"])(first.x[-1])
@@ -312,12 +314,12 @@ class Controller:
             torch.cat([first.require_value(), rest.require_value()[1:]]),
         )
 
-    def _answer(
+    def _evaluate(
         self, function: Callable[[Tensor, Tensor], Tensor], t: Any, x: Any, parameters: Mapping[str, Any]
     ) -> Any:
-        time, state = self._inputs(t, self._told(x, parameters) if parameters else x)
+        time, state = self._inputs(t, self._append_parameters(x, parameters) if parameters else x)
         with torch.set_grad_enabled(torch.is_grad_enabled() and (time.requires_grad or state.requires_grad)):
-            return _like(x, function(time, state))
+            return _in_form_of(x, function(time, state))
 
     def _inputs(self, t: Any, x: Any) -> tuple[Tensor, Tensor]:
         state = self._state(x)
@@ -329,8 +331,8 @@ class Controller:
             raise ValueError(f"Expected t ≥ 0, got {float(time.min()):g}; the horizon begins at 0.")
         return time.clamp(min=0), state
 
-    def _told(self, x: Any, parameters: Mapping[str, Any]) -> Tensor:
-        """(x, p) of x and the parameters of a family."""
+    def _append_parameters(self, x: Any, parameters: Mapping[str, Any]) -> Tensor:
+        """(x, p) from x and the parameters of a family; warns of parameters outside the range of training."""
         if not isinstance(self.system, FamilySystem):
             raise ValueError(f"Expected no parameters, got {', '.join(parameters)}; this is of a single problem.")
         box, n = self.initial_states, self.system.system.n
@@ -356,9 +358,9 @@ class Controller:
 
 
 def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
-    """The control law that V is made for; where nobody knows the HJB law, with a note if that matters."""
+    """The control law that V is made for; the HJB law if it is unknown, with a note if that matters."""
     known = known_law(problem, V)
-    if known is None and (gain := gain_over_step(problem, V)) > ALIKE:
+    if known is None and (gain := gain_over_step(problem, V)) > MAX_LAW_DIFFERENCE:
         logging.getLogger(__name__).warning(
             "note: nobody says which control law %s is made for; u is its HJB law, which at this Δt differs by %.0f %% "
             "from the law with u held. Pass policy=lyapnet.SampledPolicy where V is about steps with u held, "
@@ -368,5 +370,5 @@ def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
     return HJBPolicy if known is None else known
 
 
-def _like(given: Any, result: Any) -> Any:
+def _in_form_of(given: Any, result: Any) -> Any:
     return result if isinstance(given, Tensor) else result.detach().cpu().numpy()

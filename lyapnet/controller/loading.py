@@ -1,4 +1,4 @@
-"""The controller of a checkpoint file, which is read and never run."""
+"""Loads a controller from a checkpoint file, without executing code of the file."""
 
 import json
 import logging
@@ -44,20 +44,21 @@ def load(
     device: str | torch.device = "cpu",
     beyond: str | None = None,
 ) -> Controller:
-    """The controller of a checkpoint. Nothing that the file names is imported or run.
+    """Load the controller of a checkpoint. Nothing that the file names is imported or run.
 
-    A note is logged where f, g, the cost, U or the names of the states are others than those that it was trained with.
+    A note is logged if f, g, the cost, U or the names of the states differ from those of the training.
 
     Args:
         path: a .ckpt file of a run.
-        system, cost, controls, constraints, program: each where the run's own is not a registered one, or replaced.
-        network: likewise, the class of a network that is not one of NETWORKS.
-        device: where the tensors go.
-        beyond: the law after T: hold, that of t = T; receding, that of t = 0; riccati, the linear-quadratic regulator
-            of the goal; or error. None: that which training found to hold the goal; where it found none, with a note.
+        system, cost, controls, constraints, program: the user's objects, if the run used unregistered ones; or
+            replacements.
+        network: the class of the network, if it is not one of NETWORKS.
+        device: device of the tensors.
+        beyond: the law after T: hold, the law at t = T; receding, the law at t = 0; riccati, the linear-quadratic
+            regulator at the goal; or error. None: the law that training chose, with a note if none keeps the goal.
 
     Raises:
-        UsageError: no such file or device; or a part of the user's own that was not passed.
+        UsageError: no such file or device, or an object of the user that was not passed.
         CheckpointError: the file is truncated, foreign, or does not fit its own config.
     """
     require_device(device, torch.float32)
@@ -73,7 +74,7 @@ def load(
 def _controller_of(
     content: dict[str, Any], config: Config, parts: Parts, path: str | Path, device: Any, beyond: str | None
 ) -> Controller:
-    """The controller of what a checkpoint holds."""
+    """The controller from the content of a checkpoint."""
     problem = build_problem(config, parts)
     V = build_value_function(config, rounded(problem), parts.network)
     load_value_function(V, content, path)
@@ -94,8 +95,8 @@ def _controller_of(
 
 
 def _require_dimension(config: Config, system: ControlAffineSystem | None, path: str | Path) -> None:
-    """Refuse a system in the place of a checkpoint's that has another number of states than its X₀."""
-    if system is None or len(lower := config.initial_states.lower) == 1:  # one bound may be that of every state
+    """Raise UsageError if a replaced system has another number of states than the checkpoint's X₀."""
+    if system is None or len(lower := config.initial_states.lower) == 1:  # a single bound may hold for every state
         return
     system.check_coordinates()
     if system.n != len(lower):
@@ -106,10 +107,13 @@ def _require_dimension(config: Config, system: ControlAffineSystem | None, path:
 
 
 def require_parts(config: Config, parts: Parts, origin: str | Path) -> None:
-    """Refuse a config, of a file `origin`, that names a part which is neither registered nor passed: to be imported.
+    """Check that all unregistered parts of a config are passed, because loading never imports them.
+
+    Args:
+        origin: the file of the config, for messages.
 
     Raises:
-        UsageError: naming the part.
+        UsageError: a part is missing; names it.
     """
     for part, (registry, _) in REGISTRIES.items():
         name = getattr(config, part).name
@@ -124,7 +128,7 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
     """The config in the content of a checkpoint file.
 
     Raises:
-        CheckpointError: there is none that this version understands.
+        CheckpointError: there is no config, or this version cannot read it.
     """
     plain = content[KEY].get("config")
     if plain is None:
@@ -135,7 +139,7 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
     try:
         if not isinstance(plain, dict):
             raise UsageError(f"Expected a config, got {type(plain).__name__}; use another checkpoint.")
-        if "${" in json.dumps(plain, ensure_ascii=False):  # resolving one may read the environment, or call a function
+        if "${" in json.dumps(plain, ensure_ascii=False):  # resolving it may read the environment, or call a function
             raise UsageError("Expected plain values, got an interpolation ${…}; use another checkpoint.")
         return config_from_plain(plain)
     except UsageError as error:
@@ -145,10 +149,10 @@ def config_of(content: dict[str, Any], path: str | Path) -> Config:
 
 
 def load_value_function(V: nn.Module, content: dict, path: str | Path) -> None:
-    """Put a checkpoint's weights into V.
+    """Load a checkpoint's weights into V.
 
     Raises:
-        CheckpointError: naming the tensors that differ; or it holds the weights of several seeds.
+        CheckpointError: tensors differ, or the checkpoint has the weights of several seeds.
     """
     if content[KEY].get("config", {}).get("seeds", 1) > 1:
         raise CheckpointError(

@@ -1,1 +1,1 @@
-"""One experiment as data, and the objects that it names."""
+"""An experiment as data, and the construction of its objects."""

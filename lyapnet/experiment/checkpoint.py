@@ -1,6 +1,6 @@
-"""Checkpoint files: read without executing anything, written so that a crash leaves the previous one.
+"""Checkpoint files: reading executes no code of the file, writing is atomic.
 
-Each carries a digest of all that it holds, so that a changed bit is noticed.
+Each file has a digest of its content, so that damage is detected.
 """
 
 import functools
@@ -19,17 +19,17 @@ from lyapnet.base.errors import CheckpointError, UsageError, one_line
 from lyapnet.base.files import require_file, write_atomically
 from lyapnet.base.plain_data import UNREADABLE, plain_data_of
 
-KEY = "lyapnet"  # where a checkpoint keeps the config and the version that wrote it
+KEY = "lyapnet"  # key of the config and of the version that wrote the checkpoint
 AFTER_HORIZON = "after_horizon"  # under KEY: the law after T that training found
 ZOO = Path(__file__).parents[1] / "zoo"  # the controllers that come with lyapnet, NAME.ckpt with NAME.json
-DIGEST = "lyapnet_digest"  # where the file of one keeps digest_of(the rest); since version 0.3
+DIGEST = "lyapnet_digest"  # key of digest_of(the other entries); since version 0.3
 
 
 def located(path: str | Path) -> Path:
-    """Where a checkpoint lies: the path itself, or that of zoo:NAME among the controllers that come with lyapnet.
+    """The path of a checkpoint: the path itself, or the file of zoo:NAME, a controller that comes with lyapnet.
 
     Raises:
-        UsageError: no such controller; names those that there are.
+        UsageError: no such controller; lists the existing ones.
     """
     scheme, separator, name = str(path).partition(":")
     if scheme != "zoo" or not separator or Path(path).exists():
@@ -40,19 +40,18 @@ def located(path: str | Path) -> Path:
 
 
 def zoo_names() -> list[str]:
-    """The controllers that come with lyapnet."""
+    """The names of the controllers that come with lyapnet."""
     return sorted(path.stem for path in ZOO.glob("*.ckpt"))
 
 
 def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dict[str, Any]:
-    """The content of a lyapnet checkpoint, as it was written: its digest is verified, and left out.
+    """Read a lyapnet checkpoint; the digest is verified and removed.
 
-    A note is logged for a file without a digest, as version 0.1 wrote them; the checksums of its archive are verified.
+    For a file without digest, from version 0.1, the checksums of its archive are verified and a note is logged.
 
     Raises:
         UsageError: no such file.
-        CheckpointError: truncated, changed since it was written, not a checkpoint of lyapnet's, or holding anything but
-            plain data.
+        CheckpointError: the file is truncated or damaged, no lyapnet checkpoint, or contains more than plain data.
     """
     path = located(path)
     content = read_plain_data(path, device)
@@ -70,7 +69,7 @@ def read_checkpoint(path: str | Path, device: str | torch.device = "cpu") -> dic
 
 
 def _add_missing_buffers(weights: dict[str, Any]) -> None:
-    """Add what files of up to 0.3 lack: whether an expansion network ends in φ, which theirs did not."""
+    """Add the buffer `ends` of expansion networks, which files up to version 0.3 lack; it is 0 for them."""
     for name, tensor in list(weights.items()):
         prefix, _, last = name.rpartition(".")
         if last == "at_goal" and isinstance(tensor, Tensor):
@@ -78,19 +77,20 @@ def _add_missing_buffers(weights: dict[str, Any]) -> None:
 
 
 def digest_of(content: Any) -> str:
-    """The SHA-256 of plain data in a canonical form: every key and value with its type, in the order of the keys, and
-    of every tensor its dtype, shape and entries, bit for bit. The device does not count.
+    """The SHA-256 of plain data in a canonical form: all keys and values with their types, sorted by key.
+
+    Tensors count by dtype, shape and the bits of their entries; the device does not count.
     """
     digest = hashlib.sha256()
-    _feed(digest, content)
+    _update_digest(digest, content)
     return digest.hexdigest()
 
 
-def _feed(digest: Any, value: Any) -> None:
+def _update_digest(digest: Any, value: Any) -> None:
     if isinstance(value, Tensor):
         value = value if value.layout == torch.strided else value.to_dense()
         storage, strides = value.detach(), ()
-        if value.nbytes > value.untyped_storage().nbytes():  # expanded: what it is made of, not what it would fill
+        if value.nbytes > value.untyped_storage().nbytes():  # an expanded tensor: hash its storage
             strides = (value.stride(), value.storage_offset())
             storage = torch.empty(0, dtype=torch.uint8, device=value.device).set_(value.untyped_storage())
         digest.update(f"tensor {value.dtype} {tuple(value.shape)} {strides};".encode())
@@ -98,42 +98,42 @@ def _feed(digest: Any, value: Any) -> None:
     elif isinstance(value, Mapping):
         digest.update(f"mapping {len(value)};".encode())
         for key in sorted(value, key=lambda key: (type(key).__name__, repr(key))):
-            _feed(digest, key)
-            _feed(digest, value[key])
+            _update_digest(digest, key)
+            _update_digest(digest, value[key])
     elif isinstance(value, list | tuple | set | frozenset):
         digest.update(f"{type(value).__name__} {len(value)};".encode())
         for entry in value if isinstance(value, list | tuple) else sorted(value, key=repr):
-            _feed(digest, entry)
+            _update_digest(digest, entry)
     else:
         text = repr(value).encode()
         digest.update(f"{type(value).__name__} {len(text)};".encode() + text)
 
 
 def _is_as_written(path: Path, content: dict[str, Any], digest: Any) -> bool:
-    """Whether a file's content has its digest; one without it, whether its archive has its checksums."""
+    """Whether the content has its digest; for a file without digest, whether its archive has correct checksums."""
     try:
         if digest is not None:
             return digest == digest_of(content)
         with zipfile.ZipFile(path) as archive:
-            # torch takes an entry with the attribute of a folder for empty, and what was in memory for its tensor
+            # torch reads an entry that is marked as a folder as empty, and uses uninitialised memory for its tensor
             intact = archive.testzip() is None and not any(entry.external_attr for entry in archive.infolist())
-    except Exception:  # of any kind: what is checked may be hostile
+    except Exception:  # the file may be hostile
         return False
     _note_missing_digest(path)
     return intact
 
 
-@functools.cache  # once for each file: training reads it for its config, and Lightning for its weights
+@functools.cache  # only once for each file, which is read several times
 def _note_missing_digest(path: Path) -> None:
     logging.getLogger(__name__).warning("note: %s has no digest, as lyapnet 0.1 left it; it is taken as it is.", path)
 
 
 def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any:
-    """The content of a torch file that holds tensors, numbers, strings, lists and dictionaries only.
+    """Read a torch file that contains only tensors, numbers, strings, lists and dictionaries.
 
     Raises:
         UsageError: no such file.
-        CheckpointError: truncated, foreign, or holding anything else; nothing in it was executed.
+        CheckpointError: the file is truncated, foreign, or contains anything else; no code of it was executed.
     """
     path = Path(path)
     try:
@@ -146,8 +146,10 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         raise UsageError(
             f"Expected a checkpoint file, got {str(path)!r}, which is not there; see logs/*/*/checkpoints."
         ) from error
-    except (OSError, ValueError) as error:  # a name with a null character is a ValueError
-        raise UsageError(f"Expected a checkpoint file, got {str(path)!r} ({_words(error)}); use another.") from error
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        raise UsageError(
+            f"Expected a checkpoint file, got {str(path)!r} ({_describe_error(error)}); use another."
+        ) from error
     if not path.stat().st_size:
         raise CheckpointError(
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which is empty; use another of the run."
@@ -167,10 +169,10 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
 
 
 def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
-    """Write a checkpoint with its digest, all or nothing.
+    """Write a checkpoint with its digest, atomically.
 
     Raises:
-        CheckpointError: the disk is full, the folder cannot be written; the previous file is untouched.
+        CheckpointError: the file cannot be written; the previous file is unchanged.
     """
     buffer = io.BytesIO()
     torch.save({**content, DIGEST: digest_of(content)}, buffer)
@@ -184,17 +186,17 @@ def write_checkpoint(content: dict[str, Any], path: str | Path) -> None:
 
 
 def note_in_checkpoint(path: str | Path, **notes: Any) -> None:
-    """Add plain data to what a checkpoint file says of itself, beside its config.
+    """Add plain data to the entry of a checkpoint file that has its config.
 
     Raises:
-        CheckpointError: it cannot be read, or not be written; then it is untouched.
+        CheckpointError: the file cannot be read or written; it is then unchanged.
     """
     content = read_checkpoint(path)
     write_checkpoint({**content, KEY: {**content[KEY], **notes}}, path)
 
 
-def _words(error: Exception) -> str:
-    """What the system says of a file, or what else was raised."""
+def _describe_error(error: Exception) -> str:
+    """The system's message for a file, or the message of any other error."""
     return getattr(error, "strerror", None) or one_line(error)
 
 

@@ -1,6 +1,6 @@
-"""The schema of an experiment: one dataclass a section, one sentence a field; and its loading, with clear refusals.
+"""The schema of an experiment, one dataclass for each section with one sentence for each field; and its loading.
 
-A YAML file lists only what differs from these defaults; `key.sub=value` on the command line comes last.
+A YAML file lists only values that differ from these defaults; `key.sub=value` on the command line has precedence.
 """
 
 import dataclasses
@@ -12,10 +12,10 @@ from typing import Any
 from omegaconf import MISSING, OmegaConf
 
 from lyapnet.base.sizes import THREADS, check_sizes
-from lyapnet.experiment.recipe import STANDARD, completed
+from lyapnet.experiment.recipe import STANDARD, with_recipe
 from lyapnet.experiment.schema import Names, check_values, checked, differences, option, read_yaml
 
-# what is registered, without what registers it: a misspelt key is refused before torch is loaded
+# names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
 COSTS = Names("task.cost", "COSTS")
 ACTIVATIONS = Names("value.networks", "ACTIVATIONS")
@@ -32,7 +32,7 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 
 @dataclass
 class ProgramConfig:
-    """What is minimised; see Program for the loss and its units."""
+    """The program, which is minimised; see Program for the loss and its units."""
 
     name: str = option(
         MISSING,
@@ -43,21 +43,21 @@ class ProgramConfig:
     constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
     terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
     trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
-    normalise: bool = option(True, "Measure the terms against the batch's mean cost; false for the paper's sums.")
+    normalise: bool = option(True, "Divide the terms by the batch's mean cost; false for the paper's sums.")
     cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
     relative: bool | None = option(
-        None, "Measure that distance against the cost of each trajectory, not against their mean (value only)."
+        None, "Divide that distance by the cost of each trajectory, not by their mean (value only)."
     )
-    margin: float | None = option(None, "Share of ℓ by which the hinge asks for more (lyapunov only).", at_least=0)
-    bound: float | None = option(None, "Weight of V(0, x₀), which the hinge makes a bound (lyapunov only).", at_least=0)
-    share: float | None = option(None, "Share of ℓ by which V falls at least (region only).", above=0)
+    margin: float | None = option(None, "Reserve of the hinge, as a share of ℓ (lyapunov only).", at_least=0)
+    bound: float | None = option(None, "Weight of V(0, x₀), the upper bound of the cost (lyapunov only).", at_least=0)
+    share: float | None = option(None, "Smallest decrease of V, as a share of ℓ (region only).", above=0)
     growth: float | None = option(None, "Weight of the share of D outside the region (region only).", at_least=0)
     parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
 
 
 @dataclass
 class PointwiseConfig:
-    """The program's condition off the closed loops, as a certificate asks for it; see PointwiseCondition."""
+    """The program's condition at points off the closed loops; see PointwiseCondition."""
 
     weight: float | None = option(
         None, "Weight of the condition at points of [0, T] × D; null: 0, with the region program 5.", at_least=0
@@ -95,15 +95,17 @@ class CostConfig:
     Q: Any = option(None, "State weight, symmetric positive semidefinite.")
     R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
     Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
-    periodic: list[str] = option([], "Angles δ whose δ² counts as 2(1 − cos δ), names of states.")
-    huber: float | None = option(None, "δ: q and φ count as 2δ²(√(1 + q/δ²) − 1), less far away.", above=0)
+    periodic: list[str] = option([], "Names of angles δ for which 2(1 − cos δ) replaces δ².")
+    huber: float | None = option(
+        None, "δ: 2δ²(√(1 + q/δ²) − 1) replaces q, and likewise φ, for less growth far away.", above=0
+    )
     obstacles: list[dict[str, Any]] = option([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
     parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
 
 
 @dataclass
 class ControlsConfig:
-    """U, the controls that are admitted: all, those between limits, or a set of the user's own."""
+    """U, the admissible controls: all, those between limits, or a set of the user's own."""
 
     lower: Any = option(None, "Least controls: a number, or one for each; null: no limit.")
     upper: Any = option(None, "Greatest controls, likewise.")
@@ -129,15 +131,15 @@ class ConstraintsConfig:
     parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
     margin: float | None = option(
         None,
-        "Of h, within which training pays for coming close; null: 0.02, or where u acts on h at once and "
-        "network.penalty is true, 0.002.",
+        "Margin of h within which training adds a penalty; null: 0.02, or 0.002 if u acts on h directly and "
+        "network.penalty is true.",
         above=0,
     )
 
 
 @dataclass
 class DomainConfig:
-    """Where f, g, q and φ are defined, besides the borders that are found; see constraints for what is to be kept."""
+    """Declared borders of f, g, q and φ, in addition to those found by a search; limits to keep are in constraints."""
 
     lower: dict[str, float] = option({}, "Borders below, of states by name.")
     upper: dict[str, float] = option({}, "Borders above, likewise.")
@@ -145,7 +147,7 @@ class DomainConfig:
 
 @dataclass
 class InitialStatesConfig:
-    """X₀, the box of initial states; a single number is the bound of every state."""
+    """X₀, the box of initial states; a single number is a bound for every state."""
 
     lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
     upper: list[float] = option(MISSING, "Upper bounds, one for each state.")
@@ -162,7 +164,7 @@ class HorizonConfig:
 
 @dataclass
 class NetworkConfig:
-    """V(t, x). Fields left at null take the network's own default."""
+    """V(t, x). Fields with null use the network's default."""
 
     name: str = option(
         "expansion",
@@ -176,8 +178,8 @@ class NetworkConfig:
     embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
     epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
     smooth: bool | None = option(None, "Smooth in time, for sound certificates (expansion).")
-    penalty: bool = option(False, "Add to N what a state pays in one step for coming close to constraints.")
-    terminal: str = option("free", "exact builds V(T, ·) = φ in.", choices=("free", "exact"))
+    penalty: bool = option(False, "Add the known constraint penalty of one step to N.")
+    terminal: str = option("free", "exact: V(T, ·) = φ by construction.", choices=("free", "exact"))
     state_scale: list[float] | None = option(
         None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0
     )
@@ -190,13 +192,15 @@ class RolloutConfig:
 
     policy: str = option("hjb", "The control law that V defines.", choices=POLICIES)
     choose_policy: bool = option(
-        False, "Take lookahead in its place where the search for a start finds that this costs much less."
+        False, "Use lookahead instead, if the search for an initial V finds that it costs much less."
     )
     method: str = option("euler", "The integrator.", choices=METHODS)
-    gradient: str = option("adjoint", "The gradient's route.", choices=GRADIENTS)
+    gradient: str = option("adjoint", "How the gradient is computed.", choices=GRADIENTS)
     compile: str = option("auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH)
     costate_limit: float | None = option(
-        None, "Times the median of its batch that a costate of gradient discrete may be long; null: any.", at_least=1
+        None,
+        "Largest length of a costate relative to its batch's median, with gradient discrete; null: no limit.",
+        at_least=1,
     )
     rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
     atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
@@ -228,13 +232,13 @@ class TrainingConfig:
     )
     lost_share: float = option(
         0.0,
-        "Greatest share of a batch that is drawn from states whose closed loop costs more than V says.",
+        "Largest share of a batch drawn from lost states, whose closed loop costs more than V predicts.",
         at_least=0,
         below=1,
     )
     least_gain: float = option(
         0.0,
-        "By how much the validation loss has to fall in 40 steps for training to take all iterations; 0: always.",
+        "Early stopping if the validation loss falls by less than this in 40 steps; 0: take all iterations.",
         at_least=0,
     )
     validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
@@ -242,7 +246,7 @@ class TrainingConfig:
 
 @dataclass
 class EvaluationConfig:
-    """What is measured on states that training never sees."""
+    """Measurements on states that training does not use."""
 
     validation_states: int = option(64, "Initial states in each validation.", at_least=1)
     test_states: int = option(256, "Initial states of the evaluation at the end of training.", at_least=1)
@@ -272,24 +276,26 @@ class Config:
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
     target: Any = option(
-        None, "x*, what the cost is about: a list, or {state: value}, the others solved for; null: its own goal.",
+        None, "x*, the goal of the cost: a list, or {state: value} with the others solved for; null: the cost's own.",
         mapping=True,
     )  # fmt: skip
-    target_control: list[float] | None = option(None, "u*, likewise; null: what holds x*, f(x*) + g(x*)u* = 0.")
+    target_control: list[float] | None = option(
+        None, "u*, the control at rest; null: the control that holds x*, f(x*) + g(x*)u* = 0."
+    )
     family: dict[str, list[float]] = option(
-        {}, "Ranges of what V is told: parameters of the system, and target_STATE; each as [least, greatest]."
+        {}, "Ranges of parameters in V: of the system, and target_STATE; each as [least, greatest]."
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
-    loggers: list[str] = option(["tensorboard"], "Where curves go besides metrics.csv.", choices=LOGGERS)
+    loggers: list[str] = option(["tensorboard"], "Loggers of curves besides metrics.csv.", choices=LOGGERS)
     callbacks: list[str] = option([], "Lightning callbacks of your own, each as module:Class.")
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 
 def configs_of_seeds(config: Config) -> list[Config]:
-    """The config of each seed's run alone."""
+    """The config of each seed, as a run of its own."""
     return [dataclasses.replace(config, seed=config.seed + k, seeds=1) for k in range(config.seeds)]
 
 
@@ -309,10 +315,10 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
 
 
 def outline(path: str | Path, overrides: Sequence[str] = ()) -> Config:
-    """The config of a YAML file with its keys and types checked, and the values of its horizon: known without torch.
+    """The config of a YAML file, with only keys, types and horizon checked, so that torch is not loaded.
 
     Raises:
-        UsageError: as load_config, for these.
+        UsageError: as load_config, for these checks.
     """
     content = {"experiment": Path(path).stem, **read_yaml(path, Config)}
     given = {key: content.get(key, {}) for key in STANDARD}
@@ -328,7 +334,7 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     Raises:
         UsageError: as load_config.
     """
-    config = checked(Config, completed(content, overrides, _weights), overrides)
+    config = checked(Config, with_recipe(content, overrides, _recommended_weights), overrides)
     # YAML reads on and off as booleans
     config.rollout.compile = {"True": "on", "False": "off"}.get(config.rollout.compile, config.rollout.compile)
     check_values(config)
@@ -336,8 +342,8 @@ def config_from_plain(content: Mapping[str, Any], overrides: Sequence[str] = ())
     return config
 
 
-def _weights(program: str) -> Mapping[str, Any]:
-    """What a registered program recommends; nothing for one of the user's own."""
+def _recommended_weights(program: str) -> Mapping[str, Any]:
+    """The recommended weights of a registered program; empty for a user's program."""
     from lyapnet.loop import programs  # loads torch
 
     known = programs.PROGRAMS.get(program)
@@ -345,7 +351,7 @@ def _weights(program: str) -> Mapping[str, Any]:
 
 
 def to_plain(config: Config) -> dict[str, Any]:
-    """The config as nested dictionaries, lists, numbers and strings, as a checkpoint holds it."""
+    """The config as nested dictionaries, lists, numbers and strings, as stored in checkpoints."""
     return dataclasses.asdict(config)
 
 
@@ -355,5 +361,5 @@ def to_yaml(config: Config) -> str:
 
 
 def differing_keys(one: Config, other: Config) -> list[str]:
-    """Full names of the fields in which two configs differ."""
+    """The full names of fields in which two configs differ."""
     return list(differences(to_plain(one), to_plain(other)))

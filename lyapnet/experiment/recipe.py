@@ -1,11 +1,11 @@
-"""The standard recipe: what a config that names no network takes, as its task needs it."""
+"""The standard recipe: default settings for a config without network.name, adapted to its task."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-# What a file without network.name takes: the recipe for a system of which nothing is known. Its own keys come on top,
-# a registered program has the weights that it recommends. With constraints, where V is steep, the law looks ahead.
-# Muon moves the weights of the value program, but not with limits, of which V_x has kinks: there Adam is the safer one.
+# The recipe for an unknown system. The file's own keys have precedence, and a registered program has its recommended
+# weights. With constraints, where V is steep, the law is lookahead. The value program uses Muon, but Adam with control
+# limits, where V_x has kinks.
 STANDARD: dict[str, Any] = {
     "program": {"name": "value"},
     "network": {"name": "expansion"},
@@ -22,40 +22,40 @@ STANDARD: dict[str, Any] = {
     "trainer": {"gradient_clip_val": 3},
     "evaluation": {"validation_states": 512},
 }
-COSTATE_LIMIT = 5  # that of the recipe, for the value and region programs between limits of the controls
-LISTED = "listed"  # name of constraints that has nothing besides those that are listed
+COSTATE_LIMIT = 5  # rollout.costate_limit of the recipe, for the value and region programs with control limits
+LISTED = "listed"  # constraints.name without a class
 
 
-def completed(
+def with_recipe(
     content: Mapping[str, Any], overrides: Sequence[str], weights: Callable[[str], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """The content on top of the standard recipe, where it names no network.
+    """Complete the content of a config by the standard recipe, if it names no network.
 
     Args:
-        content: of a file.
-        overrides: of the command line, `key.sub=value`.
-        weights: those that a program recommends, by its name.
+        content: the content of the file.
+        overrides: changes from the command line, `key.sub=value`.
+        weights: name of a program ↦ its recommended weights.
     """
     sections = {key: content[key] for key in STANDARD if isinstance(content.get(key), Mapping)}
     if "name" in sections.get("network", {}) or len(sections) < sum(key in content for key in STANDARD):
         return content
     recipe = dict(STANDARD)
-    constrained = _names(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides)
-    limited = _names(("lower", "upper"), "controls", content, overrides)
+    constrained = _sets_any(("lower", "upper", "outside", "inside", "name"), "constraints", content, overrides)
+    limited = _sets_any(("lower", "upper"), "controls", content, overrides)
     if constrained:
         recipe["rollout"] = {**STANDARD["rollout"], "policy": "lookahead"}
-        law = _asked("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
+        law = _final_value("rollout.policy", {**recipe["rollout"], **sections.get("rollout", {})}["policy"], overrides)
         recipe["network"] = {**STANDARD["network"], "penalty": law == "lookahead"}
-    if recipe["rollout"]["policy"] == "lookahead" or _names(("policy",), "rollout", content, overrides):
+    if recipe["rollout"]["policy"] == "lookahead" or _sets_any(("policy",), "rollout", content, overrides):
         recipe["rollout"] = {**recipe["rollout"], "choose_policy": False}
     program, gradient = (
-        _asked(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
+        _final_value(f"{part}.{key}", {**STANDARD[part], **sections.get(part, {})}[key], overrides)
         for part, key in (("program", "name"), ("rollout", "gradient"))
     )
     if program == "value" and not constrained and not limited:
         recipe["training"] = {**STANDARD["training"], "optimizer": "muon"}
-    if program == "region" or _names(("iterations",), "training", content, overrides):
-        # its loss may stay where it is for long, and then fall; a number of steps that somebody asks for is taken
+    if program == "region" or _sets_any(("iterations",), "training", content, overrides):
+        # no early stopping: the region loss may stay constant for long before it falls, or the user chose iterations
         recipe["training"] = {**recipe["training"], "least_gain": 0.0}
     if program in ("value", "region") and gradient == "discrete" and limited:
         recipe["rollout"] = {**recipe["rollout"], "costate_limit": COSTATE_LIMIT}
@@ -63,13 +63,13 @@ def completed(
     return {**content, **standard, "program": {**weights(program), **standard["program"]}}
 
 
-def _asked(key: str, given: Any, overrides: Sequence[str]) -> str:
-    """What the command line says last of a key, and else what is given."""
+def _final_value(key: str, given: Any, overrides: Sequence[str]) -> str:
+    """The last value of a key on the command line, else the given one."""
     return str([given, *(each.partition("=")[2] for each in overrides if each.startswith(f"{key}="))][-1])
 
 
-def _names(keys: Sequence[str], section: str, content: Mapping[str, Any], overrides: Sequence[str]) -> bool:
-    """Whether a file or the command line gives a section one of some keys."""
+def _sets_any(keys: Sequence[str], section: str, content: Mapping[str, Any], overrides: Sequence[str]) -> bool:
+    """Whether the file or the command line sets one of some keys of a section."""
     written = content.get(section) or {}
     if any(written.get(key) not in (None, {}, [], LISTED) for key in keys):
         return True

@@ -1,4 +1,4 @@
-"""The generic half of a config: dataclasses with one sentence a field, read from YAML, with clear refusals."""
+"""Generic tools for configs: dataclasses with a sentence for each field, read from YAML, with helpful errors."""
 
 import dataclasses
 import difflib
@@ -20,11 +20,11 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from lyapnet.base.errors import UsageError, did_you_mean, one_line
 from lyapnet.base.files import LARGEST_TEXT, read_file
 
-_NUMBER = re.compile(r"\s*[-+]?[\d._]+(e[-+]?\d+)?\s*|.*\$\{.*", re.I)  # in quotes; or an interpolation
+_NUMBER = re.compile(r"\s*[-+]?[\d._]+(e[-+]?\d+)?\s*|.*\$\{.*", re.I)  # a number in quotes, or an interpolation
 
 
 class Names(Sequence[str]):
-    """The names of a registry of lyapnet, which is loaded, with torch, when they are first asked for."""
+    """The names in a registry of lyapnet, which is loaded on first use, because it loads torch."""
 
     def __init__(self, home: str, registry: str):
         self._home, self._registry = home, registry
@@ -52,8 +52,13 @@ def option(
     at_least: float | None = None,
     below: float | None = None,
 ) -> Any:
-    """A field with its sentence and the values it admits; `user_class` also admits module:Class, `folder` only what
-    does not leave the folder that it is in, and `mapping` a mapping in the place of a list."""
+    """A dataclass field with a description and its admissible values.
+
+    Args:
+        user_class: whether module:Class is admissible too.
+        folder: whether the value must be a relative path that stays in its folder.
+        mapping: whether a mapping is admissible instead of a list.
+    """
     bounds = {">": above, "≥": at_least, "<": below}
     rule = {"doc": doc, "choices": choices, "user_class": user_class, "folder": folder, "bounds": bounds}
     rule["mapping"] = mapping
@@ -63,7 +68,7 @@ def option(
 
 
 def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
-    """The content of a YAML file that has some keys of a schema.
+    """Read a YAML file that has some keys of a schema.
 
     Raises:
         UsageError: no such file, not YAML, or none of the keys.
@@ -87,7 +92,7 @@ def read_yaml(path: str | Path, schema: type) -> dict[str, Any]:
 
 
 def _yaml_reason(error: Exception) -> str:
-    """What is wrong with a text that is no YAML, and its line, once."""
+    """Describe why a text is no valid YAML, with its line."""
     if not isinstance(error, yaml.MarkedYAMLError) or error.problem is None or error.problem_mark is None:
         return one_line(error)
     mark, context = error.problem_mark, f" {error.context}" if error.context else ""
@@ -98,7 +103,7 @@ Schema = TypeVar("Schema")
 
 
 def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequence[str] = ()) -> Schema:
-    """An object of a schema from plain nested dictionaries with overrides: its keys and types, not its values.
+    """Build an object of a schema from nested dictionaries and overrides; checks keys and types, but not values.
 
     Raises:
         UsageError: an unknown key, a missing one, or a wrong type.
@@ -111,17 +116,17 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
         for layer in (OmegaConf.create(dict(content)), OmegaConf.from_dotlist(list(overrides))):
             given: Any = OmegaConf.to_container(layer, resolve=False)
             _refuse_unknown_keys(given, schema, "")
-            layers.append(_with_numbers_as_lists(given, schema))
+            layers.append(_numbers_to_lists(given, schema))
             for f in dataclasses.fields(schema):  # pyright: ignore
                 if f.metadata.get("folder") and re.search(r"\$\{[^}]*:", str(given.get(f.name, ""))):
                     raise UsageError(f"Expected {f.name} without ${{…:…}}, got {given[f.name]!r}; write the name out.")
         written, given = layers
-        layers = [_without_other_kinds(written, given, schema), given]
+        layers = [_drop_other_kinds(written, given, schema), given]
         merged = OmegaConf.merge(_defaults(schema), *(OmegaConf.create(layer) for layer in layers))
         config = OmegaConf.to_object(merged)
     except OmegaConfBaseException as error:
         raise UsageError(_explain(error, schema)) from error
-    except TypeError as error:  # a section's field changed from a list to a mapping, or back
+    except TypeError as error:  # an override changes a list to a mapping, or vice versa
         raise UsageError(
             f"Expected values of the same kind in file and command, got {' '.join(overrides)!r}."
         ) from error
@@ -133,12 +138,12 @@ def checked(schema: type[Schema], content: Mapping[str, Any], overrides: Sequenc
 
 @cache
 def _defaults(schema: type) -> Any:
-    """The fields of a schema with their types and defaults, which what is merged into is a copy of."""
+    """The fields of a schema with types and defaults, cached; merging copies them."""
     return OmegaConf.structured(schema)
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Full name ↦ both values, where two nested dictionaries differ; None for one that is missing."""
+    """Full name ↦ both values of the entries in which two nested dictionaries differ; None if one is missing."""
     a, b = dict(_leaves(one)), dict(_leaves(other))
     return {key: (a.get(key), b.get(key)) for key in dict.fromkeys([*a, *b]) if a.get(key) != b.get(key)}
 
@@ -168,16 +173,16 @@ def _refuse_unknown_keys(content: Any, schema: Any, prefix: str) -> None:
         collection = str(section).partition("[")[0]
         if isinstance(value, {"list": Mapping, "dict": list}.get(collection, ())):
             raise UsageError(f"Expected {prefix}{key} as {section}, got {value!r}; correct its value.")
-        for entry in get_args(section)[1:]:  # of dict[str, section]
+        for entry in get_args(section)[1:]:  # the section in dict[str, section]
             for name, one in value.items() if dataclasses.is_dataclass(entry) and isinstance(value, Mapping) else ():
                 _refuse_unknown_keys(one, entry, f"{prefix}{key}.{name}.")
 
 
-def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str = "") -> dict[str, Any]:
-    """The content with [0.1] for 0.1 in the place of a list of floats, which has one for each state, or one for all.
+def _numbers_to_lists(content: Mapping[str, Any], schema: type, prefix: str = "") -> dict[str, Any]:
+    """Replace a single number by a list of one, where a list of floats is expected.
 
     Raises:
-        UsageError: what stands in the place of a list is neither.
+        UsageError: the value is neither a list nor a number.
     """
     found = dict(content)
     for f in dataclasses.fields(schema):  # pyright: ignore
@@ -185,7 +190,7 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
         of_floats = annotation.startswith("list[float]")
         if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
             if isinstance(value, Mapping):
-                found[f.name] = _with_numbers_as_lists(value, f.type, f"{key}.")
+                found[f.name] = _numbers_to_lists(value, f.type, f"{key}.")
         elif of_floats and type(value) in (int, float):
             found[f.name] = [value]
         elif annotation.startswith("list["):
@@ -193,23 +198,23 @@ def _with_numbers_as_lists(content: Mapping[str, Any], schema: type, prefix: str
                 key, value, "a number or a list of numbers" if of_floats else "a list", f.metadata.get("doc", "")
             )
             if annotation in ("list[float]", "list[float] | None") and isinstance(value, list):
-                _refuse_all_but_numbers(key, dict(enumerate(value)), f.metadata.get("doc", ""))
+                _require_numbers(key, dict(enumerate(value)), f.metadata.get("doc", ""))
         elif annotation == "dict[str, float]":
-            _refuse_all_but_numbers(key, value, f.metadata.get("doc", ""))
+            _require_numbers(key, value, f.metadata.get("doc", ""))
         elif annotation.startswith("dict[str, list[") and isinstance(value, Mapping):
             for name, entry in value.items():
                 _refuse_scalar(f"{key}.{name}", entry, "a list", f.metadata.get("doc", ""))
     return found
 
 
-def _without_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
-    """The content without what becomes a mapping later, and mappings that become lists, in fields that take both."""
+def _drop_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], schema: type) -> dict[str, Any]:
+    """Remove values that a later layer replaces by another kind, in fields that accept both lists and mappings."""
     found = dict(content)
     for f in dataclasses.fields(schema):  # pyright: ignore
         value, other = content.get(f.name), later.get(f.name)
         if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
             if isinstance(value, Mapping) and isinstance(other, Mapping):
-                found[f.name] = _without_other_kinds(value, other, f.type)
+                found[f.name] = _drop_other_kinds(value, other, f.type)
         elif (
             f.metadata.get("mapping") and isinstance(value, Mapping) != isinstance(other, Mapping) and other is not None
         ):
@@ -217,8 +222,8 @@ def _without_other_kinds(content: Mapping[str, Any], later: Mapping[str, Any], s
     return found
 
 
-def _refuse_all_but_numbers(key: str, value: Any, doc: str) -> None:
-    """Refuse what is no mapping of names to numbers, but for what is missing or an interpolation."""
+def _require_numbers(key: str, value: Any, doc: str) -> None:
+    """Raise UsageError unless the value is a mapping of names to numbers, missing, or an interpolation."""
     if value is not None and not isinstance(value, Mapping | str):
         raise UsageError(f"Expected {key} as {{name: number}}, got {value!r}; correct it: {doc}")
     for name, entry in value.items() if isinstance(value, Mapping) else ():
@@ -227,14 +232,14 @@ def _refuse_all_but_numbers(key: str, value: Any, doc: str) -> None:
 
 
 def _refuse_scalar(key: str, value: Any, kind: str, doc: str) -> None:
-    """Refuse a number, a truth value or a text that is neither missing nor an interpolation."""
+    """Raise UsageError for a number, a Boolean, or a text that is neither missing nor an interpolation."""
     text = isinstance(value, str) and value != MISSING and "${" not in value
     if text or isinstance(value, int | float):
         raise UsageError(f"Expected {key} as {kind}, got {value!r}; correct it: {doc}")
 
 
 def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
-    """Full name and type of every field."""
+    """Full name ↦ type of every field."""
     found: dict[str, Any] = {}
     for f in dataclasses.fields(schema):
         if isinstance(f.type, type) and dataclasses.is_dataclass(f.type):
@@ -245,7 +250,7 @@ def _annotations(schema: type, prefix: str = "") -> dict[str, Any]:
 
 
 def _same_name_elsewhere(key: str, schema: type) -> list[str]:
-    """The full names of fields of that name: for a key written in the wrong section."""
+    """The full names of fields with this name, for a key in the wrong section."""
     return [name for name in _annotations(schema) if name.split(".")[-1] == key]
 
 
@@ -260,7 +265,7 @@ def _explain(error: OmegaConfBaseException, schema: type) -> str:
 
 
 def check_values(config: Any, prefix: str = "") -> None:
-    """Hold every field, and every entry of a section, against the rule it was declared with."""
+    """Check every field, and every entry of a section, by its declared rule."""
     for f in dataclasses.fields(config):
         key, value = f"{prefix}{f.name}", getattr(config, f.name)
         entries = {f"{key}.{name}": entry for name, entry in value.items()} if isinstance(value, dict) else {key: value}

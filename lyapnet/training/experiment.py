@@ -226,7 +226,7 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
         for one, run, own, member in members:
             report(f"what follows T, for seed {one.seed}")
             controller, optimum_of = load(run.best, **vars(plan.parts)), partial(report, f"optima for seed {one.seed}")
-            controller.take_code_of(member.rollout)
+            controller.share_code_of(member.rollout)
             note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
             report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
             results.append(evaluate(controller, options.test_states, one.seed, options.optimum, optimum_of))

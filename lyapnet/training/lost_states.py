@@ -7,7 +7,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import DivergenceError
 from lyapnet.base.types import PerState
-from lyapnet.loop.programs.terms import promised
+from lyapnet.loop.programs.terms import value_floored
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.cost import spread
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
@@ -48,7 +48,7 @@ class LostStates(Callback):
 
 def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
     """The excess (J_N − V(0, x₀)) / V(0, x₀) of the cost over V; without a goal, relative to the spread of J_N."""
-    return (cost - value) / (promised(value, cost) if has_goal else spread(cost))
+    return (cost - value) / (value_floored(value, cost) if has_goal else spread(cost))
 
 
 def _excess_of(learner: Learner, trajectory: Trajectory) -> PerState:

@@ -177,7 +177,7 @@ def test_further_starts_end_where_they_take_much_longer_than_the_first_minimum(m
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost
     monkeypatch.setattr(transcription, "BRIEF_ITERATIONS", (2, 150))
     assert oracle.minimise(x0, still, briefly=True).cost == first.cost, "as long as the first one took, and longer"
-    monkeypatch.setattr(transcription, "LONGER", 0)
+    monkeypatch.setattr(transcription, "BRIEF_FACTOR", 0)
     assert oracle.minimise(x0, still, briefly=True) == "IPOPT: Maximum_Iterations_Exceeded"
     assert oracle.minimise(x0, still).cost == first.cost, "where none is known, there is more time"
 

@@ -24,7 +24,7 @@ from lyapnet.task.systems import SYSTEMS, Pendulum
 from lyapnet.task.systems.base import MechanicalSystem
 from lyapnet.training import start
 from lyapnet.training.build_learner import build_learner
-from lyapnet.training.initial_networks import take
+from lyapnet.training.initial_networks import start_from
 from lyapnet.training.optima import minima
 from lyapnet.value.expansions import Expansion, Optimum, Path, riccati
 from lyapnet.value.networks import ExpansionNetwork
@@ -132,7 +132,7 @@ def started(plain):
     learner = build_learner(config, task)
     V = learner.V
     assert isinstance(V, ExpansionNetwork)
-    take(learner, riccati(task), task.initial_states.sample(64))
+    start_from(learner, riccati(task), task.initial_states.sample(64))
     torch.nn.init.normal_(V.network.output.weight)
     return task, V
 
@@ -173,7 +173,7 @@ def trained(tmp_path_factory):
         "evaluation": {"validation_states": 2, "test_states": 2, "optimum": False},
     })  # fmt: skip
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(start, "OPTIMA", 8)
+        patch.setattr(start, "MAX_OPTIMA", 8)
         shorten_fits(patch, 20, 10)
         lyapnet.train(config)
     return folder / "masses" / "version_0" / "checkpoints" / "best.ckpt"

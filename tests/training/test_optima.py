@@ -126,7 +126,7 @@ def test_a_bad_minimum_is_left_by_way_of_its_neighbours(monkeypatch, without_ora
             return found
         begun.append(x0)
         bad = optimal_trajectories(problem, x0[:1], 0 * u[:, :1], iterations=0)
-        return optima._with(found, torch.tensor([0]), bad)
+        return optima._replace_rows(found, torch.tensor([0]), bad)
 
     monkeypatch.setattr(optima, "optimal_trajectories", spoiled)
     assert_close(optima_for(problem, expansions, x0).path.cost, expected, rtol=1e-6, atol=0)

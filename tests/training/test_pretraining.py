@@ -264,7 +264,7 @@ def test_the_states_that_a_law_visits_are_examples(problem):
     for error in errors(shifted(problem, 0.0), visited, problem):
         assert float(error.detach()) < 1e-20
     assert float(errors(shifted(problem, 0.1), visited, problem)[1].detach()) > 1e-6
-    assert len(draw_examples(problem, optimum, GENERATOR).with_further(visited).t) == 3 * len(visited.t)
+    assert len(draw_examples(problem, optimum, GENERATOR).concatenated_with(visited).t) == 3 * len(visited.t)
 
 
 @pytest.mark.parametrize("free", [False, True])

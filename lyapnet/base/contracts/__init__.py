@@ -1,4 +1,4 @@
-"""The gates for what others wrote: functions of each state alone, in batches of every size, that remember nothing."""
+"""Checks of users' code: functions of each state separately, for batches of every size, without memory."""
 
 from lyapnet.base.contracts.derivatives import TO_WRITE, without_slope
 from lyapnet.base.contracts.functions import called, check_function, copied, initialised, remedy

@@ -1,4 +1,4 @@
-"""Derivatives of functions that others wrote: finite, and what differences say, beside kinks and at them too."""
+"""Checks that the derivatives of users' functions are finite and agree with finite differences, also at kinks."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -8,11 +8,11 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 
-STEP = 1e-6  # of differences, relative to the spread of an argument
-DIRECTIONS = 4  # along which derivatives are compared at each state
-LEAST = 1e-3  # spread of an argument that hardly varies, or not at all, relative to its size where that exceeds 1
-ALIKE = 1e-4  # share by which two numbers of the same slope may differ
-BESIDE = 1e-3  # how far from a kink derivatives are compared again, relative to the spread
+STEP = 1e-6  # step of finite differences, relative to the spread of an argument
+DIRECTIONS = 4  # random directions in which derivatives are compared at each state
+MIN_SPREAD = 1e-3  # smallest spread of an argument, relative to its size (at least 1)
+TOLERANCE = 1e-4  # largest relative difference of two slopes that agree
+KINK_OFFSET = 1e-3  # distance from a kink at which derivatives are compared again, relative to the spread
 TO_WRITE = (
     "write √(v² + ε²), or lyapnet.norm(v), whose slope at 0 is 0, in the place of √(v²) and |v|, and √(p + ε) in the "
     "place of √p, with a small ε"
@@ -20,37 +20,37 @@ TO_WRITE = (
 
 
 def check_derivative(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> None:
-    """Hold autograd's derivative against differences.
+    """Compare autograd's derivative with finite differences.
 
-    Where a function has a kink within a step, there is nothing to hold it against. At a kink, as max(−y, 0) has one for
-    all of X₀ where that fixes y = 0, a slope between those of the two sides is right, for each component along each
-    axis; and the derivative is held against differences a little aside too, where a wrong one cannot hide.
+    If a function has a kink within a step, differences are unreliable and not used. At a kink, such as that of
+    max(−y, 0) if X₀ fixes y = 0, any slope between those of both sides is correct, for each component along each axis;
+    the derivative is then also compared a little beside the kink.
 
     Args:
-        name: as messages say it, "Pendulum.f(x)".
+        name: name of the function in messages, such as "Pendulum.f(x)".
         arguments: batches (b, …) of float64 numbers.
 
     Raises:
-        UsageError: it is not finite, or another one; says where.
+        UsageError: the derivative is not finite, or wrong; says where.
     """
     at_kinks = _compare(name, function, arguments)
     if len(at_kinks):
         generator = torch.Generator().manual_seed(1)
         for _ in range(2):
             aside = [
-                a[at_kinks] + BESIDE * s * torch.randn(a[at_kinks].shape, generator=generator, dtype=a.dtype)
+                a[at_kinks] + KINK_OFFSET * s * torch.randn(a[at_kinks].shape, generator=generator, dtype=a.dtype)
                 for a, s in zip(arguments, _spreads(arguments), strict=True)
             ]
             _compare(name, function, aside, _spreads(arguments))
 
 
 def without_slope(function: Callable[..., Any], arguments: Sequence[Tensor]) -> tuple[int, float, int, int] | None:
-    """The first state at which a slope is not finite: its index, the slope, and by which argument and component."""
+    """The first state with a non-finite slope: its index, the slope, and the argument and component; else None."""
     return _first_not_finite(_slopes(function, arguments, torch.Generator().manual_seed(0))[1])
 
 
 def at_state(arguments: Sequence[Tensor], i: int) -> str:
-    """ "x = (1, 2)", or "(t, x) = (0.5, (1, 2))"."""
+    """Format the arguments at a state: "x = (1, 2)", or "(t, x) = (0.5, (1, 2))"."""
     shown = ["(" + ", ".join(f"{v:.6g}" for v in a[i].detach().flatten().tolist()) + ")" for a in arguments]
     return f"x = {shown[-1]}" if len(shown) == 1 else f"(t, x) = ({', '.join(shown)})"
 
@@ -65,13 +65,13 @@ def _first_not_finite(slopes: Sequence[Tensor]) -> tuple[int, float, int, int] |
 
 
 def _spreads(arguments: Sequence[Tensor]) -> list[Tensor]:
-    return [a.std(0).maximum(LEAST * a.abs().amax(0).clamp_min(1.0)) for a in arguments]
+    return [a.std(0).maximum(MIN_SPREAD * a.abs().amax(0).clamp_min(1.0)) for a in arguments]
 
 
 def _slopes(
     function: Callable[..., Any], arguments: Sequence[Tensor], generator: torch.Generator
 ) -> tuple[Tensor, Sequence[Tensor], Tensor]:
-    """Values weighted at random, autograd's slopes of their sum, and the weights."""
+    """Values with random weights, autograd's slopes of their sum, and the weights."""
     leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
     with torch.enable_grad():
         value = function(*leaves)
@@ -88,10 +88,10 @@ def _gradients(total: Tensor, leaves: Sequence[Tensor]) -> Sequence[Tensor]:
 def _compare(
     name: str, function: Callable[..., Any], arguments: Sequence[Tensor], spreads: Sequence[Tensor] | None = None
 ) -> Tensor:
-    """Refuse a wrong derivative; the indices of the states that lie on kinks, where a slope between is right.
+    """Raise UsageError for a wrong derivative; return the indices of the states at kinks.
 
     Args:
-        spreads: of the arguments, where these are states beside kinks: there nothing need be finite.
+        spreads: spreads of the arguments, if these are states beside kinks, where slopes need not be finite.
     """
     generator = torch.Generator().manual_seed(0)
     value, slopes, weight = _slopes(function, arguments, generator)
@@ -115,7 +115,7 @@ def _compare(
         parts = [(s * d).reshape(len(value), -1).sum(1) for s, d in zip(slopes, directions, strict=True)]
         slope = torch.stack(parts).sum(0)
         wide, narrow = along(directions, STEP), along(directions, STEP / 2)
-        tolerance = ALIKE * torch.maximum(wide.abs(), slope.abs()) + rounding
+        tolerance = TOLERANCE * torch.maximum(wide.abs(), slope.abs()) + rounding
         wrong = ((wide - narrow).abs() <= tolerance) & ~((slope - wide).abs() <= 3 * tolerance)
         off = torch.nonzero(wrong & ~at_kinks).flatten()
         if len(off):
@@ -144,7 +144,7 @@ def _require_finite(name: str, slopes: Sequence[Tensor], arguments: Sequence[Ten
 def _between_sides(function: Callable[..., Any], arguments: Sequence[Tensor], spreads: Sequence[Tensor]) -> Tensor:
     """Whether autograd's slopes lie between those of both sides, for each component along each axis; (b,).
 
-    Where the sides are the same, at no kink, that is to be the derivative.
+    If both sides agree, there is no kink, and autograd's slope has to equal them.
     """
     leaves = [argument.detach().clone().requires_grad_() for argument in arguments]
     with torch.enable_grad():
@@ -168,6 +168,6 @@ def _between_sides(function: Callable[..., Any], arguments: Sequence[Tensor], sp
             one, other = (ahead - here) / step, (here - behind) / step
             slope = torch.stack([of_one[k].reshape(batch, -1)[:, axis] for of_one in slopes], 1)
             largest = torch.stack([one.abs(), other.abs(), slope.abs()]).amax(0)
-            room = 3 * ALIKE * largest + 1e-13 / step * here.nan_to_num(0, 0, 0).abs().amax()
+            room = 3 * TOLERANCE * largest + 1e-13 / step * here.nan_to_num(0, 0, 0).abs().amax()
             fine &= ((slope >= torch.minimum(one, other) - room) & (slope <= torch.maximum(one, other) + room)).all(1)
     return fine

@@ -1,7 +1,7 @@
-"""The one gate for functions of states that others wrote: f, g, the cost and V are held against what is asked of them.
+"""Checks of users' functions of states: f, g, the cost and V have to fulfil their contracts.
 
-They are tried on states at random. What passes may still break its contract at a state that was not among them; a
-certificate does not rely on this gate (docs/trust.md).
+They are tested on random states, so that a contract may still be broken at other states; certificates do not rely on
+these checks (docs/trust.md).
 """
 
 import copy
@@ -15,7 +15,7 @@ from lyapnet.base.contracts.derivatives import at_state, check_derivative
 from lyapnet.base.contracts.memory import reaches_own_code
 from lyapnet.base.errors import UsageError, raised
 
-REMEDIES = {  # what an error of torch's says ↦ what to do
+REMEDIES = {  # text in an error of torch ↦ what to do
     "before Module.__init__() call": "call super().__init__() first in __init__",
     "' already exists": "give that attribute of your class another name, which no buffer of it has",
     "has no setter": "n, m, title and the like are reserved names of every system: give that attribute another one",
@@ -27,7 +27,7 @@ REMEDIES = {  # what an error of torch's says ↦ what to do
 
 
 def _advice(got: tuple[int, ...] | str, batch: int, expected: tuple[int, ...]) -> str:
-    """What to do about a result of another shape than (batch, *expected)."""
+    """Advice on a result whose shape is not (batch, *expected)."""
     if got == expected:
         return f"append .expand({', '.join(['*x.shape[:-1]', *map(str, expected)])}), which gives it to each state"
     if expected and expected[-1] == 1 and got == (batch, *expected[:-1]):
@@ -46,20 +46,20 @@ def check_function(
     differentiable: bool = True,
     any_size: bool = True,
 ) -> None:
-    """Hold a function of states against its contract.
+    """Check the contract of a function of states.
 
-    It returns finite tensors in the precision of its arguments; each state's result is of that state alone, in a
-    batch of any shape; it changes no argument; and autograd's derivative is its derivative.
+    It returns finite tensors in the precision of its arguments; the result of a state depends on that state only, in
+    batches of any shape; it does not change its arguments; and autograd computes its derivative correctly.
 
     Args:
-        name: as messages say it, "Pendulum.f(x)".
+        name: name of the function in messages, such as "Pendulum.f(x)".
         arguments: batches (b, …) of float64 numbers, b even.
-        shape: of one state's result.
-        differentiable: whether its derivative is asked for too.
-        any_size: whether it is traced for batches of every size too, where it is the user's own.
+        shape: shape of one state's result.
+        differentiable: whether the derivative is checked.
+        any_size: whether a user's function is also checked for batches of every size, by a trace.
 
     Raises:
-        UsageError: it breaks one of these; names which, and where.
+        UsageError: a condition is broken; says which one, and where.
     """
     given = [argument.detach().clone().requires_grad_() for argument in arguments]
     value = called(name, function, given)
@@ -83,16 +83,16 @@ def check_function(
             "it, or choose an X₀ that avoids this state."
         )
     if any_size and reaches_own_code(function):
-        from lyapnet.base.contracts.batch_sizes import check_batch_sizes  # loads sympy: a second
+        from lyapnet.base.contracts.batch_sizes import check_batch_sizes  # loads sympy, which takes 1 s
 
         check_batch_sizes(name, lambda *batches: (function(*batches),), arguments)
-    _check_each_for_itself(name, function, arguments, value)
+    _check_independence(name, function, arguments, value)
     if differentiable:
         check_derivative(name, lambda *batches: called(name, function, batches), arguments)
 
 
 def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:
-    """What a function of others returns; whatever it raises, sys.exit() included, as one line."""
+    """Call a user's function; converts any error, also sys.exit(), to a UsageError of one line."""
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:
@@ -103,15 +103,15 @@ def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor])
 
 
 def remedy(error: BaseException) -> str:
-    """What to do about an error of a function of others."""
+    """Advice on an error of a user's function."""
     return next((advice for words, advice in REMEDIES.items() if words in str(error)), "correct it there")
 
 
 def initialised(part: Any) -> Any:
-    """A part of a problem that is a module, or none; one whose __init__ forgot the module's is refused.
+    """Check that the __init__ of a part of a problem has called super().__init__(), and return the part.
 
     Raises:
-        UsageError: it is one.
+        UsageError: it has not.
     """
     if isinstance(part, nn.Module) and "_modules" not in vars(part):
         raise UsageError(
@@ -124,7 +124,7 @@ def copied(module: nn.Module) -> Any:
     """A float64 copy of a module on the CPU.
 
     Raises:
-        UsageError: it holds what cannot be copied.
+        UsageError: it contains something that cannot be copied.
     """
     try:
         return copy.deepcopy(module).double().cpu()
@@ -135,8 +135,8 @@ def copied(module: nn.Module) -> Any:
         ) from error
 
 
-def _check_each_for_itself(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
-    """Refuse results that depend on the other states of a batch, on its shape, or on chance."""
+def _check_independence(name: str, function: Callable[..., Any], arguments: Sequence[Tensor], value: Tensor) -> None:
+    """Raise UsageError if results depend on other states of a batch, on its shape, or on random numbers."""
     tolerance = torch.finfo(value.dtype).eps ** 0.5
     folded = called(name, function, [argument.reshape(2, -1, *argument.shape[1:]) for argument in arguments])
     first = called(name, function, [argument[:1] for argument in arguments])

@@ -1,7 +1,7 @@
-"""What code of others remembers: all that can be reached from an object, as it is before calls and after them.
+"""Detects memory in users' code: compares everything that is reachable from an object before and after calls.
 
-Buffers, attributes, containers, closures, default arguments, and the globals that its code names are followed, and
-tensors compared by value. What lies elsewhere, in C, in files, in the time or the environment, is not seen.
+It follows buffers, attributes, containers, closures, default arguments and the globals that code uses, and compares
+tensors by value. State in C code, files, the time or the environment is not detected.
 """
 
 import functools
@@ -21,27 +21,27 @@ from torch import Tensor, nn
 
 from lyapnet.base.errors import UsageError, is_own_file
 
-MOST = 200_000  # objects that are looked at
+MAX_OBJECTS = 200_000  # largest number of visited objects
 PLAIN = (
     bool, int, float, complex, str, bytes, bytearray, range, slice, Enum, type(None), type(...), torch.dtype,
     torch.device, torch.Size, np.generic, np.dtype,
 )  # fmt: skip
 CONTAINERS = (Mapping, list, tuple, set, frozenset, deque)
-CACHED = " in the cache of "  # in the name of what a functools.cache holds: it may come and go
+CACHE_MARK = " in the cache of "  # part of the names of entries of a functools.cache, which may appear and disappear
 
 
 def check_memory(parts: Mapping[str, Any], first: Callable[[], Any], second: Callable[[], Any]) -> "Memory":
-    """Refuse objects that calls change, but for what the first ones fill in and later ones leave as it is.
+    """Check that calls do not change objects; lazy initialisation in the first calls is allowed.
 
     Args:
-        parts: what messages call them ↦ the objects.
-        first, second: calls of all that they do, on different states.
+        parts: name in messages ↦ object.
+        first, second: functions that call all methods of the objects, on different states.
 
     Returns:
-        What they hold, to be held against it again later.
+        The memory of the objects, for later checks.
 
     Raises:
-        UsageError: a call changes one; names the attribute.
+        UsageError: a call changes an object; names the attribute.
     """
     first()
     first()
@@ -53,20 +53,20 @@ def check_memory(parts: Mapping[str, Any], first: Callable[[], Any], second: Cal
 
 
 class Memory:
-    """All that is reachable from some objects, as it is now.
+    """A snapshot of everything that is reachable from some objects.
 
     Args:
-        parts: what messages call them ↦ the objects.
+        parts: name in messages ↦ object.
     """
 
     def __init__(self, parts: Mapping[str, Any]):
         self.parts, self.before = dict(parts), state_of(parts)
 
     def check(self) -> None:
-        """Refuse objects that have changed since.
+        """Check that the objects have not changed since the snapshot.
 
         Raises:
-            UsageError: one has; names the attribute.
+            UsageError: an object has changed; names the attribute.
         """
         if changed := differences(self.before, state_of(self.parts)):
             raise UsageError(
@@ -77,40 +77,40 @@ class Memory:
 
 
 def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """The names under which two states differ, the plainest first; what a cache holds may come and go."""
+    """The names of entries in which two snapshots differ, shortest first; new or lost cache entries do not count."""
     both = [name for name in one if name in other and one[name] != other[name]]
-    found = both + [name for name in one.keys() ^ other.keys() if CACHED not in name]
+    found = both + [name for name in one.keys() ^ other.keys() if CACHE_MARK not in name]
     return sorted(found, key=lambda name: (name not in one, len(name), name))
 
 
 def state_of(parts: Mapping[str, Any]) -> dict[str, Any]:
-    """Name ↦ value of every plain thing that is reachable; of tensors and arrays, a digest."""
+    """Name ↦ value of every reachable plain object, or a digest for tensors and arrays."""
     found: dict[str, Any] = {"the state of torch's random numbers": _digest(torch.get_rng_state().numpy())}
     for name, value in _reachable(parts):
         if isinstance(value, PLAIN):
             found[name] = value if isinstance(value, str | bytes) else (type(value).__name__, repr(value))
         elif isinstance(value, Tensor):
-            found[name] = _of_tensor(value)
+            found[name] = _summarise_tensor(value)
         elif isinstance(value, np.ndarray) and value.dtype != object:
             found[name] = value.shape, str(value.dtype), _digest(value)
     return found
 
 
 def reaches_own_code(thing: Any) -> bool:
-    """Whether an object, or anything that it holds, is a function or an object of a class of the user's own."""
+    """Whether a user's function or class is reachable from an object."""
     kinds = types.FunctionType, type
     return any(isinstance(each, kinds) and _is_own(each) for _, each in _reachable({"": thing}))
 
 
 def _reachable(parts: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """What is reachable from some objects, with its name; each object once."""
+    """(name, object) for everything reachable from some objects, each object once."""
     seen, waiting = dict[int, Any](), [*parts.items()]
-    while waiting and len(seen) < MOST:
+    while waiting and len(seen) < MAX_OBJECTS:
         name, value = waiting.pop()
         if isinstance(value, (*PLAIN, Tensor)) or (isinstance(value, np.ndarray) and value.dtype != object):
             yield name, value
         elif id(value) not in seen:
-            seen[id(value)] = value  # held, so that no other object takes its id
+            seen[id(value)] = value  # kept alive, so that its id is not reused
             yield name, value
             waiting += _parts_of(name, value)
 
@@ -119,25 +119,25 @@ def _digest(array: np.ndarray) -> bytes:
     return hashlib.blake2b(np.ascontiguousarray(array).tobytes()).digest()
 
 
-def _of_tensor(value: Tensor) -> Any:
+def _summarise_tensor(value: Tensor) -> Any:
     kind = type(value).__name__ if type(value) not in (Tensor, nn.Parameter, nn.Buffer) else ""
     facts = kind, tuple(value.shape), str(value.dtype), str(value.device)
     try:
         with torch.no_grad():
             flat = torch.Tensor.detach(value).cpu().reshape(-1).contiguous()
             return *facts, _digest(flat.view(torch.uint8).numpy() if flat.numel() else np.zeros(0))
-    except Exception:  # one without values, or of a kind that NumPy has not
+    except Exception:  # a tensor without values, or of a dtype that NumPy lacks
         return facts
 
 
 def _parts_of(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """What an object holds, by name."""
+    """(name, part) for the direct parts of an object."""
     if isinstance(value, types.ModuleType):
         return
     if isinstance(value, type):
         if _is_own(value):
             for key, each in vars(value).items():
-                yield from [(f"{value.__qualname__}.{key}", each)] * (key not in OF_CLASSES)
+                yield from [(f"{value.__qualname__}.{key}", each)] * (key not in SKIPPED_CLASS_ATTRIBUTES)
         return
     if isinstance(value, CONTAINERS):
         yield f"the number of entries of {name}", len(value)
@@ -160,7 +160,7 @@ def _parts_of(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from ((name, each) for each in (value.fget, value.fset))
     elif isinstance(value, functools._lru_cache_wrapper):
         yield name, value.__wrapped__
-        yield from ((f"what is{CACHED}{name}: {key}", each) for key, each in _cached(value))
+        yield from ((f"what is{CACHE_MARK}{name}: {key}", each) for key, each in _cached(value))
     elif isinstance(value, types.BuiltinMethodType):
         yield name, value.__self__
     elif isinstance(value, types.GeneratorType):
@@ -174,11 +174,19 @@ def _parts_of(name: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from _parts_of_object(name, value)
 
 
-OF_CLASSES = ("__dict__", "__weakref__", "__doc__", "__module__", "__abstractmethods__", "_abc_impl", "__annotations__")
+SKIPPED_CLASS_ATTRIBUTES = (
+    "__dict__",
+    "__weakref__",
+    "__doc__",
+    "__module__",
+    "__abstractmethods__",
+    "_abc_impl",
+    "__annotations__",
+)
 
 
 def _parts_of_object(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """The attributes of an object, and of its class where that is the user's own; else what it would be pickled as."""
+    """The attributes of an object, and its class if that is the user's; for other objects their pickled state."""
     attributes = getattr(value, "__dict__", None)
     slots = [slot for cls in type(value).__mro__ for slot in _as_tuple(vars(cls).get("__slots__", ()))]
     for key, each in list((attributes or {}).items()):
@@ -191,7 +199,7 @@ def _parts_of_object(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     if attributes is None and not slots and not callable(value) and not isinstance(value, CONTAINERS):
         try:
             yield name, [each for each in value.__reduce_ex__(2) if not callable(each)]
-        except Exception:  # what has no such form is not seen
+        except Exception:  # an object that cannot be pickled is skipped
             return
 
 
@@ -200,7 +208,7 @@ def _as_tuple(slots: Any) -> tuple[str, ...]:
 
 
 def _parts_of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]]:
-    """The attributes, default arguments, closure and globals of a function; what one of a library wraps."""
+    """The attributes, defaults, closure and globals of a user's function; for a library's, the functions it wraps."""
     name, cells = function.__qualname__.replace(".<locals>", ""), dict[str, Any]()
     for key, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=False):
         try:
@@ -230,7 +238,7 @@ def _parts_of_function(function: types.FunctionType) -> Iterator[tuple[str, Any]
 
 
 def _names_in(code: types.CodeType) -> Iterator[str]:
-    """The names of globals and attributes in a function, and in those that are written in it."""
+    """The names of globals and attributes in a function's code, including nested functions."""
     yield from code.co_names
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -238,7 +246,7 @@ def _names_in(code: types.CodeType) -> Iterator[str]:
 
 
 def _cached(wrapper: Any) -> Iterator[tuple[str, Any]]:
-    """(key, result) of what a functools.cache holds; what a bounded one holds is not seen."""
+    """(key, result) for the entries of a functools.cache; those of a bounded cache are not visible."""
     for held in gc.get_referents(wrapper):
         if isinstance(held, dict):
             for key, each in held.items():
@@ -255,4 +263,4 @@ def _is_own(thing: Any) -> bool:
 
 def _file_of(module: types.ModuleType) -> str:
     known = getattr(module, "__file__", None)
-    return known or ("" if module.__name__ == "__main__" else "<frozen")  # one without a file is built in
+    return known or ("" if module.__name__ == "__main__" else "<frozen")  # a module without a file is built in

@@ -1,4 +1,4 @@
-"""From a config to the objects it names."""
+"""Builds the objects of a config."""
 
 from lyapnet.experiment.assembly.classes import DTYPES, REGISTRIES, Parts, default_of, own_parts, resolve
 from lyapnet.experiment.assembly.entries import entry_per_state

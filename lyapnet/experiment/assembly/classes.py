@@ -1,4 +1,4 @@
-"""The classes that a config names: registered ones, and the user's own."""
+"""The classes named in a config: registered ones, and the user's own."""
 
 import importlib
 import inspect
@@ -27,7 +27,7 @@ DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 @dataclass(frozen=True)
 class Parts:
-    """The user's own parts, taken in the place of those that a config names; None: the config's."""
+    """The user's objects, which replace those named in a config; None: as in the config."""
 
     system: ControlAffineSystem | None = None
     cost: Cost | None = None
@@ -37,7 +37,7 @@ class Parts:
     program: Program | None = None
 
 
-# section of a config ↦ (what is registered, what a class of the user's own derives from)
+# section of a config ↦ (registered classes, base class of users' classes)
 REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
     "system": (SYSTEMS, ControlAffineSystem),
     "cost": (COSTS, Cost),
@@ -49,12 +49,12 @@ REGISTRIES: dict[str, tuple[Mapping[str, type], type]] = {
 
 
 def own_parts(config: Config) -> dict[str, str]:
-    """The sections whose class is the user's own, with the name of the class."""
+    """Section ↦ name of the class, for the user's own classes."""
     return {part: name for part, (known, _) in REGISTRIES.items() if (name := getattr(config, part).name) not in known}
 
 
 def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> Any:
-    """A registered class, or the user's own from module:Class, found from the working directory.
+    """A registered class, or the user's own from module:Class, with the working directory on the import path.
 
     Raises:
         UsageError: no such module or class, or not a subclass of `base`.
@@ -71,7 +71,7 @@ def resolve(name: str, registry: Mapping[str, type], key: str, base: type) -> An
     try:
         module = importlib.import_module(module_name)
         cls = getattr(module, class_name, None)
-    except (Exception, SystemExit) as error:  # of any kind: the module is the user's
+    except (Exception, SystemExit) as error:  # the module is the user's
         raise UsageError(
             f"Expected {key} as module:Class, got {name!r} ({raised(error)}); correct the name, or the module."
         ) from error
@@ -99,7 +99,7 @@ def instance_of(options: Any, part: str) -> Any:
 
 
 def check_parameters(cls: type, name: str, parameters: Mapping[str, Any], part: str) -> None:
-    """Hold the names under a section's parameters against the constructor's arguments."""
+    """Check the names of a section's parameters against the constructor's arguments."""
     arguments = inspect.signature(cls).parameters.values()
     named = [a for a in arguments if a.kind in (a.POSITIONAL_OR_KEYWORD, a.KEYWORD_ONLY)]
     names = [a.name for a in named]
@@ -117,22 +117,22 @@ def check_parameters(cls: type, name: str, parameters: Mapping[str, Any], part: 
 
 @contextmanager
 def section(name: str):
-    """Name the config's section in what a constructor refuses, or what goes wrong in one of the user's own."""
+    """Convert errors of constructors to UsageErrors that name the config's section."""
     try:
         yield
     except LyapnetError:
         raise
     except (Exception, SystemExit) as error:
-        if str(error).startswith("Expected "):  # lyapnet's own words
+        if str(error).startswith("Expected "):  # raised by lyapnet
             raise UsageError(f"{name}: {error}") from error
         raise UsageError(f"Expected {name} that can be built, got {raised(error)}; {remedy(error)}.") from error
 
 
 @contextmanager
 def default_dtype(dtype: torch.dtype):
-    """Have tensors of floats be of this type where nothing else is said, as in torch.tensor([[0.0], [1 / L]]).
+    """Set torch's default dtype, which is used, for example, by torch.tensor([[0.0], [1 / L]]) in a user's f.
 
-    One type for all that a command computes: 1/L in float32 is another number, by 5e-8 of it, than the build has used.
+    A command uses one dtype throughout: 1/L in float32 differs by 5e-8 from the value used when building in float64.
     """
     previous = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
@@ -143,10 +143,10 @@ def default_dtype(dtype: torch.dtype):
 
 
 def float64_defaults():
-    """Build in float64 whatever the precision, so that float32 runs start from the rounded float64 weights."""
+    """Build in float64 for every precision, so that float32 runs start from the rounded float64 weights."""
     return default_dtype(torch.float64)
 
 
 def default_of(config: Config):
-    """The type of a config's precision as the default, for training and measuring."""
+    """Set the dtype of a config's precision as default, for training and evaluation."""
     return default_dtype(DTYPES[config.training.precision])

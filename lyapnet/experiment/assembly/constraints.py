@@ -1,4 +1,4 @@
-"""From a config to its state constraints."""
+"""Builds the state constraints of a config."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,15 +16,16 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.derivatives import jacobian
 
-NEAR, FAR = 0.002, 0.02  # where u acts on h at once, and where it acts by way of other states
-STATES, ROUNDING = 64, 1e-9  # tried; share of |h_x| |g| up to which h_x g is taken for zero
+SMALL_MARGIN = 0.002  # margin of h if u acts on h directly (relative degree one)
+LARGE_MARGIN = 0.02  # margin of h if u acts on h through other states
+TEST_STATES, ROUNDING = 64, 1e-9  # random states; largest |h_x g| relative to |h_x| |g| that counts as zero
 
 
 def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constraints | None) -> Constraints | None:
-    """The constraints of a config in a problem that has none yet, those that it lists first; None for none at all.
+    """The constraints of a config for a problem without constraints, listed ones first; None if there are none.
 
     Args:
-        own: the user's, in the place of those that the config names.
+        own: the user's constraints, which replace the class that the config names.
 
     Raises:
         UsageError: an entry does not fit the system.
@@ -40,20 +41,20 @@ def build_constraints(config: ConstraintsConfig, problem: Problem, own: Constrai
         if not parts:
             return None
         constraints = parts[0] if len(parts) == 1 else AllOf(parts)
-        constraints.margin = FAR if config.margin is None else config.margin
+        constraints.margin = LARGE_MARGIN if config.margin is None else config.margin
         return constraints
 
 
 @torch.no_grad()
 def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
-    """Of each h_j, NEAR where its relative degree is one, that is where h_x g ≠ 0 at most states; else FAR.
+    """The margin of each h_j: SMALL_MARGIN if its relative degree is one (h_x g ≠ 0 at most states), else LARGE_MARGIN.
 
-    Where u acts on h_j at once, one step is enough to keep off, and a margin that is small costs less. Where u acts on
-    it by way of other states, as on a position by a force, the law has to see the constraint coming.
+    If u acts directly on h_j, one step is sufficient to avoid a violation, and a small margin costs less. If u acts
+    through other states, as a force on a position, the law has to react earlier.
     """
     box, draws = problem.initial_states, torch.Generator().manual_seed(0)
-    x = box.sample(STATES, draws)
-    # states that X₀ fixes are moved, as h may have no slope there
+    x = box.sample(TEST_STATES, draws)
+    # components that X₀ fixes are varied too, because h may have no slope there
     x = x + 0.1 * size_of(box) * (box.lower == box.upper) * torch.randn(x.shape, generator=draws, dtype=x.dtype)
     with torch.enable_grad():
         x.requires_grad_()
@@ -61,13 +62,13 @@ def choose_margins(problem: Problem, constraints: Constraints) -> list[float]:
     g = problem.system.g(x)
     moved, most = (slopes @ g).abs().amax(-1), (slopes.abs() @ g.abs()).amax(-1)
     at_once = (moved > ROUNDING * most).double().mean(0) > 0.5
-    return [NEAR if each else FAR for each in at_once.tolist()]
+    return [SMALL_MARGIN if each else LARGE_MARGIN for each in at_once.tolist()]
 
 
 def _limits(config: ConstraintsConfig, problem: Problem) -> list[StateLimits]:
-    """The limits of states as one part, if there are some; what counts as 1 is how far they are from the goal.
+    """The limits of states as one part, or an empty list. The unit of each limit is its distance from the goal.
 
-    For a limit that the goal is at, and in a task without a goal, it is how far X₀ reaches from the limit.
+    For a limit at the goal, and in a task without a goal, the unit is the distance of X₀'s far end from the limit.
     """
     system, goal, box, columns = problem.system, problem.goal, problem.initial_states, []
     for key, side, given in (("lower", -1.0, config.lower), ("upper", 1.0, config.upper)):
@@ -94,10 +95,10 @@ def _balls(config: ConstraintsConfig, system: ControlAffineSystem) -> list[Const
 def ball_of(
     given: Mapping[str, Any], key: str, keys: set[str], system: ControlAffineSystem
 ) -> tuple[dict[str, float], float]:
-    """The centre, by names of states, and the radius of an entry that has these keys, all of whose others are numbers.
+    """The centre, by names of states, and the radius of an entry with given keys.
 
     Raises:
-        UsageError: it is another one; says how it should be.
+        UsageError: the entry has other keys or values; says what is expected.
     """
     center = given.get("center")
     numbers = [*center.values()] if isinstance(center, Mapping) else []

@@ -1,4 +1,4 @@
-"""From a config to the domain of its problem: the borders that are declared, and those that are found."""
+"""Builds the domain of a problem from declared borders and those found by a search."""
 
 import math
 
@@ -11,12 +11,12 @@ from lyapnet.task.problem import Problem
 
 
 def in_domain(config: DomainConfig, problem: Problem) -> Problem:
-    """The problem within its domain; itself where it has none, or is in one already.
+    """The problem restricted to its domain; the problem itself if it needs none or has one already.
 
     Raises:
-        UsageError: a border is of no state, no finite number, or X₀ reaches it.
+        UsageError: a border names no state, is not finite, or touches X₀.
     """
-    if problem.domain is not None:  # made by hand
+    if problem.domain is not None:  # set by the user
         return problem
     with section("domain"):
         declared = [border for side in ("lower", "upper") for border in _declared(side, config, problem)]
@@ -24,7 +24,7 @@ def in_domain(config: DomainConfig, problem: Problem) -> Problem:
 
 
 def _declared(side: str, config: DomainConfig, problem: Problem) -> list[Border]:
-    """The borders of one side that a config has, each with X₀ strictly within."""
+    """The declared borders of one side; X₀ has to be strictly inside."""
     box, borders = problem.initial_states, list[Border]()
     for name, value in getattr(config, side).items():
         i = index_of(name, f"domain.{side}", problem.system)

@@ -1,4 +1,4 @@
-"""The lists of a config: a number for each state or control, or one for all."""
+"""Lists in a config: one number for each state or control, or one for all."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from lyapnet.task.systems import ControlAffineSystem
 
 
 def rows(name: str, matrix: Any) -> Any:
-    """A flat list of numbers as the diagonal matrix it stands for."""
+    """Convert a flat list of numbers to a diagonal matrix; rows remain unchanged."""
     if not isinstance(matrix, list | tuple):
         raise ValueError(f"Expected {name} as a number, the diagonal's numbers or a list of rows, got {matrix!r}.")
     if all(type(entry) in (int, float) for entry in matrix):
@@ -19,10 +19,10 @@ def rows(name: str, matrix: Any) -> Any:
 
 
 def entry_per_state(key: str, entries: list[float] | None, system: ControlAffineSystem) -> list[float] | None:
-    """A list with an entry for each state, or with one number for all; None where there is none.
+    """A list with one entry for each state, from such a list or a single number; None if there is none.
 
     Raises:
-        UsageError: another length; names the key.
+        UsageError: the length is wrong; names the key.
     """
     every = repeated(entries, system.n)
     if every is not None:
@@ -31,24 +31,24 @@ def entry_per_state(key: str, entries: list[float] | None, system: ControlAffine
 
 
 def repeated(entries: Any, n: int) -> Any:
-    """A number, or a list of one, as the number of every state; anything else as it is."""
+    """Repeat a number, or a list of one number, n times; anything else remains unchanged."""
     listed = [entries] if type(entries) in (int, float) else entries
     alone = isinstance(listed, list | tuple) and len(listed) == 1 and isinstance(listed[0], int | float)
     return [*listed] * n if alone else entries
 
 
 def require_length(key: str, length: int, names: Sequence[str]) -> None:
-    """Refuse a list that has another number of entries than there are states, or controls, of these names."""
+    """Raise UsageError unless a list has one entry for each of some states or controls."""
     if length != len(names):
         entries = "one entry" if len(names) == 1 else f"{len(names)} entries"
         raise UsageError(f"Expected {key} with {entries} ({', '.join(names)}), got {length}; give one for each.")
 
 
 def index_of(name: str, key: str, system: ControlAffineSystem) -> int:
-    """The index of a state by its name.
+    """The index of the state with a name.
 
     Raises:
-        UsageError: there is none of that name; names the key.
+        UsageError: there is no such state; names the key.
     """
     if name not in system.state_names:
         names = ", ".join(system.state_names)

@@ -1,4 +1,4 @@
-"""From a config with a family to the system, the cost and the initial states of all its members."""
+"""Builds the system, cost and initial states of a family from a config."""
 
 import copy
 import dataclasses
@@ -20,28 +20,28 @@ from lyapnet.task.operating_points import HELD
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
-TAKEN = ("t", "x", "x0", "steps")  # what a controller takes beside them
-TRIED = 8  # states at which members are held against systems built with their parameters
+RESERVED_NAMES = ("t", "x", "x0", "steps")  # other arguments of a controller's methods
+TEST_STATES = 8  # random (x, p) at which members are compared with newly constructed systems
 
 
 def family_of(
     config: Config, system: ControlAffineSystem, cost: Cost, controls: ControlSet, initial_states: Box
 ) -> tuple[FamilySystem, FamilyCost, Box]:
-    """The parts of a family in z = (x, p), X₀ × P among them.
+    """The system, the cost and the box X₀ × P of a family in z = (x, p).
 
     Raises:
-        UsageError: a name that is neither a parameter of the system nor target_STATE; a range that is none; or a
-            member that breaks the contract of FamilySystem, or a target that asks for another control than the others.
+        UsageError: a name is neither a parameter of the system nor target_STATE, a range is invalid, a member breaks
+            the contract of FamilySystem, or targets are held by different controls.
     """
     if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
-    ranges = _ranges(config.family)
-    targets = _targets(ranges, system)
+    ranges = _checked_ranges(config.family)
+    targets = _target_indices(ranges, system)
     low, high = (torch.tensor([r[side] for r in ranges.values()], dtype=torch.float64) for side in (0, 1))
     units = [system.state_units[targets[name]] if name in targets else "" for name in ranges]
     family = FamilySystem(system, list(ranges), units)
     box = Box(torch.cat([initial_states.lower, low]), torch.cat([initial_states.upper, high]))
-    _check(config, family, box)
+    _check_members(config, family, box)
     center = (low + high) / 2
     shift = torch.zeros(system.n, len(ranges), dtype=torch.float64)
     for k, name in enumerate(ranges):
@@ -58,10 +58,10 @@ def family_of(
 def member(
     config: Config, parts: Parts, family: FamilySystem, parameters: Mapping[str, Any]
 ) -> tuple[Config, Parts, list[float]]:
-    """The config of one member of a family, the user's own parts for it, and its p in the order of the family.
+    """The config of a family's member, the user's parts for it, and its p in the order of the family.
 
     Raises:
-        UsageError: a parameter is missing, unknown, no number, or outside the range that V was told.
+        UsageError: a parameter is missing, unknown, no number, or outside the range that V was trained for.
     """
     if parameters.keys() != config.family.keys():
         names = ", ".join(parameters) or "none"
@@ -80,34 +80,36 @@ def member(
 
 
 def _config_of(config: Config, parameters: Mapping[str, float], system: ControlAffineSystem) -> Config:
-    """The config of one member of a family."""
+    """The config of a family's member."""
     given = {name: value for name, value in parameters.items() if not name.startswith(PREFIX)}
     own = dataclasses.replace(config.system, parameters={**config.system.parameters, **given})
     target = None if config.target is None else written_target(config, system).tolist()
-    for name, i in _targets(parameters, system).items():
+    for name, i in _target_indices(parameters, system).items():
         target = [0.0] * system.n if target is None else target
         target[i] = parameters[name]
     return dataclasses.replace(copy.deepcopy(config), system=own, target=target, family={})
 
 
 def knows(config: Config, name: str, value: float) -> bool:
-    """Whether a value lies in the range of a family's parameter, but for rounding."""
+    """Whether a value is in the range of a family's parameter, up to rounding."""
     least, greatest = config.family[name]
     room = 1e-9 * max(abs(least), abs(greatest))
     return least - room <= value <= greatest + room
 
 
-def _ranges(family: Mapping[str, list[float]]) -> dict[str, list[float]]:
+def _checked_ranges(family: Mapping[str, list[float]]) -> dict[str, list[float]]:
     for name, bounds in family.items():
-        if name in TAKEN:
-            raise UsageError(f"Expected parameters of a family other than {', '.join(TAKEN)}, got {name}; rename it.")
+        if name in RESERVED_NAMES:
+            raise UsageError(
+                f"Expected parameters of a family other than {', '.join(RESERVED_NAMES)}, got {name}; rename it."
+            )
         if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
             raise UsageError(f"Expected family.{name} as [least, greatest], got {bounds}; give two finite numbers.")
     return dict(family)
 
 
-def _targets(names: Mapping[str, object], system: ControlAffineSystem) -> dict[str, int]:
-    """The names target_STATE with the index of their state."""
+def _target_indices(names: Mapping[str, object], system: ControlAffineSystem) -> dict[str, int]:
+    """Name target_STATE ↦ index of the state."""
     known = {PREFIX + name.replace(" ", "_"): i for i, name in enumerate(system.state_names)}
     targets = [name for name in names if name.startswith(PREFIX)]
     for name in targets:
@@ -117,8 +119,8 @@ def _targets(names: Mapping[str, object], system: ControlAffineSystem) -> dict[s
     return {name: known[name] for name in targets}
 
 
-def _check(config: Config, family: FamilySystem, box: Box) -> None:
-    """Hold the members against systems that are built with their parameters."""
+def _check_members(config: Config, family: FamilySystem, box: Box) -> None:
+    """Compare members with newly constructed systems, see `check_members`."""
     if not family.parameters_in_f:
         return
     cls, given = type(family.system), config.system.parameters
@@ -127,17 +129,17 @@ def _check(config: Config, family: FamilySystem, box: Box) -> None:
         with section("family"):
             return cls(**{**given, **values})
 
-    inside = box.sample(TRIED, torch.Generator().manual_seed(0))
+    inside = box.sample(TEST_STATES, torch.Generator().manual_seed(0))
     check_members(family, build, torch.cat([box.lower[None], box.upper[None], inside]))
 
 
 def _require_one_control(
     family: FamilySystem, cost: Cost, shift: Tensor, center: Tensor, low: Tensor, high: Tensor
 ) -> None:
-    """Refuse targets of which some are held by another control than the one at the centre."""
+    """Raise UsageError unless all targets are held by the same control as the one at the centre."""
     assert cost.goal is not None
     assert cost.rest is not None
-    for p in (low, high, *Box(low, high).sample(TRIED, torch.Generator().manual_seed(0))):
+    for p in (low, high, *Box(low, high).sample(TEST_STATES, torch.Generator().manual_seed(0))):
         x = cost.goal + shift @ (p - center)
         u = holding(family.member(p), x)
         if not float((u - cost.rest).abs().max()) <= HELD * max(1.0, float(cost.rest.abs().max())):
@@ -148,7 +150,7 @@ def _require_one_control(
 
 
 def _weight_of_members(cost: Cost, family: FamilySystem) -> Callable[[State], ControlMatrix] | None:
-    """R(x; p), where R is the inverse mass of the system; None where it is the same for every member."""
+    """R(x; p), if R is the inverse mass of the system; None if it is the same for all members."""
     R = getattr(innermost(cost), "R_of_state", None)
     of_system = getattr(R, "__self__", None) is family.system and getattr(R, "__name__", "") == "inverse_mass"
     return family.inverse_mass if of_system and family.parameters_in_f else None

@@ -1,4 +1,4 @@
-"""Controls that cost nothing between their limits: what the least weight on them is, and what it adds to the cost."""
+"""Controls without a weight in R: suggests a small weight and states how much it adds to the cost."""
 
 import math
 
@@ -8,22 +8,23 @@ from torch import Tensor
 from lyapnet.base.errors import UsageError
 from lyapnet.task.problem import Problem
 
-SEEN = 256  # states of X₀ for the size of the cost
-SHARE = 0.01  # of the cost, that the weight adds at most
+COST_STATES = 256  # random states of X₀ that give the size of the cost
+MAX_COST_SHARE = 0.01  # largest increase of the cost by the suggested weight
 
 
 def refuse_free_controls(problem: Problem, R: Tensor) -> None:
-    """Refuse an R that is positive semidefinite alone, where limits keep u finite, and say what to write.
+    """Refuse an R that is only positive semidefinite if controls have limits; the error suggests another R.
 
-    The optimum is bang-bang then, and its V has kinks that no law here is made for. A weight r on the controls that are
-    free adds at most r T Σ max u² to the cost; it is chosen for that to be SHARE of T |q| + |φ|, in the mean over X₀.
+    The optimum is then bang-bang, and its V has kinks, for which no control law here is made. A weight r on the free
+    controls adds at most r T Σ max u² to the cost. The suggested r makes this MAX_COST_SHARE of the mean of T |q| + |φ|
+    over X₀.
 
     Args:
-        problem: q, φ, U, X₀ and T count.
+        problem: the problem; only q, φ, U, X₀ and T are used.
         R: (m, m), or one for each of some states (b, m, m).
 
     Raises:
-        UsageError: with such an R and its price.
+        UsageError: R is only positive semidefinite; suggests a weight and states its price.
     """
     with torch.no_grad():
         diagonal = R.diagonal(dim1=-2, dim2=-1).reshape(-1, problem.system.m)
@@ -33,15 +34,15 @@ def refuse_free_controls(problem: Problem, R: Tensor) -> None:
         rounding = 1e-12 * float(values.abs().max())
         if limits is None or not -rounding <= float(values.min()) <= rounding:
             return
-        x = problem.initial_states.sample(SEEN, torch.Generator().manual_seed(0))
+        x = problem.initial_states.sample(COST_STATES, torch.Generator().manual_seed(0))
         q, end = (float(function(x).abs().mean()) for function in (problem.cost.state, problem.cost.terminal))
     most = torch.stack([(side - problem.rest).abs() for side in limits]).amax(0)[free]
     T = problem.horizon.duration
     cost, size = T * q + end, float((most**2).sum())
     if not (math.isfinite(size) and cost * size > 0):
         return
-    r = SHARE * cost / (T * size)
-    r = math.floor(r / 10 ** (power := math.floor(math.log10(r)))) * 10.0**power  # one digit, and no more than that
+    r = MAX_COST_SHARE * cost / (T * size)
+    r = math.floor(r / 10 ** (power := math.floor(math.log10(r)))) * 10.0**power  # rounded down to one digit
     price, names = r * T * size, ", ".join(problem.system.control_names[i] for i in free)
     own = [f"{r:.9g}" if i in free else f"{float(diagonal[0, i]):g}" for i in range(problem.system.m)]
     to_write = f"cost.R={own[0]}" if len(free) == len(own) else f"'cost.R=[{', '.join(own)}]'"

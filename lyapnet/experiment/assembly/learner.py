@@ -1,4 +1,4 @@
-"""From a config to what learns: V, its closed loop, and the program."""
+"""Builds V, its closed loop and the program of a config."""
 
 import inspect
 from typing import Any
@@ -29,18 +29,18 @@ from lyapnet.value.policy import POLICIES
 
 
 def build_value_function(config: Config, problem: Problem, network: type[ValueFunction] | None = None) -> ValueFunction:
-    """V(t, x) with fresh weights drawn from the config's seed, in its precision; made for the config's control law.
+    """V(t, x) with random weights from the config's seed, in its precision, for the config's control law.
 
     Args:
-        network: the class taken instead of the one that the config names.
+        network: a class that replaces the one named in the config.
 
     Raises:
-        UsageError: an option that the network does not have, or a value that it refuses.
+        UsageError: the network does not have an option, or refuses its value.
     """
     options, n = config.network, problem.system.n
     cls, kept = network or class_of(config, "network"), _kept_states(config, problem.system)
     name = options.name
-    if problem.horizon.stationary and cls is ExpansionNetwork:  # the standard one
+    if problem.horizon.stationary and cls is ExpansionNetwork:  # the default network
         cls, name = StationaryNetwork, "stationary"
     _require_same_end(problem, cls, options.terminal)
     angles = [kept.index(angle) for angle in problem.system.angles if angle in kept]
@@ -71,7 +71,7 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
         goal = problem.goal.double().cpu()[kept]
         if isinstance(V, StationaryNetwork):
             V.goal.copy_(goal)
-        elif goal.any() and not isinstance(V, ExpansionNetwork):  # which has its own centre
+        elif goal.any() and not isinstance(V, ExpansionNetwork):  # it has its own centre
             V = CentredNetwork(V, goal)
         if options.terminal == "exact":
             V = TerminalAnchor(V, _terminal_cost(problem, kept), problem.horizon.duration)
@@ -86,10 +86,10 @@ def build_value_function(config: Config, problem: Problem, network: type[ValueFu
 
 
 def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str) -> None:
-    """Refuse a V without time in a task that ends, and one that is φ at T in a task that does not.
+    """Check that the network suits the horizon.
 
     Raises:
-        UsageError: as said.
+        UsageError: a stationary network for a finite horizon, or terminal=exact for an infinite one.
     """
     stationary = problem.horizon.stationary
     if issubclass(cls, StationaryNetwork) and not stationary:
@@ -103,10 +103,10 @@ def _require_same_end(problem: Problem, cls: type[ValueFunction], terminal: str)
 
 
 def build_rollout(config: Config, problem: Problem, V: ValueFunction) -> Rollout:
-    """The closed loop of V under the config's control law, integrator and gradient route.
+    """The closed loop of V with the config's control law, integrator and gradient.
 
     Raises:
-        UsageError: compile is on for a route that has nothing to compile; or the law does not suit the problem.
+        UsageError: compile is on for a gradient that cannot be compiled, or the law does not suit the problem.
     """
     options = config.rollout
     if options.compile == "on" and options.gradient != "discrete":
@@ -125,7 +125,7 @@ def build_program(config: Config) -> Program:
     """The program of a config.
 
     Raises:
-        UsageError: an option that the program does not have, or values that contradict each other.
+        UsageError: the program does not have an option, or values contradict each other.
     """
     options, cls = program_options(config), class_of(config, "program")
     for name in options.keys() - inspect.signature(cls).parameters.keys():
@@ -138,13 +138,13 @@ def build_program(config: Config) -> Program:
 
 
 def program_options(config: Config) -> dict[str, Any]:
-    """The weights and further keys that a config gives its program, but for `parameters`."""
+    """The weights and further keys of the config's program, except `parameters`."""
     given = vars(config.program)
     return {key: value for key, value in given.items() if key not in ("name", "parameters") and value is not None}
 
 
 def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
-    """The indices of the states that V depends on."""
+    """The indices of the states on which V depends."""
     names, ignored = list(system.state_names), config.network.ignored_states
     if unknown := [name for name in ignored if name not in names]:
         raise UsageError(
@@ -156,7 +156,7 @@ def _kept_states(config: Config, system: ControlAffineSystem) -> list[int]:
 
 
 def _terminal_cost(problem: Problem, kept: list[int]) -> Cost:
-    """φ as a function of the kept states alone, which it has to be."""
+    """φ as a function of the kept states; raises UsageError if it depends on others."""
     n = problem.system.n
     if not all(problem.cost.ignores_at_end(i, n) for i in range(n) if i not in kept):
         raise UsageError(

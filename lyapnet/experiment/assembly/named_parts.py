@@ -1,4 +1,4 @@
-"""The parts of the user's own that a config names, as objects."""
+"""Builds the user's own parts that a config names."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -11,17 +11,17 @@ from lyapnet.experiment.config import Config
 
 
 def parts_of(config: Config) -> Parts:
-    """The user's own parts that a config names as module:Class, imported; nothing for what is registered.
+    """Import the user's parts that a config names as module:Class; registered parts remain None.
 
     Raises:
-        UsageError: no such module or class, or arguments that it does not take.
+        UsageError: no such module or class, or it does not accept its arguments.
     """
     refuse_two_sets(config.controls)
     return parts_named(config, own_parts(config))
 
 
 def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
-    """Parts by their section and the name of their class, with the other options of a config; as parts_of."""
+    """Import parts by section and class name, with the other options of a config; see parts_of."""
     config = copy.deepcopy(config)
     for part, name in names.items():
         getattr(config, part).name = name
@@ -37,10 +37,10 @@ def parts_named(config: Config, names: Mapping[str, str]) -> Parts:
 
 
 def python_of(config: Config, part: str) -> str:
-    """The Python expression for a part of the user's own that a config names, its module being imported."""
+    """The Python expression that builds a user's part of a config, assuming that its module is imported."""
     options = getattr(config, part)
     name = options.name.replace(":", ".")
-    if part == "network":  # lyapnet.load takes its class
+    if part == "network":  # lyapnet.load expects its class
         return name
     given = {**(program_options(config) if part == "program" else {}), **options.parameters}
     return f"{name}({', '.join(f'{key}={value!r}' for key, value in given.items())})"

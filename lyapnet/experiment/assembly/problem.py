@@ -1,4 +1,4 @@
-"""From a config to its problem."""
+"""Builds the problem of a config."""
 
 import copy
 import math
@@ -40,14 +40,14 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
     """The problem of a config, in its precision.
 
     Args:
-        parts: taken instead of those that the config names.
+        parts: objects that replace those named in the config.
 
     Raises:
         UsageError: a parameter, matrix, bound or dimension does not fit; names the section.
     """
     parts, dtype = parts or Parts(), DTYPES[config.training.precision]
     with float64_defaults():
-        # in float64 for the checks below, and copies: the caller's own parts keep their precision
+        # float64 copies for the checks below; the caller's own parts keep their precision
         given = (parts.system, parts.cost, parts.controls, parts.constraints)
         system, cost, controls, constraints = (copy.deepcopy(initialised(part)) for part in given)
         system = build_system(config.system) if system is None else system.double()
@@ -55,19 +55,19 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         initial_states = build_initial_states(config.initial_states, system)
         with section("horizon"):
             method = config.rollout.method
-            held = method if method in TABLEAUX else "rk4"  # of an adaptive method
+            held = method if method in TABLEAUX else "rk4"  # for an adaptive method
             horizon = Horizon(config.horizon.steps, config.horizon.dt, held, config.horizon.stationary)
         if cost is None and config.cost.name in COSTS:
             _refuse_free_controls(config, system, controls, initial_states, horizon)
         with section("cost"):
-            cost = build_cost(_weights(config), system) if cost is None else cost.double()
+            cost = build_cost(_cost_section(config), system) if cost is None else cost.double()
             if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
                 cost = PseudoHuberCost(cost, config.cost.huber)
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
         if config.family:
             system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
-        elif not isinstance(parts.cost, MadeOfAnother):  # one that was made by hand is taken as it is
+        elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
             cost = about_target(config, cost, system, controls, initial_states)
         if not isinstance(parts.cost, MadeOfAnother):
             cost = _with_obstacles(config.cost, cost, system)
@@ -85,10 +85,10 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
 
 
 def operating_point(config: Config, parts: Parts | None = None) -> tuple[ControlAffineSystem, Trim]:
-    """The system of a config, and the operating point of its target, for which its cost and horizon are not asked.
+    """The system of a config and the operating point of its target; cost and horizon are not needed.
 
     Raises:
-        UsageError: as build_problem, for these.
+        UsageError: as build_problem, for these parts.
     """
     parts = parts or Parts()
     with float64_defaults():
@@ -101,8 +101,8 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
         return system, trim(config, system, controls, initial_states)
 
 
-def _weights(config: Config) -> CostConfig:
-    """The cost section; with stationary V, of which no Q_T is asked, Q in its place until φ is known."""
+def _cost_section(config: Config) -> CostConfig:
+    """The cost section; for a stationary V, which needs no Q_T, with Q_T = Q until φ is computed."""
     if not config.horizon.stationary:
         return config.cost
     if config.family:
@@ -115,12 +115,12 @@ def _weights(config: Config) -> CostConfig:
 def _refuse_free_controls(
     config: Config, system: ControlAffineSystem, controls: ControlSet | None, initial_states: Box, horizon: Horizon
 ) -> None:
-    """Refuse a quadratic cost whose R has no weight for a control that has limits; other faults are found later."""
+    """Refuse a quadratic cost whose R has no weight for a limited control; other errors are reported later."""
     try:
         R = torch.as_tensor(_control_weight(config.cost.R, system), dtype=torch.float64)
         if torch.linalg.eigvalsh(R)[0] > 0:
             return
-        weighted = build_cost(replace(_weights(config), R=1.0), system)
+        weighted = build_cost(replace(_cost_section(config), R=1.0), system)
         controls = build_controls(config.controls, system) if controls is None else controls.double()
         cost = about_target(config, weighted, system, controls, initial_states)
         problem = Problem(system, cost, controls, initial_states, horizon)
@@ -130,10 +130,10 @@ def _refuse_free_controls(
 
 
 def _refuse_free_controls_of_own_cost(problem: Problem) -> None:
-    """The same for a cost of the user's own; an R that is no matrix, or raises, is found by its contract."""
+    """The same for a user's cost; an R that fails or is no matrix is reported by the check of its contract."""
     try:
         R: Any = problem.cost.R(problem.initial_states.lower[None])
-    except Exception:  # of any kind: it is the user's
+    except Exception:  # the cost is the user's
         return
     if isinstance(R, Tensor) and R.shape == (1, problem.system.m, problem.system.m):
         refuse_free_controls(problem, R)
@@ -145,13 +145,13 @@ def build_system(config: SystemConfig) -> ControlAffineSystem:
 
 
 def with_parameters(system: ControlAffineSystem, parameters: Mapping[str, Any], like: Tensor) -> ControlAffineSystem:
-    """A system of the same class from other arguments, in the precision and on the device of a tensor."""
+    """A system of the same class with other arguments, in the precision and on the device of a tensor."""
     with float64_defaults():
         return type(system)(**parameters).to(like)
 
 
 def build_initial_states(config: InitialStatesConfig, system: ControlAffineSystem) -> Box:
-    """X₀ of a config; a single number is the bound of every state."""
+    """X₀ of a config; a single number is a bound for every state."""
     with section("initial_states"):
         bounds = {side: repeated(getattr(config, side), system.n) for side in ("lower", "upper")}
         for side, bound in bounds.items():
@@ -160,7 +160,7 @@ def build_initial_states(config: InitialStatesConfig, system: ControlAffineSyste
 
 
 def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) -> Cost:
-    """The cost of a config; a quadratic one with its shapes held against the system's."""
+    """The cost of a config; the shapes of a quadratic one are checked against the system."""
     if config.name not in COSTS:
         if config.periodic:
             raise UsageError("Expected cost.periodic with the quadratic cost, got another; write it into your own.")
@@ -178,11 +178,11 @@ def build_cost(config: CostConfig, system: ControlAffineSystem | None = None) ->
     for key, weight in weights.items():
         require_length(f"cost.{key}", len(weight), system.state_names)
     cost = QuadraticCost(R=R, **weights)
-    return _going_round(config.periodic, cost, system) if config.periodic else cost
+    return _make_periodic(config.periodic, cost, system) if config.periodic else cost
 
 
-def _going_round(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
-    """The cost with some angles that go round; it must not know on which side of the goal they are."""
+def _make_periodic(names: Sequence[str], cost: QuadraticCost, system: ControlAffineSystem) -> Cost:
+    """Make a cost periodic in some angles, in which it has to be even."""
     angles = [index_of(name, "cost.periodic", system) for name in names]
     for weight in (cost.Q, cost.Q_T):
         beside = weight[angles] * (1 - torch.eye(system.n)[angles])
@@ -202,7 +202,7 @@ def _with_obstacles(config: CostConfig, cost: Cost, system: ControlAffineSystem)
 
 
 def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
-    """R as a matrix, or as the function of the state that inverse_mass names."""
+    """R as a matrix, or the function inverse_mass of the state."""
     if not isinstance(R, str):
         R = rows("R", repeated(R, system.m))
         require_length("cost.R", len(R), system.control_names)
@@ -214,12 +214,12 @@ def _control_weight(R: Any, system: ControlAffineSystem) -> Any:
         raise ValueError(
             f"Expected R as a matrix, got inverse_mass, which {type(system).__name__} has not; write R as rows."
         )
-    # constant for a linear system: a matrix then, as the Riccati equation needs it
+    # constant for a linear system: the Riccati equation needs a matrix
     return inverse_mass(torch.zeros(system.n)) if isinstance(system, Linear) else inverse_mass
 
 
 def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> ControlSet:
-    """The control set of a config: a box where it has limits, else a registered one or the user's own."""
+    """The control set of a config: a box if it has limits, else a registered set or the user's own."""
     if config.lower is None and config.upper is None:
         return instance_of(config, "controls")
     refuse_two_sets(config)
@@ -229,14 +229,14 @@ def build_controls(config: ControlsConfig, system: ControlAffineSystem) -> Contr
 
 
 def refuse_two_sets(config: ControlsConfig) -> None:
-    """Refuse limits beside a set that is named."""
+    """Raise UsageError if a config has both limits and a named set."""
     limited = config.lower is not None or config.upper is not None
     if limited and (config.name != "unbounded" or config.parameters):
         raise UsageError(f"Expected limits or a controls.name, got both ({config.name}); leave one of them out.")
 
 
 def _limits(key: str, given: Any, none: float, system: ControlAffineSystem) -> list[float]:
-    """A limit for each control, from a number, one for all, or a list in which null is none."""
+    """A limit for each control, from a single number or a list; null means no limit."""
     entries = [none if entry is None else entry for entry in (given if isinstance(given, list) else [given])]
     if not all(type(entry) in (int, float) and not math.isnan(entry) for entry in entries):
         raise UsageError(f"Expected {key} as a number or a list of them, got {given!r}; write null where is no limit.")

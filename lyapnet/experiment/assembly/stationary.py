@@ -1,4 +1,4 @@
-"""Tasks without end: what a regulator goes on to pay after T, as the terminal cost."""
+"""Infinite-horizon tasks: the terminal cost is the cost of a regulator after T."""
 
 import torch
 
@@ -7,18 +7,20 @@ from lyapnet.task.cost import RegulatorTail
 from lyapnet.task.problem import Problem
 from lyapnet.value.regulator import Regulator
 
-PURPOSE, INSTEAD = "horizon.stationary", "choose another goal, or stationary: false"
-FREE, STATES = 1e-3, 256  # of the mean q at states of X₀: what staying at the goal may cost per second
+PURPOSE, INSTEAD = "horizon.stationary", "choose another goal, or stationary: false"  # texts of messages
+MAX_COST_AT_GOAL = 1e-3  # largest q at the goal, relative to the mean q on X₀
+COST_STATES = 256  # random states of X₀ for this mean
 
 
 def without_end(problem: Problem) -> Problem:
     """The problem with φ = (x − x*)ᵀP(x − x*), the infinite-horizon cost of the regulator linearised at the goal.
 
-    V of the linearised problem is then φ at every t, whatever T is. No limit may be met at the goal.
+    V of the linearised problem then equals φ at every t, for any T. The control at the goal has to be inside its
+    limits.
 
     Raises:
-        UsageError: no control holds the goal, a limit is met there, it lies outside the constraints, staying there
-            costs something, or no regulator brings the state there.
+        UsageError: no control inside the limits holds the goal, it violates constraints, staying there has a cost, or
+            no regulator stabilises it.
     """
     limits, rest = problem.controls.limits, problem.rest
     if limits is None:
@@ -42,19 +44,19 @@ def without_end(problem: Problem) -> Problem:
 
 
 def _require_lasting_goal(problem: Problem) -> None:
-    """Refuse a goal outside the constraints, and one at which q is paid: for ever, that is more than any number.
+    """Check that a system may stay at the goal for ever.
 
     Raises:
-        UsageError: as said.
+        UsageError: the goal violates constraints, or q(x*) > 0, whose integral over an infinite time is infinite.
     """
     place = f"x* = {problem.goal.tolist()}"
     if problem.constraints is not None and bool((problem.constraints(problem.goal) > 0).any()):
         raise UsageError(f"Expected a goal within the constraints for {PURPOSE}, got {place} outside; {INSTEAD}.")
     at_goal, mean = (
         float(problem.cost.state(x).mean())
-        for x in (problem.goal, problem.initial_states.sample(STATES, torch.Generator().manual_seed(0)))
+        for x in (problem.goal, problem.initial_states.sample(COST_STATES, torch.Generator().manual_seed(0)))
     )
-    if abs(at_goal) > FREE * abs(mean):
+    if abs(at_goal) > MAX_COST_AT_GOAL * abs(mean):
         raise UsageError(
             f"Expected q(x*) = 0 for {PURPOSE}, got {at_goal:.3g} per second at {place}; write a cost that vanishes "
             "there, move cost.obstacles away from it, or take stationary: false."

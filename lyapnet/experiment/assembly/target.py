@@ -1,4 +1,4 @@
-"""The cost about a target, and the control that holds it."""
+"""The cost with a target, and the control that holds the target."""
 
 import functools
 import logging
@@ -17,31 +17,31 @@ from lyapnet.task.operating_points import HELD, OperatingPoint, OperatingPoints
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
-OTHERS = 4  # further operating points that a note lists
-ELSEWHERE = "say what the cost counts u from, as in target_control: [0]"
+LISTED_POINTS = 4  # largest number of further operating points in a note
+CONTROL_ADVICE = "say what the cost counts u from, as in target_control: [0]"
 
 
 class Trim(NamedTuple):
-    """The operating point of a target, and what there was to choose from."""
+    """The operating point of a target, and its alternatives."""
 
     point: OperatingPoint
     others: list[OperatingPoint]
-    note: str  # how it was found; empty where the target was held as it was written
+    note: str  # how it was found; empty if the given target is held exactly
 
 
 def about_target(
     config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet, initial_states: Box
 ) -> Cost:
-    """The cost about the target of a config, if there is one; what was solved for is told in a note."""
+    """The cost with the target of a config, if there is one; a note reports components that were solved for."""
     if config.target is None or config.target_control is not None:
         return about_written_target(config, cost, system, controls)
     (x, u, *_), _, note = trim(config, system, controls, initial_states)
-    _tell(note)
+    _log_once(note)
     return TargetCost(cost, x, u)
 
 
 def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem, controls: ControlSet) -> Cost:
-    """The same where x* is taken as it is written, and u* too where it is: nothing is moved, nor solved for but u*."""
+    """The cost with exactly the given x*, and the given u* or the u* that holds x*."""
     if config.target is None and config.target_control is not None:
         raise UsageError("Expected target with target_control, got none; name the state that it holds.")
     if config.target is None:
@@ -49,49 +49,50 @@ def about_written_target(config: Config, cost: Cost, system: ControlAffineSystem
     x = written_target(config, system)
     u = holding(system, x) if config.target_control is None else _written_control(config, system)
     if not bool(controls.contains(u)):
-        raise _not_admitted(u)
+        raise _not_admitted_error(u)
     return TargetCost(cost, x, u)
 
 
 def trim(config: Config, system: ControlAffineSystem, controls: ControlSet, initial_states: Box) -> Trim:
-    """The operating point of a config's target, f(x*) + g(x*)u* = 0: what is not given is solved for.
+    """The operating point of a config's target, f(x*) + g(x*)u* = 0, solved for all components that are not given.
 
     Raises:
-        UsageError: the target is none, or no control that is admitted holds it.
+        UsageError: the target is invalid, or no admissible control holds it.
     """
     given = named_entries(config.target, system)
     search = OperatingPoints(system, controls, initial_states, _state_limits(config.constraints, system))
     if len(given) == system.n:
         point = search.held_by(torch.tensor([given[i] for i in range(system.n)], dtype=torch.float64))
         if not point.held:
-            point, note = _moved(search, given, point)
-            return Trim(_admitted(point), [], note)
-        return Trim(_admitted(point), [], "")
+            point, note = _move_to_nearest(search, given, point)
+            return Trim(_require_admitted(point), [], note)
+        return Trim(_require_admitted(point), [], "")
     points = search.find(given)
     if not points:
         raise UsageError(
-            f"Expected a target near which f and g are finite, got {_in_words(given, system)} and none in X₀; choose "
-            "another."
+            f"Expected a target near which f and g are finite, got {_format_entries(given, system)} and none in X₀; "
+            "choose another."
         )
     point, *others = points
     if not point.held:
-        point, note = _moved(search, given, point)
-        return Trim(_admitted(point), [], note)
-    note = f"{_in_words(given, system)}; solved for {_place(point, system, given)}"
+        point, note = _move_to_nearest(search, given, point)
+        return Trim(_require_admitted(point), [], note)
+    note = f"{_format_entries(given, system)}; solved for {_format_point(point, system, given)}"
     if others:
         further = "; ".join(
-            _place(other, system, given) + ("" if other.admitted else ", beyond limits") for other in others[:OTHERS]
+            _format_point(other, system, given) + ("" if other.admitted else ", beyond limits")
+            for other in others[:LISTED_POINTS]
         )
-        more = f" and {len(others) - OTHERS} more" if len(others) > OTHERS else ""
+        more = f" and {len(others) - LISTED_POINTS} more" if len(others) > LISTED_POINTS else ""
         note += f", the nearest to X₀'s centre of {len(points)}; also {further}{more}"
-    return Trim(_admitted(point), others, f"target: {note}.")
+    return Trim(_require_admitted(point), others, f"target: {note}.")
 
 
 def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
-    """Index ↦ value of what a target gives: a list for every state, a number for all, or a mapping by their names.
+    """Index ↦ value of a target that is a list for all states, a number for every state, or a mapping by name.
 
     Raises:
-        UsageError: it is none of these.
+        UsageError: the target has another form.
     """
     if not isinstance(target, Mapping):
         entries = repeated(target, system.n)
@@ -126,10 +127,10 @@ def named_entries(target: Any, system: ControlAffineSystem) -> dict[int, float]:
 
 
 def written_target(config: Config, system: ControlAffineSystem) -> Tensor:
-    """The target of a config that gives every state.
+    """The target of a config, which has to give every state.
 
     Raises:
-        UsageError: it does not.
+        UsageError: a state is missing.
     """
     given = named_entries(config.target, system)
     missing = [name for i, name in enumerate(system.state_names) if i not in given]
@@ -151,8 +152,8 @@ def holding(system: ControlAffineSystem, x: Tensor) -> Tensor:
     u, left = system.holding_control(x)
     worst = int(left.abs().argmax())
     if not float(left.abs()[worst]) <= HELD * max(1.0, float(system.f(x).abs().max())):
-        raise _not_held(system, x, f"choose another, or {ELSEWHERE}")
-    return u + 0.0  # 0 in the place of −0
+        raise _not_held_error(system, x, f"choose another, or {CONTROL_ADVICE}")
+    return u + 0.0  # turns −0 into 0
 
 
 def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:
@@ -163,8 +164,10 @@ def _written_control(config: Config, system: ControlAffineSystem) -> Tensor:
     return torch.tensor(given, dtype=torch.float64)
 
 
-def _moved(search: OperatingPoints, given: Mapping[int, float], point: OperatingPoint) -> tuple[OperatingPoint, str]:
-    """A target that is not held, moved onto the nearest point that is, where it misses that by rounding alone."""
+def _move_to_nearest(
+    search: OperatingPoints, given: Mapping[int, float], point: OperatingPoint
+) -> tuple[OperatingPoint, str]:
+    """Move a target that is not held to the nearest operating point, if it is only rounded; else raise UsageError."""
     system, to_move = search.system, search.to_move(point.x, given)
     near = search.nearest(point.x, to_move) if to_move else None
     if near is not None and search.is_rounding(given, near.x):
@@ -173,30 +176,30 @@ def _moved(search: OperatingPoints, given: Mapping[int, float], point: Operating
             for i, number in given.items()
             if float(near.x[i]) != number
         ]
-        solved = _place(near, system, given)
+        solved = _format_point(near, system, given)
         return near, f"target: moved onto the nearest operating point, {', '.join(moves)}; {solved}."
-    advice = f"choose another, or {ELSEWHERE}"
+    advice = f"choose another, or {CONTROL_ADVICE}"
     if near is not None and near.admitted:
-        advice = f"choose another, such as {_rounded(near.x)}, or {ELSEWHERE}"
-    raise _not_held(system, point.x, advice)
+        advice = f"choose another, such as {_round_to_six_digits(near.x)}, or {CONTROL_ADVICE}"
+    raise _not_held_error(system, point.x, advice)
 
 
-def _not_held(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
+def _not_held_error(system: ControlAffineSystem, x: Tensor, advice: str) -> UsageError:
     left = system.holding_control(x)[1]
     worst = int(left.abs().nan_to_num(torch.inf).argmax())
     return UsageError(
         f"Expected a target that some control holds, f(x*) + g(x*)u* = 0, got {float(left[worst]):.3g} for the rate of "
-        f"{system.state_names[worst]} at {_rounded(x)}; {advice}."
+        f"{system.state_names[worst]} at {_round_to_six_digits(x)}; {advice}."
     )
 
 
-def _admitted(point: OperatingPoint) -> OperatingPoint:
+def _require_admitted(point: OperatingPoint) -> OperatingPoint:
     if not point.admitted:
-        raise _not_admitted(point.u)
+        raise _not_admitted_error(point.u)
     return point
 
 
-def _not_admitted(u: Tensor) -> UsageError:
+def _not_admitted_error(u: Tensor) -> UsageError:
     return UsageError(
         f"Expected the control at the target among those that are admitted, got {u.tolist()}; widen controls, or "
         "choose another target."
@@ -204,7 +207,7 @@ def _not_admitted(u: Tensor) -> UsageError:
 
 
 def _state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tuple[Tensor, Tensor]:
-    """The limits of states that a config lists, for which points are sought within them; names are held elsewhere."""
+    """The state limits of a config, within which points are preferred; their names are checked elsewhere."""
     low, high = (
         torch.tensor([float(side.get(name, none)) for name in system.state_names], dtype=torch.float64)
         for side, none in ((config.lower, -math.inf), (config.upper, math.inf))
@@ -212,23 +215,23 @@ def _state_limits(config: ConstraintsConfig, system: ControlAffineSystem) -> tup
     return low, high
 
 
-def _in_words(given: Mapping[int, float], system: ControlAffineSystem) -> str:
+def _format_entries(given: Mapping[int, float], system: ControlAffineSystem) -> str:
     return ", ".join(f"{system.state_names[i]} = {number:.9g}" for i, number in given.items())
 
 
-def _place(point: OperatingPoint, system: ControlAffineSystem, given: Mapping[int, float] | None = None) -> str:
-    """What a point was solved for, in nine digits: "current = 0.454124583, held by duty = 0.339388328"."""
+def _format_point(point: OperatingPoint, system: ControlAffineSystem, given: Mapping[int, float] | None = None) -> str:
+    """Format the solved components in nine digits: "current = 0.454124583, held by duty = 0.339388328"."""
     states = {i: float(point.x[i]) for i in range(system.n) if given is None or i not in given}
     controls = [f"{name} = {u:.9g}" for name, u in zip(system.control_names, point.u.tolist(), strict=True)]
-    return ", ".join([*([_in_words(states, system)] if states else []), f"held by {controls[0]}", *controls[1:]])
+    return ", ".join([*([_format_entries(states, system)] if states else []), f"held by {controls[0]}", *controls[1:]])
 
 
-def _rounded(x: Tensor) -> list[float]:
+def _round_to_six_digits(x: Tensor) -> list[float]:
     return [float(f"{number:.6g}") for number in x.tolist()]
 
 
 @functools.cache
-def _tell(note: str) -> None:
-    """Say it once in a process, however often its problem is built."""
+def _log_once(note: str) -> None:
+    """Log a note only once in a process, even if the problem is built several times."""
     if note:
         logging.getLogger(__name__).warning("note: %s", note)

@@ -1,4 +1,4 @@
-"""The two programs of the paper, with the terms that make them stronger, and that of a region of attraction."""
+"""The two programs of the paper with additional terms, and the program of a region of attraction."""
 
 from lyapnet.loop.programs.base import Program, ProgramOutput
 from lyapnet.loop.programs.lyapunov import LyapunovProgram

@@ -1,4 +1,4 @@
-"""What a program is: named, weighted terms of V along the closed loop."""
+"""The base class of programs, losses made of named, weighted terms of V along the closed loop."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -16,32 +16,32 @@ from lyapnet.loop.rollout import Trajectory
 
 
 class ProgramOutput(NamedTuple):
-    """One evaluation of a program on a batch; every entry is a mean over the batch."""
+    """The value of a program on a batch; every entry is a mean over the batch."""
 
-    loss: Float[Tensor, ""]  # what is minimised
-    terms: dict[str, Float[Tensor, ""]]  # each term before its weight
-    constraint_loss: Float[Tensor, ""]  # the paper's mean sum, without weight, margin or normalisation
+    loss: Float[Tensor, ""]  # weighted sum of the terms
+    terms: dict[str, Float[Tensor, ""]]  # each term without its weight
+    constraint_loss: Float[Tensor, ""]  # mean of the paper's sum, without weight, margin or normalisation
     trajectory_cost: Float[Tensor, ""]  # mean J_N
 
 
 @dataclass(frozen=True)
 class Program(ABC):
-    """loss = constraint · C + terminal · B + trajectory_cost · J: the weighted terms of one program.
+    """loss = constraint · C + terminal · B + trajectory_cost · J, a weighted sum of terms.
 
     C is the program's condition along the trajectory, B the condition at t = T, J the cost of the closed loop; a
-    program may add further terms. A weight of zero leaves a term out; constraint = 1 alone, without normalisation, is
-    the paper's program.
+    program may have further terms. A weight of zero removes a term. The paper's program has constraint = 1 only, and no
+    normalisation.
 
-    With `normalise`, the weights are numbers without units: every term is measured against its `unit`, the batch's mean
-    cost J̄ (detached; C as the mean over time) unless told otherwise, but J, which enters as log J̄, whose gradient is
-    ∇J̄/J̄. Where costs may be of any sign, as of a task without a goal, they are measured against their spread.
+    With `normalise` the weights have no unit: each term is divided by its `unit`, by default the batch's mean cost J̄ to
+    the power of its degree (detached; C as the mean over time). J enters as log J̄, with gradient ∇J̄/J̄. In tasks
+    without a goal, where costs may have any sign, the spread of costs replaces J̄.
     """
 
-    degree: ClassVar[int]  # all terms but J are of this degree in units of cost
-    weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # the terms, and their weights
+    degree: ClassVar[int]  # degree of all terms except J in units of cost
+    weighted: ClassVar[tuple[str, ...]] = ("constraint", "terminal", "trajectory_cost")  # names of terms and weights
     recommended: ClassVar[Mapping[str, float | bool]] = {}  # arguments in the standard recipe
-    needs_goal: ClassVar[bool] = False  # whether V is a distance to a goal, towards which it falls
-    pointwise: ClassVar[float] = 0.0  # the weight of its condition at points off the closed loops, unless it is given
+    needs_goal: ClassVar[bool] = False  # whether V has to decrease towards a goal
+    pointwise: ClassVar[float] = 0.0  # default weight of the condition at points off the closed loops
 
     constraint: float = 1.0
     terminal: float = 0.0
@@ -66,17 +66,17 @@ class Program(ABC):
         mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value,
         spread_of_costs: Float[Tensor, ""] | None = None,
     ) -> ProgramOutput:
-        """The program on one batch of trajectories under the control law of a V.
+        """Evaluate the program on a batch of trajectories under the control law of a V.
 
         Args:
             trajectory: the batch.
-            mean_over_processes: takes a number of this process to its mean over all that share the batch, so that
-                they normalise alike and the mean of their gradients is the gradient on the joint batch.
-            spread_of_costs: of a task without a goal, what stands for the mean cost; None where there is one.
+            mean_over_processes: the mean of a number over all processes that share the batch. With it they use the same
+                normalisation, so that the mean of their gradients is the gradient on the joint batch.
+            spread_of_costs: replaces the mean cost in a task without a goal; None for a task with a goal.
 
         Raises:
             ValueError: no V defines the control law.
-            DivergenceError: a term is not finite; names it and the initial state.
+            DivergenceError: a term is not finite; names the term and the initial state.
         """
         values = trajectory.require_value()
         J = trajectory.cost.mean()
@@ -90,43 +90,44 @@ class Program(ABC):
             size = mean_over_processes(cost.mean()) if has_goal else spread_of_costs
             each = cost if has_goal else size.expand_as(cost)
             terms = {name: (term / self.unit(name, each, size)).mean() for name, term in per_state.items()}
-            # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; a sum of degree one needs no N
+            # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; for degree one the factor is 1
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
-            # log J̄, or J̄ in units of the spread, and its gradient; J̄ is the joint mean, and this batch a part of it
+            # log J̄, or J̄ in units of the spread, with J̄ over all processes but the gradient of this batch
             mean = torch.log(size) if has_goal else mean_over_processes(J.detach()) / size
             terms["trajectory_cost"] = mean + (J - J.detach()) / size
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
-        """What a term of trajectories of some cost J is measured against: J̄ to the power of its degree.
+        """The unit of a term: J̄ to the power of the degree.
 
-        Without a goal both are the spread of costs.
+        Args:
+            name: name of the term.
+            cost: J of each trajectory; without a goal the spread of costs.
+            mean_cost: J̄; without a goal the spread of costs.
         """
         return mean_cost**self.degree
 
     def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
-        """What this program promises of one closed loop, by default: J within 5 % of V(0, x₀), and ‖x(T) − goal‖
-        within a radius, if one is given."""
+        """The success criteria of a closed loop: by default J ≤ 1.05 V(0, x₀), and ‖x(T) − goal‖ ≤ radius if given."""
         return Tolerances(radius, None, cost)
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:
-        """By how much the condition fails where V changes by `rate` while `running` accrues: V̇ + ℓ, or the same over
-        a step."""
+        """The violation of the condition for a rate V̇ and a running cost ℓ: V̇ + ℓ; or for their sums over a step."""
         return rate + running
 
     @abstractmethod
     def penalty(self, excess: Tensor) -> Tensor:
-        """What an excess costs: zero where the condition holds."""
+        """The loss of an excess; zero where the condition holds."""
 
     def without_goal(self, reason: str) -> "Program":
-        """The program for a task that has no goal.
+        """The program for a task without a goal.
 
         Args:
-            reason: why it has none.
+            reason: the reason why there is no goal, for messages.
 
         Raises:
-            UsageError: it needs one.
+            UsageError: the program needs a goal.
         """
         if self.needs_goal:
             raise UsageError(
@@ -135,8 +136,8 @@ class Program(ABC):
             )
         return self
 
-    def check_terminal(self, exact: bool) -> None:  # noqa: B027  (most programs have nothing to refuse)
-        """Refuse weights that do not suit how V ends.
+    def check_terminal(self, exact: bool) -> None:  # noqa: B027  (most programs accept both)
+        """Check that the weights suit the terminal condition of V.
 
         Args:
             exact: whether V(T, ·) = φ by construction.
@@ -162,7 +163,7 @@ class Program(ABC):
         """B for each trajectory."""
 
     def constraint_term(self, values: ValuePath, trajectory: Trajectory) -> PerState:
-        """C for each trajectory: the paper's sum, unless the program asks for more."""
+        """C for each trajectory; by default the paper's sum."""
         return self.constraint_loss(values, trajectory)
 
 

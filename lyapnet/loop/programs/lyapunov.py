@@ -1,4 +1,4 @@
-"""The Lyapunov program: V falls along its own closed loop at least as fast as the cost accrues."""
+"""The Lyapunov program: V decreases along its closed loop at least as fast as the cost accrues."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,13 +20,14 @@ from lyapnet.loop.rollout import Trajectory
 class LyapunovProgram(Program):
     """C = Σ_n max(V_{n+1} − V_n + (1 + margin) Δt ℓ_n, 0) and B = max(φ(x_N) − V(T, x_N), 0).
 
-    Where both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 asks for a little more than is claimed, which leaves
-    room for states between the sampled ones; the constraint loss that is logged has none.
+    If both are zero, J_N(x₀) ≤ V(0, x₀). A margin > 0 requires more than this, as a reserve for states between the
+    sampled ones; the logged constraint loss has no margin.
 
-    The further term bound · V(0, x₀) makes that bound tight: the least V(0, ·) with C = B = 0 is the optimal cost.
-    Since V(0, x₀) ≥ J_N − C − B for any V, a V(0, x₀) below the cost is paid for in C or B at their weights: no gain
-    where both weights exceed that of the bound, so that the conditions hold as exact penalties (where V(T, ·) = φ is
-    built in, B is zero and needs none).
+    The further term bound · V(0, x₀) makes the bound tight: the least V(0, ·) with C = B = 0 is the optimal cost. As
+    V(0, x₀) ≥ J_N − C − B for any V, reducing V(0, x₀) below the cost increases C or B by as much. If the weights of
+    both exceed that of the bound, this does not pay, and C and B are exact penalties. If V(T, ·) = φ by construction, B
+    is zero and needs no weight.
+
     Source: P_L of arXiv 2305.15244.
     """
 
@@ -50,7 +51,7 @@ class LyapunovProgram(Program):
             )
 
     def tolerances(self, radius: float | None = None, cost: float = 0.05) -> Tolerances:
-        """And that V decreases along the closed loop, within 1 % of V(0, x₀)."""
+        """As in the base class; also V has to decrease along the closed loop, within 1 % of V(0, x₀)."""
         return Tolerances(radius, 1e-2, cost)
 
     def excess(self, rate: Tensor, running: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""A program's condition off the closed loops: at points of [0, T] × D, as a certificate asks for it."""
+"""A program's condition at points of [0, T] × D off the closed loops, as certificates require it."""
 
 import torch
 from jaxtyping import Float
@@ -11,11 +11,11 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction, time_derivative
 
-FLOOR = 0.01  # of the mean running cost (and of the mean cost, at T): violations below it count as absolute ones
-LEAST = 1e-4  # the same of a stationary V, which is right at the goal by construction
-NEAREST = 1 / 300  # of the distance from the goal, to which points are drawn towards it where V is stationary
-SURPLUS = 4  # candidates drawn for each point that is used
-CEILING = 1.2  # times the largest V(0, x₀) of the batch: a funnel of X₀ has no points above
+FLOOR = 0.01  # ℓ₀ and φ₀ relative to the mean running cost and the mean cost: floor of the denominators
+STATIONARY_FLOOR = 1e-4  # the same for a stationary V, which is exact at the goal by construction
+NEAREST_SHARE = 1 / 300  # smallest factor by which points are moved towards the goal for a stationary V
+CANDIDATES_PER_POINT = 4  # random candidates for each point that is used
+CEILING = 1.2  # points with V above this multiple of the batch's largest V(0, x₀) are outside any funnel of X₀
 
 
 class PointwiseCondition:
@@ -24,24 +24,24 @@ class PointwiseCondition:
         Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
-    with V̇ = V_t + V_xᵀ(f + g u), ℓ₀ and φ₀ a share (`floor`) of the batch's mean cost per second and of its mean cost
-    (denominators are detached). Points with V above what a funnel of X₀ can hold do not count. Of a stationary V
-    there is no end.
+    with V̇ = V_t + V_xᵀ(f + g u). ℓ₀ and φ₀ are a share (`floor`) of the batch's mean cost per second and of its mean
+    cost; denominators are detached. Points whose V is too large for a funnel of X₀ do not count. The terms at T are
+    omitted for a stationary V.
 
-    The points of a step are a function of its random stream and of the weights, so that a resumed run sees the same:
-    half of them are drawn, half are the worst of four times as many. Three in ten lie in the last tenth of the horizon,
-    ever denser towards T, where V moves fastest; another half is drawn towards the goal, by a factor that is uniform,
-    or where V is stationary by one whose logarithm is.
+    The points of a step depend only on its random stream and the weights, so that a resumed run uses the same ones.
+    Half of the points are random, the other half are the worst of four times as many. 30 % lie in the last tenth of the
+    horizon, increasingly dense towards T, where V changes fastest. Independently, half of the points are moved towards
+    the goal, by a uniform factor, or by a log-uniform factor for a stationary V.
 
     Args:
-        rollout: of the law that V defines.
-        program: whose condition it is.
+        rollout: closed loop of the law that V defines.
+        program: the program with the condition.
         region: D.
-        weight: of the term.
-        points: drawn and sought in each step.
-        further: (k, 1 + n) points (t, x) that join those of every step: counterexamples.
-        floor: of ℓ₀ and φ₀; 1 %, or 10⁻⁴ of a stationary V. A certificate allows δ beside (1 − α) ℓ: with
-            ℓ₀ ≈ δ/(1 − α) violations weigh as much as they do there.
+        weight: weight of the term.
+        points: number of points in each step.
+        further: (k, 1 + n) points (t, x) that are added in every step, such as counterexamples.
+        floor: share for ℓ₀ and φ₀; by default 1 %, or 10⁻⁴ for a stationary V. A certificate tolerates δ in addition to
+            (1 − α) ℓ; with ℓ₀ ≈ δ/(1 − α) violations have the same weight as there.
     """
 
     closed_loop: ClosedLoop
@@ -73,25 +73,25 @@ class PointwiseCondition:
         self.duration, self.stationary = rollout.problem.horizon.duration, rollout.problem.horizon.stationary
         self.program, self.region = program, region
         self.weight, self.points, self.further = weight, points, further
-        self.floor = (LEAST if self.stationary else FLOOR) if floor is None else floor
+        self.floor = (STATIONARY_FLOOR if self.stationary else FLOOR) if floor is None else floor
 
     @property
     def goal(self) -> State:
-        """x* (n,), on the device and in the precision that the problem has by now."""
+        """x* (n,), on the current device and in the current precision of the problem."""
         return self.problem.goal
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
         """The condition at the points of one step.
 
         Args:
-            generator: the step's stream.
+            generator: the random stream of the step.
             mean_cost: J̄ of the closed loops of the step.
             largest_value: the largest V(0, x₀) among them.
         """
         return self.condition(generator, self.floor * mean_cost.detach(), CEILING * largest_value.detach())
 
     def condition(self, generator: torch.Generator, floor: Tensor, ceiling: Tensor) -> Float[Tensor, ""]:
-        """The condition at the points of one step, of which those with V above a ceiling do not count."""
+        """The condition at the points of one step; points with V above a ceiling do not count."""
         t, x = (y.to(floor) for y in self.draw(generator))
         with torch.no_grad():
             worst = self._violation(t, x, floor, ceiling).topk(self.points // 2).indices
@@ -103,11 +103,11 @@ class PointwiseCondition:
         return violation if self.stationary else violation + self._end_violation(x, floor, ceiling).mean()
 
     def draw(self, generator: torch.Generator) -> tuple[Time, State]:
-        """The points of a step before the worst are chosen: SURPLUS times as many as it uses."""
+        """The candidates of a step, CANDIDATES_PER_POINT times as many as it uses."""
         goal = self.goal
-        x = self.region.sample(SURPLUS * self.points, generator).to(goal)
+        x = self.region.sample(CANDIDATES_PER_POINT * self.points, generator).to(goal)
         share, late, near = torch.rand(3, len(x), generator=generator, dtype=torch.float64).to(x.device)
-        nearer = NEAREST**near if self.stationary else near
+        nearer = NEAREST_SHARE**near if self.stationary else near
         x = goal + (x - goal) * torch.where(late < 0.5, 1.0, nearer)[:, None].to(x)
         before_end = torch.where(late < 0.3, 0.1 * share**2, share)
         return self.duration * (1 - before_end), x

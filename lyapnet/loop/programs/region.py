@@ -1,4 +1,4 @@
-"""The region program: V(x) falls along the closed loop on as large a sublevel set in a box as can be had."""
+"""The region program: V(x) decreases along the closed loop on a sublevel set in a box that is as large as possible."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,22 +16,24 @@ from lyapnet.loop.programs.terms import hinge, terminal_hinge
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.value.networks import kept_states
 
-CEILING = 1.15  # times the least V on the boundary of D: points above do not count as failing
-SHARPNESS, SOFTNESS = 8.0, 30.0  # of what is smoothed: a step at V = ρ, and the least V on the boundary, both in log V
-BOUNDARY, SAMPLES = 1024, 20_000  # points on the boundary, and of D where the region is measured
+CEILING = 1.15  # points with V above this multiple of the least V on the boundary of D do not count
+STEP_SHARPNESS = 8.0  # slope of the smooth step at V = ρ, in log V
+MINIMUM_SHARPNESS = 30.0  # exponent of the smooth minimum over the boundary
+BOUNDARY_POINTS = 1024  # random points on the boundary of D for ρ
+VOLUME_SAMPLES = 20_000  # random points of D that measure the region
 
 
 @dataclass(frozen=True)
 class RegionProgram(Program):
-    """V̇ + share · ℓ ≤ 0 on {x ∈ D: V(x) ≤ ρ}, ρ = the least V on the boundary of D, and that set as large as can be.
+    """V̇ + share · ℓ ≤ 0 on {x ∈ D: V(x) ≤ ρ}, ρ = least V on the boundary of D, with this set as large as possible.
 
-    It is a program of points, RegionCondition, and not of closed loops: C = Σ_n max(V_{n+1} − V_n + share Δt ℓ_n, 0)
-    along these and J_N, the cost of the closed loop, are further terms. V is no longer the cost-to-go, but a Lyapunov
-    function of its law; with share < 1 it may grow steeper than the cost-to-go where that makes the region larger.
+    The condition is imposed at points, see RegionCondition. C = Σ_n max(V_{n+1} − V_n + share Δt ℓ_n, 0) along closed
+    loops and their cost J_N are further terms. V is not the cost-to-go but a Lyapunov function of its law; with share <
+    1 it may be steeper than the cost-to-go where that enlarges the region.
 
     Args:
-        share: of the running cost, by which V falls at the least, so that a proof has room.
-        growth: weight of the share of D outside the region, against the condition.
+        share: smallest decrease of V relative to the running cost; positive as a reserve for a proof.
+        growth: weight of the share of D outside the region, relative to the condition.
     """
 
     degree: ClassVar[int] = 1
@@ -65,27 +67,27 @@ class RegionProgram(Program):
 
 
 class RegionCondition(PointwiseCondition):
-    """The mean of max(V̇ + share ℓ, 0) / (ℓ + ℓ₀) at points of {x ∈ D: V ≤ 1.15 ρ} + growth × the share of D outside:
+    """The mean of max(V̇ + share ℓ, 0) / (ℓ + ℓ₀) at points of {x ∈ D: V ≤ 1.15 ρ}, plus growth times
 
         mean over x ∈ D of σ(8 log(V(x)/ρ)),     ρ = (Σ V⁻³⁰)^(−1/30) over points of the boundary of D,
 
-    a smooth measure of the volume that {V ≤ ρ} does not have yet. Points are drawn and sought as of PointwiseCondition.
+    a smooth measure of the share of D outside {V ≤ ρ}. The points are chosen as in PointwiseCondition.
     """
 
     program: RegionProgram
 
     def __call__(self, generator: torch.Generator, mean_cost: Tensor, largest_value: Tensor) -> Float[Tensor, ""]:
-        """The condition at the points of one step; of the closed loops it needs the mean cost alone."""
-        level = -torch.logsumexp(-SOFTNESS * self._log_value(self._boundary(generator)), 0) / SOFTNESS
+        """The condition at the points of one step; `largest_value` is not used."""
+        level = -torch.logsumexp(-MINIMUM_SHARPNESS * self._log_value(self._boundary(generator)), 0) / MINIMUM_SHARPNESS
         failing = self.condition(generator, self.floor * mean_cost.detach(), CEILING * level.detach().exp())
         inside = self.region.sample(2 * self.points, generator).to(mean_cost)
-        return failing + self.program.growth * torch.sigmoid(SHARPNESS * (self._log_value(inside) - level)).mean()
+        return failing + self.program.growth * torch.sigmoid(STEP_SHARPNESS * (self._log_value(inside) - level)).mean()
 
     @torch.no_grad()
     def sampled_share(self, generator: torch.Generator) -> Float[Tensor, ""]:
-        """The share of D in the largest {V ≤ ρ} on which V falls, as far as samples tell."""
+        """The share of D in the largest {V ≤ ρ} on which V decreases, estimated from samples."""
         V, loop = self.V, self.closed_loop
-        x, now = self.region.sample(SAMPLES, generator).to(self.goal), self.goal.new_zeros(())
+        x, now = self.region.sample(VOLUME_SAMPLES, generator).to(self.goal), self.goal.new_zeros(())
         value, slope = V.value_and_state_gradient(now, x)
         rising = (slope * loop.system.dynamics(x, loop.policy(now, x))).sum(-1) >= 0
         boundary = self._log_value(self._boundary(generator)).exp()
@@ -96,8 +98,8 @@ class RegionCondition(PointwiseCondition):
         return self.V(x.new_zeros(()), x).clamp_min(torch.finfo(x.dtype).tiny).log()
 
     def _boundary(self, generator: torch.Generator) -> State:
-        """Points of the boundary of D, as many on each side along which V changes."""
-        x = self.region.sample(BOUNDARY, generator).to(self.goal)
+        """Random points on the boundary of D, the same number on each side along which V changes."""
+        x = self.region.sample(BOUNDARY_POINTS, generator).to(self.goal)
         sides = [(i, side) for i in self.axes for side in (self.region.lower[i], self.region.upper[i])]
         for k, (i, side) in enumerate(sides):
             x[k :: len(sides), i] = side
@@ -105,5 +107,5 @@ class RegionCondition(PointwiseCondition):
 
     @property
     def axes(self) -> list[int]:
-        """The states that V depends on: along the others V does not change, and D has no boundary."""
+        """The states on which V depends; along the others D is unbounded."""
         return kept_states(self.V, self.region.dimension)

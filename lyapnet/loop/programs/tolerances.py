@@ -1,8 +1,8 @@
-"""What counts as success of one closed loop: the events that a program promises, and certificates count."""
+"""Success criteria of a closed loop, which certificates check."""
 
 from dataclasses import dataclass
 
-EVENTS = ("decrease", "terminal", "cost", "constraints", "all")  # one that is not asked for counts as success
+EVENTS = ("decrease", "terminal", "cost", "constraints", "all")  # an event that is not required counts as success
 
 
 @dataclass(frozen=True)
@@ -13,11 +13,11 @@ class Tolerances:
         terminal:  ‖x_N − goal‖ ≤ radius,
         cost:      J_N(x₀) ≤ (1 + cost) V(0, x₀),
         constraints:  h(x_n) ≤ 0,
-        all:       these together.
+        all:       all of these.
 
     Args:
-        radius: in the norm of the state's components, each in its own unit. None, here and for decrease: not asked for.
-        constraints: whether they are asked for.
+        radius: in the norm of the state, each component in its own unit; None, also for decrease: not required.
+        constraints: whether they are required.
     """
 
     radius: float | None = None
@@ -32,7 +32,7 @@ class Tolerances:
 
     @property
     def asked(self) -> list[str]:
-        """The single events that are asked for."""
+        """The required single events."""
         constraints = True if self.constraints else None
         limits = {"decrease": self.decrease, "terminal": self.radius, "cost": self.cost, "constraints": constraints}
         return [event for event, limit in limits.items() if limit is not None]

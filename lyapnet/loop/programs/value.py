@@ -10,24 +10,24 @@ from torch import Tensor
 
 from lyapnet.base.types import PerState, ValuePath
 from lyapnet.loop.programs.base import Program
-from lyapnet.loop.programs.terms import LEAST, cost_to_go_error, promised, residual, terminal_residual
+from lyapnet.loop.programs.terms import MIN_COST_SHARE, cost_to_go_error, residual, terminal_residual, value_floored
 from lyapnet.loop.rollout import Trajectory
 
-LOST = 1.5  # times as much as V(0, x₀) promises, the batch's median of which being one: the law is lost there, not V
+LOST_COST_RATIO = 1.5  # J/V(0, x₀) relative to the batch's median, above which the law, not V, is wrong
 
 
 @dataclass(frozen=True)
 class ValueProgram(Program):
     """C = Σ_n (V_{n+1} − V_n + Δt ℓ_n)² and B = (V(T, x_N) − φ(x_N))². Source: P_V of arXiv 2305.15244.
 
-    The loss has a further term, cost_to_go · D, with D the mean over the nodes of (V_n − J_n)², J_n being what the
-    closed loop still pays. D is zero where C and B are, and sees the level of V at once, which they see faintly.
+    The further term is cost_to_go · D, with D the mean over the nodes of (V_n − J_n)² and J_n the cost to go of the
+    closed loop. D is zero if C and B are zero, and more sensitive to the level of V.
 
-    With `relative`, a normalised D is measured against the cost J of its own trajectory, LEAST of J̄ at the least: V is
-    then right in relation to what it costs from where that is little, too. And D then has no gradient of trajectories
-    that cost far more than V(0, x₀) says, LOST times the batch's median of J/V(0, x₀), 1 at the least: what a law that
-    is lost pays is no better guess of the optimum than V. Taken for the truth it would raise V where the way to the
-    goal begins, and lead the laws of the states around away from it, until all of them are lost.
+    With `relative`, a normalised D is divided by the squared cost J of its own trajectory, at least MIN_COST_SHARE of
+    J̄, so that V is also accurate where the cost is small. Lost trajectories, which cost far more than V(0, x₀) (see
+    `lost`), then have no gradient of D: their cost is no better estimate of the optimum than V. Learning it would raise
+    V at states where the way to the goal begins, so that the laws of neighbouring states avoid these and become lost
+    too.
     """
 
     degree: ClassVar[int] = 2
@@ -47,11 +47,11 @@ class ValueProgram(Program):
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
         if self.relative and name == "cost_to_go":
-            return cost.maximum(LEAST * mean_cost) ** 2
+            return cost.maximum(MIN_COST_SHARE * mean_cost) ** 2
         return super().unit(name, cost, mean_cost)
 
     def without_goal(self, reason: str) -> "ValueProgram":
-        return replace(self, relative=False)  # J of a trajectory may be anything
+        return replace(self, relative=False)  # J may have any sign
 
     def penalty(self, excess: Tensor) -> Tensor:
         return excess**2
@@ -64,7 +64,7 @@ class ValueProgram(Program):
 
 
 def lost(values: ValuePath, trajectory: Trajectory) -> Bool[Tensor, "*batch"]:
-    """Whether a trajectory costs LOST times as much as V(0, x₀) says, in units of the batch's median of that ratio."""
+    """Whether J/V(0, x₀) of a trajectory exceeds LOST_COST_RATIO times the batch's median (at least 1)."""
     J = trajectory.cost.detach()
-    ratio = J / promised(values[0].detach(), J)
-    return ratio > LOST * ratio.median().clamp_min(1)
+    ratio = J / value_floored(values[0].detach(), J)
+    return ratio > LOST_COST_RATIO * ratio.median().clamp_min(1)

@@ -1,4 +1,4 @@
-"""The closed loop: its vector field, its integration, and the gradients of what it costs."""
+"""The closed loop: its vector field, its integration, and the gradients of its cost."""
 
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.loop.rollout.discrete_adjoint import DiscreteAdjoint

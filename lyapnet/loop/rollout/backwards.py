@@ -1,8 +1,7 @@
-"""Backwards along a closed loop: from the loss's derivatives at the nodes to those by x₀ and the parameters.
+"""The backward pass along a closed loop, from the loss's derivatives at the nodes to those by x₀ and the parameters.
 
-Either one step at a time, by differentiating the step itself; or block by block, linearised at all states of a block at
-once. The first needs no products with the network's matrices for each state component; the second has few, large
-operations, as torch and GPUs like them.
+The stepwise route differentiates one step at a time, without a product with the network's matrices for each state
+component. The blockwise route linearises all states of a block at once, with few large operations, which suits GPUs.
 """
 
 import math
@@ -15,18 +14,18 @@ from torch import Tensor
 
 from lyapnet.base.types import Jacobians, StagePath, State, StatePath, Times, ValuePath
 
-EVERY = 4  # nodes from one limit of the costates to the next, as the recipe's limit was chosen with
+LIMIT_INTERVAL = 4  # nodes between two limitations of the costates; the recipe's limit was tuned with this
 
 
 class PathWithDerivatives(NamedTuple):
-    """A path and the loss's derivatives along it, over its nodes 0 … N."""
+    """A path and the loss's derivatives along it, at its nodes 0 … N."""
 
     t: Times
     dt: Times  # 0 at the last node
     stages: StagePath
-    node_bar: StatePath  # by x
-    cost_bar: ValuePath  # by ∫ℓ over the step
-    value_bar: ValuePath  # by V
+    node_bar: StatePath  # derivative by x
+    cost_bar: ValuePath  # derivative by ∫ℓ over the step
+    value_bar: ValuePath  # derivative by V
 
 
 class StepwiseGradient:
@@ -34,7 +33,7 @@ class StepwiseGradient:
 
     Args:
         pull_back: (*state, t, Δt, x, x̄, c̄, V̄, λ'), columns with the latest node first ↦ (λ at the nodes, *θ̄).
-        limit: of the costates, at each EVERY-th node.
+        limit: largest length of costates, see `limit_costates`; applied at each LIMIT_INTERVAL-th node.
     """
 
     def __init__(self, pull_back: Callable[..., Sequence[Tensor]], limit: float | None):
@@ -44,11 +43,15 @@ class StepwiseGradient:
         nodes = len(path.t)
         t, dt, stages, *derivatives = path
         columns = [column.flip(0) for column in (t, dt, stages[:, 0], *derivatives)]
-        ends = [0, nodes] if self.limit is None else [0, *range((nodes - 1) % EVERY + 1, nodes + 1, EVERY)]
+        ends = (
+            [0, nodes]
+            if self.limit is None
+            else [0, *range((nodes - 1) % LIMIT_INTERVAL + 1, nodes + 1, LIMIT_INTERVAL)]
+        )
         costate, gradient = torch.zeros_like(path.node_bar[0]), list[Tensor]()
         for start, end in pairwise(ends):
             costates, *share = self.pull_back(*state, *(column[start:end] for column in columns), costate)
-            costate = costates[-1] if self.limit is None else limited(costates[-1], self.limit)
+            costate = costates[-1] if self.limit is None else limit_costates(costates[-1], self.limit)
             gradient = [total + part for total, part in zip(gradient, share, strict=True)] if gradient else share
         return costate, gradient
 
@@ -59,8 +62,8 @@ class BlockwiseGradient:
     Args:
         linearise: (*state, *block) ↦ (Φᵀ, source, *intermediate).
         product: (*state, *block, costate, *intermediate) ↦ θ̄.
-        block: K, nodes in a block.
-        limit: of the costates, at each EVERY-th node.
+        block: K, the number of nodes in a block.
+        limit: as for StepwiseGradient.
     """
 
     def __init__(
@@ -95,8 +98,8 @@ def run_costate(
     """λ = Φᵀλ' + source backwards through a block: (λ before its first step, λ' after each of its steps).
 
     Args:
-        first: the index of its first node.
-        limit: of the length of λ.
+        first: index of the block's first node.
+        limit: as for StepwiseGradient.
     """
     K, n = len(source), source.shape[-1]
     transition, source = transition.reshape(K, -1, n, n), source.reshape(K, -1, n, 1)
@@ -104,17 +107,17 @@ def run_costate(
     for k in reversed(range(K)):
         after[k] = running
         running = torch.baddbmm(source[k], transition[k], running)
-        if limit is not None and (first + k) % EVERY == 0:
-            running = limited(running.reshape(costate.shape), limit).reshape(running.shape)
+        if limit is not None and (first + k) % LIMIT_INTERVAL == 0:
+            running = limit_costates(running.reshape(costate.shape), limit).reshape(running.shape)
     return running.reshape(costate.shape), after.reshape(K, *costate.shape)
 
 
-def limited(costate: State, limit: float) -> State:
-    """Costates (*members, b, n), none longer than `limit` times the median length of its batch.
+def limit_costates(costate: State, limit: float) -> State:
+    """Shorten costates (*members, b, n) to at most `limit` times the median length of their batch.
 
-    The median says how long a costate is where a small change of x is a small change of what follows. Where a closed
-    loop is unstable, or a change of x decides whether the goal is reached, λ grows exponentially backwards, and one
-    such trajectory outweighs all others in the gradient of their mean, while it says little about where to go.
+    If a closed loop is unstable, or a small change of x decides whether it reaches the goal, λ grows exponentially
+    backwards in time. A single such trajectory would dominate the gradient of the mean, without useful information. The
+    median is the length for trajectories that depend smoothly on x.
     """
     length = torch.linalg.vector_norm(costate, dim=-1, keepdim=True)
     longest = limit * length.median(-2, keepdim=True).values
@@ -122,10 +125,10 @@ def limited(costate: State, limit: float) -> State:
 
 
 def padded(column: Tensor, length: int) -> Tensor:
-    """The column with zeros after it: steps that no loss depends on."""
+    """Append zeros to a column: steps on which the loss does not depend."""
     return torch.cat([column, column.new_zeros(length - len(column), *column.shape[1:])])
 
 
 def repeated(column: Tensor, length: int) -> Tensor:
-    """The column with its last entry after it."""
+    """Append copies of the last entry to a column."""
     return torch.cat([column, column[-1:].expand(length - len(column), *column.shape[1:])])

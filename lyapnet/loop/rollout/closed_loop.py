@@ -1,4 +1,4 @@
-"""The closed loop as one vector field of the state and its running cost."""
+"""The closed loop as a vector field of the state and the running cost."""
 
 import torch
 from torch import Tensor, nn
@@ -24,7 +24,7 @@ class ClosedLoop(nn.Module):
 
     @property
     def V(self) -> ValueFunction | None:
-        """The V that defines the control law; None where no V does."""
+        """The V that defines the control law; None if the law is not defined by a V."""
         return self.policy.V if isinstance(self.policy, ValuePolicy) else None
 
     def forward(self, t: Time, y: Tensor) -> Tensor:
@@ -36,14 +36,14 @@ class ClosedLoop(nn.Module):
         return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
 
     def control(self, t: Time, x: State) -> PolicyOutput:
-        """u, V and V_x; with a law that no V defines, V = 0."""
+        """u, V and V_x; zeros for V and V_x if the law is not defined by a V."""
         if isinstance(self.policy, ValuePolicy):
             return self.policy.with_value(t, x)
         return PolicyOutput(self.policy(t, x), torch.zeros_like(x[..., 0]), torch.zeros_like(x))
 
 
 class SteppedLoop(ClosedLoop):
-    """The means of (f + gu, ℓ) over a step with u held: Euler steps of it are steps of the horizon's method."""
+    """The means of (f + gu, ℓ) over a step with u held; its Euler steps equal the steps of the horizon's method."""
 
     def __init__(self, problem: Problem, policy: nn.Module):
         super().__init__(problem, policy)

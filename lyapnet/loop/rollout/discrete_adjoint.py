@@ -1,8 +1,8 @@
-"""The exact gradient of a discretised closed loop: Pontryagin's estimator in discrete time.
+"""The exact gradient of a discretised closed loop by the discrete costate equation (Pontryagin).
 
-The closed loop is integrated without a graph. Backwards the costate runs from step to step, and each step gives its
-share of the parameters' gradient (lyapnet.loop.rollout.runge_kutta has the equations). Memory is that of the path, and
-of one step or one block of steps.
+The closed loop is integrated without a graph. The backward pass computes the costate step by step, and each step's
+contribution to the parameters' gradient; the equations are in lyapnet.loop.rollout.runge_kutta. It needs memory for the
+path and for one step or one block of steps.
 """
 
 import logging
@@ -29,26 +29,26 @@ from lyapnet.loop.rollout.runge_kutta import Linearise, Step
 from lyapnet.task.horizon import TABLEAUX
 
 _LOG = logging.getLogger(__name__)
-Rolled = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
-VISITED = 6  # steps of a rollout at which its trace, or shared code, is held against the loop itself
-BLOCK = 512  # states linearised at once: 64 float64 units of each are a quarter of a megabyte, which a cache holds
-ON_GPU = 131_072  # states linearised at once there
+RolledPath = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
+CHECKED_STEPS = 6  # steps of a rollout at which a trace or shared code is compared with the loop itself
+STATES_PER_BLOCK = 512  # states linearised at once: 64 hidden units each in float64 are 256 kB, which fit into a cache
+STATES_PER_BLOCK_ON_GPU = 131_072  # the same on a GPU
 
 
 class DiscreteAdjoint:
     """x₀ ↦ the path of the discretised closed loop, with its exact gradient in x₀ and the loop's parameters.
 
-    The work is traced for one batch shape at its first use (lyapnet.graphs.tracing). Parameters and buffers of the
-    system, the cost and V are arguments of what is traced and may change between rollouts; what else f, g and V read is
-    frozen. A loop that cannot be traced, since its control flow depends on tensor values or leaves torch, runs eagerly;
-    the log says why.
+    The computations are traced for each batch shape at its first use (lyapnet.graphs.tracing). Parameters and buffers
+    of the system, the cost and V are arguments of the trace and may change between rollouts; all other numbers that f,
+    g and V use are frozen. A loop that cannot be traced, because its control flow depends on tensor values or leaves
+    torch, runs eagerly; the log says why.
 
     Args:
         loop: the closed loop.
         steps, dt: N and Δt in s.
         method: a key of TABLEAUX.
-        costate_limit: L; backwards, at every fourth node, the costates of a batch longer than L times their median are
-            cut to that length. None: no limit, and the exact gradient. It is the exact one too where none is so long.
+        costate_limit: L; at every fourth node, costates of a batch that are longer than L times their median are
+            shortened to that length. None: no limit. The gradient is exact if no costate is shortened.
     """
 
     loop: ClosedLoop
@@ -60,47 +60,47 @@ class DiscreteAdjoint:
         self.costate_limit = costate_limit
         self._traced: dict[tuple[Any, ...], TracedRoutines] = {}
         self._routines: dict[tuple[Any, ...], Routines] = {}
-        self._compiled: Tensor | None = None  # an x₀ of the batches that run as machine code
+        self._compiled: Tensor | None = None  # an x₀ with the shape of the compiled batches
         self._compiled_key: tuple[Any, ...] | None = None
-        self._told = False  # whether the log has said why the loop runs as it is written
+        self._has_warned = False  # whether it was logged why the loop runs eagerly
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without the work, which belongs to these very tensors: a copy does its own."""
+        """Without traces and code, which belong to these very tensors; a copy makes its own."""
         return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None, "_compiled_key": None}
 
-    def __call__(self, x0: State) -> Rolled:
+    def __call__(self, x0: State) -> RolledPath:
         """(x, ∫ℓ, V, u) at the nodes, from x₀ (b, n).
 
         Raises:
-            UsageError: the loop draws random numbers, which the way back could not repeat.
+            UsageError: the loop draws random numbers, which the backward pass could not repeat.
         """
-        x0, theta = x0.contiguous(), self.trained()  # contiguous as machine code takes it, which does not check
+        x0, theta = x0.contiguous(), self.trained()  # compiled code assumes contiguous tensors without a check
         if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
             x, running_cost, value, u = _Rollout.apply(self, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
             return x, running_cost, value, u
-        return _read(self._integrate_any(x0, theta))
+        return _path_of(self._integrate_without_gradient(x0, theta))
 
     def trained(self) -> list[Tensor]:
-        """The loop's parameters that ask for a gradient."""
+        """The loop's parameters that require a gradient."""
         return trained_of(self.loop)
 
     def compile(self, x0: State) -> None:
-        """Have batches like x₀ run as machine code, and others, where no gradient is asked for, in slices of that size.
+        """Compile for batches like x₀; other batches then also use this code in slices, if they need no gradient.
 
         Raises:
             UntraceableError: the loop cannot be traced.
             CompilationError: as TracedRoutines.compiled.
         """
         if self._compiled_key != self._key(x0):
-            self._take_compiled(self._work(x0).compiled(), x0)
+            self._set_compiled(self._work(x0).compiled(), x0)
 
     @property
     def compiled_batch(self) -> int:
-        """How many states the batches have that run as machine code; 0 where there is none."""
+        """The size of compiled batches; 0 if nothing is compiled."""
         return 0 if self._compiled is None else len(self._compiled)
 
     def compile_like(self, other: "DiscreteAdjoint") -> None:
-        """Have batches run as machine code where another loop has them.
+        """Compile for the same batches as another loop.
 
         Raises:
             UntraceableError, CompilationError: as compile.
@@ -109,15 +109,15 @@ class DiscreteAdjoint:
             self.compile(other._compiled)
 
     def share_code(self, other: "DiscreteAdjoint", x0: State) -> bool:
-        """Run by the machine code of a loop that differs in tensors alone, if it has some and agrees along its paths.
+        """Use the compiled code of another loop that differs only in its tensors; return whether that is possible.
 
-        What a trace has frozen, a number or a tensor that no buffer holds, may be another one here. So the code is held
-        against this loop as it is written: at some steps of its paths from x₀ and, where something is trained, by their
-        gradient. A loop of which nothing is trained takes the code of one of which everything is, as its tensors are in
-        the same order.
+        The trace may have frozen numbers, or tensors outside of buffers, that differ in this loop. Therefore the code
+        is compared with this loop run eagerly, at some steps of its paths from x₀ and by their gradient if anything is
+        trained. A loop without trained parameters may use the code of one where all are trained, because its tensors
+        have the same order.
 
         Args:
-            x0: (b, n) where closed loops begin, as many as the other has code for.
+            x0: initial states (b, n), with the size of the other's compiled batches.
         """
         routines = None if other._compiled is None else other._routines.get(other._key(other._compiled))
         flags, of_other = ([p.requires_grad for p in each.loop.parameters()] for each in (self, other))
@@ -131,21 +131,21 @@ class DiscreteAdjoint:
         with suppress(RuntimeError, ValueError):  # tensors of other shapes
             agrees = self._agrees(routines, x0)
         if agrees:
-            self._take_compiled(routines, x0)
+            self._set_compiled(routines, x0)
         return agrees
 
     def _compiled_for(self, x0: State) -> tuple[Any, ...]:
-        """What is frozen in a trace for sure, besides the code of f, g, the cost and V."""
+        """The facts that are certainly frozen in a trace, besides the code of f, g, the cost and V."""
         system, cost = self.loop.system, self.loop.cost
         return self._key(x0)[:3], self.steps, self.dt, self._tableau, self.costate_limit, type(system), type(cost)
 
     def _agrees(self, routines: Routines, x0: State) -> bool:
-        """Whether paths from x₀ have steps of this loop, and the gradient of the sum of their x, ∫ℓ and V."""
+        """Whether routines give this loop's steps from x₀, and the gradient of the sum of x, ∫ℓ and V."""
         theta, step = self.trained(), Step(self.loop, self._tableau)
         nodes, (t, dt) = self.integrate(routines, x0, theta), self._grid(x0, self.steps + 1)
         found, expected = list[Tensor](), list[Tensor]()
         with torch.no_grad():
-            for k in self._some_steps():
+            for k in self._steps_to_check():
                 following, *kept = step(t[k], dt[k], nodes.stages[k, 0])
                 found += [column[k] for column in nodes]
                 expected += kept
@@ -154,34 +154,34 @@ class DiscreteAdjoint:
                     expected.append(following)
         if theta:
             ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
-            for routes, results in ((routines, found), (self._as_written(x0), expected)):
+            for routes, results in ((routines, found), (self._eager_routines(x0), expected)):
                 x0_bar, theta_bar = self.gradient(routes, theta, nodes.stages, ones)
                 results += [x0_bar, *theta_bar]
         return all(are_close(mine, theirs) for mine, theirs in zip(found, expected, strict=True))
 
-    def _some_steps(self) -> list[int]:
-        """VISITED steps, from the first one to the last node."""
-        return torch.linspace(0, self.steps, VISITED).long().tolist()
+    def _steps_to_check(self) -> list[int]:
+        """The indices of CHECKED_STEPS steps, from the first step to the last node."""
+        return torch.linspace(0, self.steps, CHECKED_STEPS).long().tolist()
 
-    def _take_compiled(self, routines: Routines, x0: State) -> None:
+    def _set_compiled(self, routines: Routines, x0: State) -> None:
         self._routines[self._key(x0)] = routines
         self._compiled, self._compiled_key = x0.detach(), self._key(x0)
 
     def routines(self, x0: State) -> Routines:
-        """The work for batches like x₀: compiled, else traced, else as written."""
+        """The routines for batches like x₀: compiled, else traced, else eager."""
         key = self._key(x0)
         if key not in self._routines:
             try:
                 self._routines[key] = self._work(x0).traced()
             except UntraceableError as error:
-                if not self._told:
+                if not self._has_warned:
                     _LOG.warning("%s It runs as it is written, which is slower.", error)
-                    self._told = True
-                self._routines[key] = self._as_written(x0)
+                    self._has_warned = True
+                self._routines[key] = self._eager_routines(x0)
         return self._routines[key]
 
     def integrate(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> Nodes:
-        """The path from x₀; its last node takes a step of length zero, which makes it a node like the others."""
+        """The path from x₀; a step of length zero at its last node makes all nodes alike."""
         with torch.no_grad():
             return Nodes(*routines.integrate(*self._state(theta), *self._grid(x0, self.steps + 1), x0))
 
@@ -194,19 +194,19 @@ class DiscreteAdjoint:
         cost_bar = padded(running_cost_bar.flip(0).cumsum(0).flip(0)[1:], len(stages))
         path = PathWithDerivatives(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
         costate, share = routines.gradient(self._state(theta), path)
-        return costate, share[: len(theta)]  # shared code may have the gradient of more than is trained here
+        return costate, share[: len(theta)]  # shared code may have gradients of parameters that are not trained here
 
-    def _integrate_any(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
-        """The path without a gradient: by compiled routines, in slices if need be; else without a trace."""
+    def _integrate_without_gradient(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
+        """The path without a gradient: by compiled routines, if necessary in slices; else eagerly."""
         if self._key(x0) in self._routines:
             return self.integrate(self._routines[self._key(x0)], x0, theta)
         if (
             not x0.numel()
             or self._compiled is None
-            or self._key(self._compiled) not in self._routines  # other parameters were trained then
+            or self._key(self._compiled) not in self._routines  # it was compiled for other trained parameters
             or self._key(self._compiled[0]) != self._key(x0[0])
         ):
-            return self.integrate(self._as_written(x0), x0, theta)
+            return self.integrate(self._eager_routines(x0), x0, theta)
         size, batch = len(self._compiled), len(x0)
         full = torch.cat([x0, x0[-1:].expand(-batch % size, -1)])
         routines = self._routines[self._key(self._compiled)]
@@ -217,15 +217,15 @@ class DiscreteAdjoint:
         return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
 
     def _key(self, x0: Tensor) -> tuple[Any, ...]:
-        """What the work is done for: a shape, and parameters that are trained."""
+        """The key of routines: shape, dtype, device, and which parameters are trained."""
         return tuple(x0.shape), x0.dtype, x0.device, tuple(p.requires_grad for p in self.loop.parameters())
 
     def _state(self, theta: Sequence[Tensor]) -> list[Tensor]:
-        """The tensors that the loop is made of, the trained ones first."""
+        """The tensors of the loop, the trained ones first."""
         return state_of(self.loop, theta)
 
     def _work(self, x0: Tensor) -> TracedRoutines:
-        """The work for batches like x₀ as graphs, each traced once."""
+        """The traced routines for batches like x₀."""
         key = self._key(x0)
         if key not in self._traced:
             state, grid, x0 = self._state(self.trained()), self._grid(x0, self.steps + 1), x0.detach().contiguous()
@@ -236,13 +236,13 @@ class DiscreteAdjoint:
         return self._traced[key]
 
     def _visited(self, x0: Tensor) -> list[list[Tensor]]:
-        """(t, Δt, x) of some steps along the loop as it is written."""
+        """(t, Δt, x) of some steps of the loop run eagerly."""
         t, dt = self._grid(x0, self.steps + 1)
-        path = self.integrate(self._as_written(x0), x0, self.trained()).stages[:, 0]
-        return [[t[k], dt[k], path[k]] for k in self._some_steps()]
+        path = self.integrate(self._eager_routines(x0), x0, self.trained()).stages[:, 0]
+        return [[t[k], dt[k], path[k]] for k in self._steps_to_check()]
 
-    def _as_written(self, x0: Tensor) -> Routines:
-        """The work in Python, on the loop's own tensors."""
+    def _eager_routines(self, x0: Tensor) -> Routines:
+        """The routines in Python, on the loop's own tensors."""
         skipped, own_step = len(self._state(self.trained())), Step(self.loop, self._tableau)
         own_linearise = Linearise(self.loop, self._tableau)
 
@@ -261,26 +261,26 @@ class DiscreteAdjoint:
         return Routines(Scan(lambda *_: (), step, skipped).loop, gradient)
 
     def _block(self, x0: Tensor) -> int:
-        """K: blocks of equal length with about BLOCK states in each."""
+        """K for blocks of equal length with about STATES_PER_BLOCK states in each."""
         nodes, states = self.steps + 1, max(1, len(x0))
-        most = BLOCK if x0.device.type == "cpu" else ON_GPU
+        most = STATES_PER_BLOCK if x0.device.type == "cpu" else STATES_PER_BLOCK_ON_GPU
         return math.ceil(nodes / math.ceil(nodes * len(self._tableau.b) * states / most))
 
     def _grid(self, like: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
-        """(t, Δt) of the first nodes; from the last one of the horizon on, t = T and Δt = 0."""
+        """(t, Δt) of the first nodes; t = T and Δt = 0 from the last node of the horizon on."""
         index = torch.arange(nodes, device=like.device)
         t = index.clamp(max=self.steps).to(like.dtype) * self.dt
         return t, (index < self.steps).to(like.dtype) * self.dt
 
 
 class _Rollout(torch.autograd.Function):
-    """(adjoint, x₀, *θ) ↦ (x, ∫ℓ, V, u), where u is a record without a gradient."""
+    """(adjoint, x₀, *θ) ↦ (x, ∫ℓ, V, u), where u has no gradient."""
 
     @staticmethod
     def forward(ctx: Any, adjoint: DiscreteAdjoint, x0: Tensor, *theta: Tensor) -> tuple[Tensor, ...]:
         routines = adjoint.routines(x0)
         path = adjoint.integrate(routines, x0, theta)
-        result = _read(path)
+        result = _path_of(path)
         ctx.adjoint, ctx.routines = adjoint, routines
         ctx.save_for_backward(path.stages, *theta, *untrained_of(adjoint.loop))
         ctx.mark_non_differentiable(result[-1])
@@ -289,7 +289,7 @@ class _Rollout(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
-        stages, *state = ctx.saved_tensors  # torch refuses tensors that were changed in between
+        stages, *state = ctx.saved_tensors  # torch raises an error if they were changed in between
         theta, facts = state[: len(ctx.needs_input_grad) - 2], state[len(ctx.needs_input_grad) - 2 :]
         now = [tensor.data_ptr() for tensor in untrained_of(ctx.adjoint.loop)]
         if now != [tensor.data_ptr() for tensor in facts]:
@@ -300,7 +300,7 @@ class _Rollout(torch.autograd.Function):
         return None, x0_bar, *theta_bar
 
 
-def _read(nodes: Nodes) -> Rolled:
+def _path_of(nodes: Nodes) -> RolledPath:
     """(x, ∫ℓ, V, u) at the nodes."""
     running_cost = torch.cat([torch.zeros_like(nodes.step_cost[:1]), nodes.step_cost[:-1].cumsum(0)])
     return nodes.stages[:, 0], running_cost, nodes.value, nodes.u[:-1]

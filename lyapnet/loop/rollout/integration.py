@@ -19,10 +19,10 @@ class Trajectory(NamedTuple):
 
     t: Times  # (N + 1,)
     x: StatePath  # (N + 1, *batch, n)
-    u: ControlPath  # (N, *batch, m) applied from t_n on; a record, never part of the graph
+    u: ControlPath  # (N, *batch, m) applied from t_n on; never part of the graph
     running_cost: ValuePath  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: PerState  # (*batch,): φ(x_N)
-    value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), where a V defines the control law
+    value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), if a V defines the control law
 
     def require_value(self) -> ValuePath:
         """V along the trajectory.
@@ -35,13 +35,13 @@ class Trajectory(NamedTuple):
         return self.value
 
     @property
-    def cost(self) -> Any:  # a tensor, or an array where the fields are arrays
+    def cost(self) -> Any:  # a tensor, or an array if the fields are arrays
         """J_N = running cost plus terminal cost, (*batch,)."""
         return self.running_cost[-1] + self.terminal_cost
 
     @property
     def step_cost(self) -> Any:
-        """∫ℓ over each step in the integrator's own quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
+        """∫ℓ over each step by the integrator's quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
         return self.running_cost[1:] - self.running_cost[:-1]
 
 
@@ -54,32 +54,32 @@ GRADIENTS = ("adjoint", "backprop", "discrete")
 class Rollout(nn.Module):
     """x₀ ↦ Trajectory under u = policy(t, x), by torchdiffeq on the state augmented with the running cost.
 
-    Fixed-step methods take one step from node to node: with Euler, x_{n+1} = x_n + Δt(f + g u) and the cost is J_N.
+    Fixed-step methods take one step between nodes: with Euler, x_{n+1} = x_n + Δt(f + g u) and the cost is J_N.
 
     Args:
-        problem, policy: what is integrated.
-        method: a member of METHODS, None: the horizon's; rk4 is the 3/8 rule, dopri5 chooses its own steps between the
-            nodes. A law that is made to be held is held over each step of a fixed-step method, else it is u(t, x) at
-            every stage.
+        problem, policy: problem and control law of the closed loop.
+        method: a member of METHODS; None: that of the horizon. rk4 is the 3/8 rule, dopri5 chooses its own steps
+            between the nodes. A law that is made to be held is held over each step of a fixed-step method; other laws
+            are evaluated as u(t, x) at every stage.
         gradient: a member of GRADIENTS.
 
             * adjoint: the costate equation ȧ = −aᵀ(f_x + f_u u_x) − (ℓ_x + ℓ_u u_x) is integrated backwards from node
               to node, and ∫(aᵀf_u + ℓ_u)u_θ dt gives the parameters' gradient (Pontryagin's form of the neural-ODE
-              adjoint). Memory does not grow with the graph of a step; the gradient is that of the continuous problem,
-              so on a fixed grid it differs from the discrete one by O(Δt).
-            * backprop: automatic differentiation through the steps; the exact gradient of the discretisation.
-            * discrete: the same gradient, exact, by the discrete costate equation (see DiscreteAdjoint); several times
-              faster than either, in memory that grows with neither the network nor the graph of the steps. For
-              fixed-step methods.
+              adjoint). Memory does not grow with the graph of a step. It is the gradient of the continuous problem,
+              and differs on a fixed grid from the discrete one by O(Δt).
+            * backprop: automatic differentiation through the steps, the exact gradient of the discretisation.
+            * discrete: the same exact gradient by the discrete costate equation, see DiscreteAdjoint. Several times
+              faster than both, with memory that grows neither with the network nor with the graph of the steps. For
+              fixed-step methods only.
         rtol, atol: tolerances of adaptive methods.
-        costate_limit: with gradient discrete, times the median of its batch that a costate may be long; None: any, the
-            exact gradient (see DiscreteAdjoint).
+        costate_limit: for gradient discrete, largest length of a costate relative to the median of its batch; None: no
+            limit, the exact gradient (see DiscreteAdjoint).
         held: whether u is held over each step; None: as the law is made to be.
 
     Raises:
-        ValueError: an unknown method or gradient (torchdiffeq itself would only warn, or fail later); or discrete with
-            an adaptive method, whose steps depend on the state; or adjoint for a law that is held, but by Euler; or a
-            limit of the costates below 1, or of another gradient.
+        ValueError: an unknown method or gradient (torchdiffeq would only warn, or fail later); discrete with an
+            adaptive method, whose steps depend on the state; adjoint with a held law, except for Euler; a costate limit
+            below 1, or with another gradient.
     """
 
     problem: Problem
@@ -125,9 +125,9 @@ class Rollout(nn.Module):
         self.closed_loop, self.horizon = ClosedLoop(problem, policy), problem.horizon
         self.stepped = SteppedLoop(problem.in_steps(method=method), policy) if held else self.closed_loop
         self.problem, self.method, self.gradient = problem, method, gradient
-        step = "euler" if held else method  # of the mean over a step that `method` takes
+        step = "euler" if held else method  # SteppedLoop gives the mean over a step of `method`
         self.solver_arguments: dict[str, Any] = {"method": step, "rtol": rtol, "atol": atol}
-        if method in ADAPTIVE_METHODS:  # a closed loop that blows up would be followed for ever
+        if method in ADAPTIVE_METHODS:  # otherwise the integration of a diverging closed loop would not end
             self.solver_arguments["options"] = {"max_num_steps": 10_000}
         self.discrete = None
         if gradient == "discrete":
@@ -138,22 +138,22 @@ class Rollout(nn.Module):
         """The closed loop from x₀ (*batch, n).
 
         Raises:
-            DivergenceError: a state or cost is not finite; names the step and the initial state. Or an adaptive method,
-                which takes its steps for the whole batch, gave up.
+            DivergenceError: a state or cost is not finite; names the step and the initial state. Or an adaptive method
+                gave up.
         """
         t = self.horizon.times(x0)
-        x, running_cost, value, u = (self._integrate if self.discrete is None else self._discretely)(x0, t)
+        x, running_cost, value, u = (self._integrate if self.discrete is None else self._integrate_discretely)(x0, t)
         _require_finite(x, running_cost, t)
         return Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
 
     @property
     def takes_steps_of_problem(self) -> bool:
-        """Whether it goes from node to node as Problem.step does, with u held."""
+        """Whether its steps equal Problem.step, with u held."""
         held = self.stepped is not self.closed_loop
         return self.method == self.problem.horizon.method and (held or self.method == "euler")
 
-    def _discretely(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
-        """(x, ∫ℓ, V, u) at the nodes, by the route with the discrete costate."""
+    def _integrate_discretely(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
+        """(x, ∫ℓ, V, u) at the nodes, with the gradient by DiscreteAdjoint."""
         assert self.discrete is not None
         path = self.discrete(x0.reshape(-1, x0.shape[-1]))
         x, running_cost, value, u = (y.reshape(len(y), *x0.shape[:-1], *y.shape[2:]) for y in path)
@@ -169,8 +169,8 @@ class Rollout(nn.Module):
         return x, y[..., -1], None if V is None else V(nodes, x), u
 
     def _solve(self, y0: Tensor, t: Times) -> Tensor:
-        """The augmented state at the nodes, by the route of `gradient`."""
-        from torchdiffeq import odeint, odeint_adjoint  # loads scipy.integrate: a third of a second
+        """The augmented state at the nodes."""
+        from torchdiffeq import odeint, odeint_adjoint  # imported here because it takes 0.3 s
 
         solve: Callable[..., Any] = odeint
         arguments = dict(self.solver_arguments)
@@ -179,9 +179,7 @@ class Rollout(nn.Module):
             arguments |= self._adjoint_arguments()
         try:
             return solve(self.stepped, y0, t, **arguments)
-        except (
-            AssertionError
-        ) as error:  # how torchdiffeq says that an adaptive step shrank to nothing, or too many came
+        except AssertionError as error:  # raised by torchdiffeq for a step size of 0 or too many steps
             if self.method not in ADAPTIVE_METHODS:
                 raise
             message = f"Expected {self.method} to reach t = {t[-1]:.4g} s, got {error}; {_REMEDY}."
@@ -190,8 +188,8 @@ class Rollout(nn.Module):
     def _adjoint_arguments(self) -> dict[str, Any]:
         arguments: dict[str, Any] = {"adjoint_params": tuple(p for p in self.parameters() if p.requires_grad)}
         if self.method in ADAPTIVE_METHODS:
-            # The parameters' gradient is an integral that feeds back into nothing: leaving it out of the error
-            # estimate saves steps (Kidger, Chen, Lyons, "Hey, that's not an ODE", ICML 2021).
+            # The parameters' gradient is a pure integral. Excluding it from the error estimate saves steps (Kidger,
+            # Chen, Lyons, "Hey, that's not an ODE", ICML 2021).
             arguments["adjoint_options"] = {"norm": "seminorm", **self.solver_arguments["options"]}
         return arguments
 

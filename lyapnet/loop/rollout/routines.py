@@ -1,4 +1,4 @@
-"""The pieces of work of a discretised closed loop: integrate it, and run backwards along it to the gradient."""
+"""The routines of a discretised closed loop: its integration, and the backward pass for the gradient."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,35 +24,35 @@ from lyapnet.task.horizon import ButcherTableau
 
 
 class Nodes(NamedTuple):
-    """What a rollout leaves at its nodes 0 … N; at the last one, of a step of length zero."""
+    """The results of a rollout at its nodes 0 … N; the last node has a step of length zero."""
 
-    stages: StagePath  # where each step evaluates the closed loop, the node itself first
+    stages: StagePath  # stages of each step; the first one is the node itself
     step_cost: ValuePath  # ∫ℓ over the step
     u: ControlPath  # at the node
     value: ValuePath  # V at the node
 
 
-BATCH_AXES = (-2, -1, -2, -1)  # of the columns of Nodes
+BATCH_AXES = (-2, -1, -2, -1)  # batch axis of each column of Nodes
 
 
 class Routines(NamedTuple):
-    """The two pieces of work, for one shape of batch; `state` is the tensors that a closed loop is made of."""
+    """The two routines for one batch shape; `state` is the list of tensors of the closed loop."""
 
     integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀) ↦ the columns of Nodes at the nodes t
     gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
 
 
 class TracedRoutines:
-    """The pieces of work for one shape of batch as graphs, each traced when it is first asked for.
+    """The routines for one batch shape as graphs, each traced on first use.
 
     Args:
-        loop, tableau: the closed loop, and its steps.
-        state: the tensors that it is made of, the trained ones first.
+        loop, tableau: the closed loop, and the integrator of its steps.
+        state: the tensors of the loop, the trained ones first.
         grid: t and Δt at all nodes.
         x0: a batch (b, n).
-        block: K, nodes in a block.
-        limit: of the costates.
-        visited: gives (t, Δt, x) at which the trace of a step is held against the loop itself.
+        block: K, the number of nodes in a block.
+        limit: limit of the costates, see `limit_costates`.
+        visited: returns the (t, Δt, x) at which the trace of a step is compared with the loop itself.
     """
 
     def __init__(
@@ -71,25 +71,25 @@ class TracedRoutines:
         self._visited, self._trained, self._stages = visited, len(trained_of(loop)), len(tableau.b)
 
     def traced(self) -> Routines:
-        """The graphs, replayed operation by operation.
+        """The graphs, run operation by operation.
 
         Raises:
-            UntraceableError: control flow that depends on tensor values, or code that leaves torch.
+            UntraceableError: the control flow depends on tensor values, or the code leaves torch.
         """
         return Routines(self._scan().loop, BlockwiseGradient(*self._block_pieces, self.block, self.limit))
 
     def compiled(self) -> Routines:
-        """The graphs on a CPU by lyapnet's own kernel, on a GPU with all kernels of a piece launched at once.
+        """The compiled graphs: by lyapnet's kernel on a CPU, as CUDA graphs on a GPU.
 
         Raises:
             UntraceableError: as traced.
-            CompilationError: there is no compiler, or it failed; or the kernel has no rule for an operation.
+            CompilationError: there is no compiler, it failed, or the kernel has no rule for an operation.
         """
         with compilation_errors():
             return self._by_kernel() if self.x0.device.type == "cpu" else self.recorded()
 
     def recorded(self, record: Callable[..., Replay] = record) -> Routines:
-        """The graphs, with the kernels of the whole path and of the whole gradient recorded."""
+        """The graphs as CUDA graphs, one for the whole path and one for the whole gradient."""
         by_blocks, tensors = BlockwiseGradient(*self._block_pieces, self.block, self.limit), len(self.state)
         integrate = RecordedFunction(self._scan().loop, [*self.state, *self.grid, self.x0], record)
         (t, dt), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
@@ -126,7 +126,7 @@ class TracedRoutines:
 
     @cached_property
     def _forwards(self) -> tuple[GraphModule, GraphModule]:
-        """(what all steps share, a step)."""
+        """(the part common to all steps, one step)."""
         t, dt = self.grid
         arguments = [*self.state, t[0], dt[0], self.x0]
         with _tracing():
@@ -135,7 +135,7 @@ class TracedRoutines:
 
     @cached_property
     def _backwards(self) -> tuple[GraphModule, GraphModule]:
-        """(what all steps share, a step pulled back)."""
+        """(the part common to all steps, one backward step)."""
         (t, dt), x0 = self.grid, self.x0
         late = [t[0], dt[0], x0, x0.clone(), torch.ones_like(x0[:, 0]), torch.ones_like(x0[:, 0]), x0.clone()]
         return cut(
@@ -148,7 +148,7 @@ class TracedRoutines:
         return cut(self._trace(self._linearise, self._block_arguments()), late=1, early_outputs=2)
 
     def _block_arguments(self) -> list[Tensor]:
-        """What the pieces of a block are traced on."""
+        """Arguments for tracing the functions of a block."""
         (t, dt), x0 = self.grid, self.x0
         nodes = x0.expand(self.block, *x0.shape)
         stages = nodes[:, None].repeat(1, self._stages, 1, 1)
@@ -164,12 +164,12 @@ class TracedRoutines:
 
 @contextmanager
 def _tracing() -> Iterator[None]:
-    """Turn whatever a loop's own functions raise in a trace into an UntraceableError."""
+    """Convert any error of the loop's functions during tracing to an UntraceableError."""
     try:
         yield
     except LyapnetError:
         raise
-    except Exception as error:  # of any kind, from inside the user's own functions
+    except Exception as error:  # raised by the user's functions
         reason = one_line(error).split(". ")[0].rstrip(".")
         raise UntraceableError(
             f"Expected a closed loop that can be traced, got {type(error).__name__}: {reason}."

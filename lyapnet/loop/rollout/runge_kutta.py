@@ -1,13 +1,13 @@
-"""Explicit Runge–Kutta steps of the closed loop: taken, linearised, and pulled back to the parameters.
+"""Explicit Runge–Kutta steps of the closed loop, their linearisation, and their gradient by the parameters.
 
-With stages X_i and slopes k_i of a step, x' = x + Δt Σ b_i k_i, let λ' be the costate after the step, β what the loss
-pays for the step's running cost, and H_i = β b_i ℓ + μ_iᵀ(f + g u) the Hamiltonian of a stage. Then, d/dx running
-through u(t, x) too, and λ̄ being what the loss takes from the node itself, V(t, x) included,
+Let X_i and k_i be the stages and slopes of a step x' = x + Δt Σ b_i k_i, λ' the costate after the step, β the loss's
+derivative by the step's running cost, λ̄ the loss's derivative by the node itself (also through V(t, x)), and
+H_i = β b_i ℓ + μ_iᵀ(f + g u) the Hamiltonian of a stage. With d/dx the total derivative, also through u(t, x),
 
     μ_i = b_i λ' + Σ_{j>i} a_ji X̄_j,   X̄_i = Δt dH_i/dx,   λ = λ' + Σ_i X̄_i + λ̄,   θ̄ = Σ_i Δt u_θᵀ ∂H_i/∂u.
 
-With Euler this is λ_n = λ_{n+1} + Δt dH/dx + λ̄_n: the costate equation of the paper (arXiv 2305.15244) on the
-rollout's own grid. Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed
+With Euler this is λ_n = λ_{n+1} + Δt dH/dx + λ̄_n, the costate equation of the paper (arXiv 2305.15244) on the grid of
+the rollout. Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed
 adjoint system", Numerische Mathematik 2000.
 """
 
@@ -38,7 +38,7 @@ from lyapnet.task.horizon import ButcherTableau, weighted_sum
 
 
 class Step(nn.Module):
-    """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V): one step from a batch of states, and what is kept of it."""
+    """One step from a batch of states: (t, Δt, x) ↦ (x', stages, ∫ℓ, u, V)."""
 
     loop: ClosedLoop
     tableau: ButcherTableau
@@ -60,10 +60,10 @@ class Step(nn.Module):
 
 
 class PullBack(nn.Module):
-    """(t, Δt, x, x̄, c̄, V̄, λ') ↦ (λ, λ, *θ̄): one step backwards, by differentiating it.
+    """One backward step by automatic differentiation: (t, Δt, x, x̄, c̄, V̄, λ') ↦ (λ, λ, *θ̄).
 
     Args:
-        step: whose parameters θ are.
+        step: the step with parameters θ.
     """
 
     def __init__(self, step: Step):
@@ -79,25 +79,25 @@ class PullBack(nn.Module):
             following, _, cost, _, value = self.step(t, dt, x)
             x_bar, *theta_bar = _vjp([following, cost, value], [x, *theta], [costate, cost_bar, value_bar])
         before = node_bar + x_bar
-        return before, before.clone(), *theta_bar  # the first is carried on, the second kept
+        return before, before.clone(), *theta_bar  # the carried state and the output of a scan
 
 
 class Linearisation(NamedTuple):
-    """The closed loop at all stages of a block of steps, to first order."""
+    """The closed loop to first order at all stages of a block of steps."""
 
     transition: Jacobians  # Φᵀ with Φ = ∂x'/∂x
     source: StatePath  # λ̄ + β ∂(∫ℓ)/∂x, so that λ = Φᵀλ' + source
-    f_x: StageJacobians  # d(f + gu)/dx, through u too
-    cost_x: StagePath  # dℓ/dx, through u too
+    f_x: StageJacobians  # d(f + gu)/dx, also through u
+    cost_x: StagePath  # dℓ/dx, also through u
     f_u: StageInputMatrices
     cost_u: StageControls
-    u: StageControls  # with its graph, as the next two
+    u: StageControls  # with its graph, like the next two
     value: StageValues
     slope: StageSlopes  # (f + gu, ℓ) at given (x, u), for parameters of the system and the cost
 
 
 class Linearise(nn.Module):
-    """Linearisation and parameter product over blocks; its forward is both, for a known costate."""
+    """Linearisation and parameter gradient of blocks; `forward` computes both for a known costate."""
 
     loop: ClosedLoop
     tableau: ButcherTableau
@@ -113,13 +113,13 @@ class Linearise(nn.Module):
     def linearise(
         self, t: Times, dt: Times, stages: StagePath, node_bar: StatePath, cost_bar: ValuePath, value_bar: ValuePath
     ) -> Linearisation:
-        """Around the stages, with the loss's derivatives by x_n, by ∫ℓ over the step and by V_n."""
+        """Linearise at the stages, given the loss's derivatives by x_n, by ∫ℓ over the step, and by V_n."""
         tableau, n = self.tableau, stages.shape[-1]
         with torch.enable_grad():
             x = stages.detach().requires_grad_()
             u, value, V_x = self.loop.control(self._times(t, dt), x)
             u_x = torch.stack([_vjp([u_j], [x], [torch.ones_like(u_j)])[0] for u_j in u.unbind(-1)], -2)
-            # One copy of (x, u) for each component of (f + gu, ℓ): all rows of the Jacobian in one sweep.
+            # One copy of (x, u) for each component of (f + gu, ℓ): all rows of the Jacobian in one backward pass.
             copies = [y.detach().expand(n + 1, *y.shape).clone().requires_grad_() for y in (x, u)]
             slope = self.loop.slope(*copies)
             rows = torch.eye(n + 1, dtype=slope.dtype, device=slope.device).reshape(
@@ -157,7 +157,7 @@ class Linearise(nn.Module):
         value_bar: ValuePath,
         costate: StatePath,
     ) -> tuple[Tensor, ...]:
-        """θ̄ of the block, for the costates λ' after each of its steps."""
+        """θ̄ of the block, given the costates λ' after each of its steps."""
         (a, b, _), (_, _, f_x, cost_x, f_u, cost_u, u, value, slope) = self.tableau, linearisation
         h, s = dt[:, None, None], len(self.tableau.b)
         stage_bars: dict[int, Tensor] = {}
@@ -178,12 +178,12 @@ class Linearise(nn.Module):
         return _vjp([u, value, slope], theta, bars)
 
     def _times(self, t: Times, dt: Times) -> Float[Tensor, "nodes stages 1"]:
-        """The stages' times."""
+        """The times of the stages."""
         return torch.stack([t + c * dt for c in self.tableau.c], -1)[..., None]
 
 
 def _vjp(outputs: Sequence[Tensor], inputs: Sequence[Tensor], cotangents: Sequence[Tensor]) -> tuple[Tensor, ...]:
-    """Σ cotangentᵀ ∂output/∂input; zero where an output does not depend on an input."""
+    """Σ cotangentᵀ ∂output/∂input for each input; zero if no output depends on it."""
     pairs = [(y, bar) for y, bar in zip(outputs, cotangents, strict=True) if y.requires_grad]
     if not pairs or not inputs:
         return tuple(torch.zeros_like(x) for x in inputs)

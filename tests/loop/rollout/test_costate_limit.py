@@ -6,7 +6,7 @@ from torch.testing import assert_close
 
 from lyapnet.experiment.config import load_config
 from lyapnet.loop.rollout import Rollout
-from lyapnet.loop.rollout.backwards import limited
+from lyapnet.loop.rollout.backwards import limit_costates
 from lyapnet.value.policy import HJBPolicy
 from tests.problems import CONF, untrained
 
@@ -29,14 +29,14 @@ def slopes(rollout, x0):
 
 def test_by_hand():
     costate = torch.tensor([[1.0, 0.0], [0.0, -2.0], [3.0, 0.0], [30.0, 40.0]])
-    cut = limited(costate, 5.0)
+    cut = limit_costates(costate, 5.0)
     assert_close(cut[:3], costate[:3], rtol=0, atol=0)
     assert_close(cut[3], torch.tensor([6.0, 8.0]))  # the lower median is 2
-    assert_close(limited(costate, 25.0), costate, rtol=0, atol=0)
+    assert_close(limit_costates(costate, 25.0), costate, rtol=0, atol=0)
     both = torch.stack([costate, 100 * costate])
-    assert_close(limited(both, 5.0), torch.stack([cut, 100 * cut]))
+    assert_close(limit_costates(both, 5.0), torch.stack([cut, 100 * cut]))
     resting = torch.tensor([[0.0, 0.0], [0.0, 0.0], [7.0, 0.0]])
-    assert_close(limited(resting, 5.0), resting, rtol=0, atol=0)
+    assert_close(limit_costates(resting, 5.0), resting, rtol=0, atol=0)
 
 
 def test_costates_of_one_size_are_left_as_they_are(pendulum):

@@ -318,7 +318,7 @@ def test_batches_of_two_sizes_in_turn(system, cost, policy):
 )
 def test_blocks_and_their_padding_change_no_number(block, method, monkeypatch, system, cost, policy):
     horizon, x0 = Horizon(12, 0.05), torch.randn(2, system.n)
-    monkeypatch.setattr(discrete_adjoint, "BLOCK", block)
+    monkeypatch.setattr(discrete_adjoint, "STATES_PER_BLOCK", block)
     is_exact(routes(system, cost, policy, method, horizon), x0)
 
 
@@ -327,7 +327,7 @@ def test_padding_with_anything_but_zeros_would(monkeypatch, system, cost, policy
     """The twin: thirteen nodes in blocks of seven states, three or four nodes each, leave something to pad."""
     discrete, backprop = routes(system, cost, policy, horizon=Horizon(12, 0.05))
     x0 = torch.randn(2, system.n)
-    monkeypatch.setattr(discrete_adjoint, "BLOCK", 7)
+    monkeypatch.setattr(discrete_adjoint, "STATES_PER_BLOCK", 7)
     monkeypatch.setattr(
         backwards, "padded", lambda y, length: torch.cat([y, y.new_ones(length - len(y), *y.shape[1:])])
     )

@@ -28,6 +28,7 @@ from lyapnet.value.policy import LookaheadPolicy
 BATCH_SIZE = 512  # examples in a step
 BRIEF_STEPS = 200  # steps of a brief fit, which compares initial values of V
 FIT_SECONDS = 60.0, 30.0  # CPU seconds of this thread for the first fit and for each further round, at most
+PACE_SHARE = 0.1  # share of these seconds after which the pace decides whether the learning rate falls by time instead
 MIN_GAIN = 2e-4  # relative to the optimal cost: a round that lowers the law's cost by less counts as no gain
 NEWTON_STEPS = 6  # Newton steps that find the best control, at which the lookahead law evaluates V
 MISFIT_SAMPLES = 20_000  # examples at which the misfit is evaluated
@@ -336,11 +337,15 @@ class _Fit:
     def lower(
         self, examples: Examples, steps: int, rate: float, seconds: float, progress: Callable[[int, int], None]
     ) -> None:
-        """Minimise the loss with a cosine learning rate, over a number of steps or CPU seconds of this thread."""
+        """Minimise the loss with a cosine learning rate, over a number of steps or CPU seconds of this thread.
+
+        Where the seconds suffice for all steps the result does not depend on them.
+        """
         trained, began = self._trained, time.thread_time()
         examples, optimizer = examples.to(trained[0]), self.method.optimizer(trained, rate)
         for k in range(steps):
-            share = max(k / steps, (time.thread_time() - began) / seconds)
+            spent = (time.thread_time() - began) / seconds
+            share = max(k / steps, spent if spent > PACE_SHARE else 0.0)
             if share >= 1:
                 break
             for group in optimizer.param_groups:

@@ -1,5 +1,7 @@
 """Fitting V to optima: what the examples say, against Riccati's solution and rollouts; and what fitting brings."""
 
+import itertools
+
 import pytest
 import torch
 from torch.testing import assert_close
@@ -139,6 +141,25 @@ def test_fitting_lowers_both_errors_on_states_that_it_did_not_see(swing):
     after = [float(error.detach()) for error in errors(learner.V, others, problem)]
     assert after[0] < before[0] / 20
     assert after[1] < before[1] / 20
+
+
+def test_a_fit_does_not_depend_on_the_pace_of_the_machine_unless_time_runs_out(problem, monkeypatch):
+    """The twin: where time runs out, the learning rate falls sooner."""
+    optimum = optima_for(problem, [riccati(problem)], problem.initial_states.sample(6))
+    examples = draw_examples(problem, optimum, torch.Generator().manual_seed(0))
+
+    def weights_after(pause):
+        clock = itertools.chain([0.0] * 3, itertools.repeat(pause))  # one slow step, as of a busy machine
+        monkeypatch.setattr(pretraining.time, "thread_time", lambda: next(clock))
+        torch.manual_seed(0)
+        learner = learner_of(problem, 1.0)
+        pretraining.fit_briefly(learner, examples)
+        return torch.cat([p.flatten() for p in learner.V.parameters()])
+
+    monkeypatch.setattr(pretraining, "BRIEF_STEPS", 12)
+    seconds, undisturbed = pretraining.FIT_SECONDS[0], weights_after(0.0)
+    assert torch.equal(weights_after(0.09 * seconds), undisturbed)
+    assert not torch.equal(weights_after(0.5 * seconds), undisturbed)
 
 
 @pytest.mark.gate

@@ -18,7 +18,7 @@ UNROLLED = 6  # largest number of unknowns of linear systems that are solved by 
 
 
 def norm(v: Tensor, dim: int = -1) -> Tensor:
-    """‖v‖ = √(Σ v²) along an axis, with slope 0 at v = 0 and finite higher derivatives there.
+    """‖v‖ = √(Σ v²) along an axis, exactly, with slope 0 at v = 0 and finite higher derivatives there.
 
     The slope of the root is infinite at 0, and autograd then gives NaN: at rest, v‖v‖ has no derivative with
     torch.sqrt, and no second derivative with torch.linalg.vector_norm.

@@ -21,7 +21,7 @@ WHOLE = set[Any]()
 
 @contextmanager
 def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
-    """Within it, the functions that a reader has are one operator each, or none is; elsewhere none is.
+    """Within it, each function of a reader is traced as one operator (on=True), or as it is written, as by default.
 
     Those of the kernel for numbers are made by `operator`; that of bounds is lyapnet.prover.rounding.rounded.
     """
@@ -43,10 +43,10 @@ def is_transformed(x: Tensor) -> bool:
 
 
 def operator(function: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Make a function torch's operator lyapnet::NAME too, which it is `as_operators`.
+    """Also register a function as the torch operator lyapnet::NAME, which is called within `as_operators`.
 
     Its arguments are tensors, its result has the shape and the type of the first one, and no gradient runs through it.
-    Under torch.func.vmap and the like it is what it is written as.
+    Under torch.func's transforms the function itself is called.
     """
     named = ", ".join(f"Tensor {name}" for name in inspect.signature(function).parameters)
     whole = custom_op(f"lyapnet::{function.__name__}", function, mutates_args=(), schema=f"({named}) -> Tensor")

@@ -86,7 +86,7 @@ def _expected(f: dataclasses.Field[Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """The means of a claim.
+    """What a claim may use: seconds, processes, a seed, a file, and whom it tells of its progress.
 
     Args:
         budget: seconds, workers and where they work.

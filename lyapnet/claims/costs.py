@@ -18,7 +18,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 
-SEARCHED = 64  # states at which optima are sought, where each is a search
+SEARCHED = 64  # largest number of states for an oracle that solves each by a search
 
 
 class Inside(NamedTuple):
@@ -34,12 +34,12 @@ class CostCertificate(Certificate):
     """A bound of what the controller costs, from those states of X₀ for which it is proved."""
 
     picture_of_both: ClassVar[str]  # what a report calls the figure of both sides
-    labels_beside: ClassVar[Mapping[str, str]] = {}  # what a table calls what there is to say beside a bound from below
+    labels_beside: ClassVar[Mapping[str, str]] = {}  # labels in a table of the numbers of `beside`
 
     @cached_property
     @abstractmethod
     def inside(self) -> Inside:
-        """Such states among COMPARED ones of X₀."""
+        """The states for which the bound is proved, among random states of X₀."""
 
     @cached_property
     def optimum(self) -> PerState | None:
@@ -84,7 +84,7 @@ class CostCertificate(Certificate):
 def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> Tensor | None:
     """The optimum of the first of some states; None where there are no states or no oracle, or it takes longer.
 
-    A search by IPOPT takes fewer states, and the controller's help.
+    IPOPT solves the first SEARCHED states only, starting from the controller's trajectories.
     """
     end = time.monotonic() + seconds
 

@@ -27,9 +27,9 @@ DRAWN = 2000  # points of a figure
 
 
 class PointwiseCondition(DecreaseCondition):
-    """c(t, x) ≤ 0 wherever it is asked for: W = 1 orders no points, and falls.
+    """c(t, x) ≤ 0 on a whole box. W = 1 is constant, so that boxes have no order; Ẇ = −1 satisfies Ẇ ≤ 0.
 
-    Its proof is kept under the name that a funnel's has; its fingerprint tells them apart.
+    In a file its proof has the name of a funnel's; the fingerprints differ.
     """
 
     def __init__(self, closed_loop: ClosedLoop, margin: Callable[[ClosedLoop, Time, State], PerState]):

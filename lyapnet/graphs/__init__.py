@@ -1,1 +1,1 @@
-"""Torch functions as flat operator graphs: traced, compiled, simplified, bounded on boxes, handed to CasADi."""
+"""Torch functions as flat operator graphs: traced, run by a kernel, and translated to C, CasADi and JavaScript."""

@@ -1,9 +1,8 @@
 """Functions of tensors as C99: their traces written again as loops over arrays, operation by operation.
 
-An operation on constants alone is torch's own, and its result a table. One that only looks at entries in another way, a
-transposition or a slice, writes nothing: an array is a place in memory with strides, on which torch itself does the
-operation. What is left are loops, of which RULES has the inner line; loops that stand already are not written again.
-Nothing is allocated but on the stack.
+torch computes operations on constants; their results become tables. Views, such as a transposition or a slice, produce
+no code: an array is a place in memory with strides. All other operations become loops, whose inner line is in RULES;
+identical loops are written once. Memory is allocated on the stack only.
 """
 
 import copy
@@ -65,7 +64,7 @@ def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], res
 
 
 def _without_shapes_alone(graph: GraphModule) -> GraphModule:
-    """The trace without what is computed for its shape alone, as x.sin() is in torch.zeros_like(x.sin())."""
+    """Remove operations of which only the shape is used, as x.sin() in torch.zeros_like(x.sin())."""
     nodes = copy.deepcopy(graph.graph)
     for node in list(nodes.nodes):
         if node.op == "call_function" and name_of(node.target) in SHAPED:

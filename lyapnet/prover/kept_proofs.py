@@ -99,7 +99,7 @@ class KeptProof:
 
     @property
     def identity(self) -> list[Any]:
-        """What the proof is about, and the rules that it was made by: others might not have dropped what it dropped."""
+        """The condition, the level, and the prover's sources: another version might not prove the boxes that are closed."""
         return [self.about, self.wanted, hash_of_sources()]
 
     def write(self, proof: Standing) -> None:

@@ -62,7 +62,9 @@ def tell(report: Callable[[Progress], None] | None, budget: Budget, stage: str) 
 
 
 CPU = torch.device("cpu")
-BELOW = 1e-2  # of a counterexample's W: how far under it the level goes on, or ever smaller boxes would follow its edge
+BELOW = (
+    1e-2  # of a counterexample's W, by which the level stays below it; else ever smaller boxes would follow its edge
+)
 KEEP_EVERY = 30.0  # seconds
 KEPT = 1000  # undecided boxes whose centres a proof names
 

@@ -10,9 +10,9 @@ def verdict_on(proved: float, wanted: float, fails: float | None, least: float) 
 
     Args:
         proved: the level up to which the condition was proved.
-        wanted: a level that does for all of X₀.
+        wanted: a level whose sublevel set contains X₀.
         fails: W where the condition fails; None where no such point was found.
-        least: a level below which none does for all of X₀.
+        least: sublevel sets of lower levels do not contain X₀.
     """
     if proved >= wanted:
         return "certified"

@@ -56,8 +56,8 @@ def build_pointwise(config: Config, rollout: Rollout, program: Program) -> Point
     cls = RegionCondition if isinstance(program, RegionProgram) else PointwiseCondition
     if cls is RegionCondition and not (problem.horizon.stationary and weight):
         raise UsageError(
-            "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got none; its V has "
-            "no time, and points of D are what it is about."
+            "Expected horizon.stationary: true and pointwise.weight > 0 with the region program, got one or none of "
+            "them; its V has no time, and points of D are what it is about."
         )
     if not weight:
         return None

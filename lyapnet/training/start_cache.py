@@ -67,9 +67,8 @@ class StartCache:
         torch.save({"start": _to_plain(start), "weights": weights}, content)
         with contextlib.suppress(OSError):
             self.file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.TemporaryDirectory(
-                dir=self.file.parent, prefix=".new_"
-            ) as draft:  # no other process uses this folder
+            # no other process uses this folder
+            with tempfile.TemporaryDirectory(dir=self.file.parent, prefix=".new_") as draft:
                 path = Path(draft) / "start"
                 write_atomically(path, content.getvalue())
                 path.replace(self.file)

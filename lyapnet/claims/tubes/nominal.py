@@ -57,8 +57,8 @@ def advanced(slope: Slope, t: float, h: float, y: Tensor) -> Tensor:
 def over_step(before: Flow, after: Flow, h: float, e: int) -> Tensor:
     """p(τ, ε) over h seconds, τ from −1 to 1, through what it is at both ends; (terms, cells, n + 1).
 
-    What is constant in ε is of third degree in τ, what is linear of second, and what is quadratic of first, so that p
-    is continuous from step to step, but for rounding. The terms are in the order of `monomials(1 + e, DEGREE)`.
+    Coefficients of ε⁰, ε¹ and ε² are polynomials in τ of degree 3, 2 and 1, so that p is continuous from step to step,
+    but for rounding. The terms are in the order of `monomials(1 + e, DEGREE)`.
     """
     place, known = places(1 + e, DEGREE), monomials(e, 2)
     terms = before.y.new_zeros(len(place), *before.y.shape[1:])

@@ -22,7 +22,7 @@ NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
 
 @cache
 def library(*definitions: str) -> ctypes.CDLL:
-    """The compiled C++ by what it leaves open, from disk, or compiled now: one file for each machine.
+    """The library compiled from program.cpp with some macro definitions, read from disk if it is there.
 
     Raises:
         CompilationError: as library_of.
@@ -68,7 +68,7 @@ class AssembledProgram:
         self._idle = list[_Memory]()  # of runs that ended; each run has one for itself
 
     def arguments(self, examples: Sequence[Tensor], varying: int) -> list[Tensor]:
-        """Examples of their own memory, the last ones of which vary from step to step."""
+        """Copies of examples, declared as arguments of the program; the last `varying` ones change in each step."""
         own = [each.detach().contiguous().clone() for each in examples]
         for k, example in enumerate(own):
             is_number = example.dtype in (self.dtype, torch.bool)
@@ -80,10 +80,10 @@ class AssembledProgram:
         return own
 
     def finish(self, results: Sequence[Tensor], sums: int = 0, prepared: bool = False) -> None:
-        """Lay out the memory, for results that are copied out, the last ones added to what is there.
+        """Allocate the memory. Results are copied to the outputs; the last `sums` of them are added to the outputs.
 
         Args:
-            prepared: what is shared is of constants alone, and done once for a memory.
+            prepared: what steps share depends on constants only, and is computed once for each memory.
         """
         program, self.sums, self._prepared = self.writer.program, sums, prepared
         for k, result in enumerate(results):

@@ -21,7 +21,7 @@ WHOLE = set[Any]()
 
 @contextmanager
 def as_operators(reader: str = NUMBERS, on: bool = True) -> Iterator[None]:
-    """Within it, each function of a reader is traced as one operator (on=True), or as it is written, as by default.
+    """Within it, each function of a reader is traced as one operator (on=True) or as it is written (default).
 
     Those of the kernel for numbers are made by `operator`; that of bounds is lyapnet.prover.rounding.rounded.
     """

@@ -116,7 +116,7 @@ def terminal(table: Table) -> RichTable:
 
 
 def number(value: float) -> str:
-    """Format a number: with at least four significant digits from 0.001 to ten million, else with three and an exponent."""
+    """Format a number: at least four significant digits from 0.001 to ten million, else three and an exponent."""
     if math.isinf(value):
         return "∞"
     if value and not 1e-3 <= abs(value) < 1e7:

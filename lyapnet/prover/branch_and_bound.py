@@ -168,7 +168,7 @@ PROBES = 12  # boxes of a chunk that are cut along every axis
 def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor, result: int = 0) -> Tensor:
     """For each chosen box, the axis along which a cut lowers the excess of one result most, the first by default.
 
-    A linear part is bounded exactly on a box of any size: only the excess of the other part prevents the proof of a true
+    A linear part is bounded exactly on any box: only the excess of the other part prevents the proof of a true
     inequality. The excess is about Σ_k m_k w_k² for widths w; m is measured on a few boxes.
 
     Args:

@@ -99,7 +99,7 @@ class KeptProof:
 
     @property
     def identity(self) -> list[Any]:
-        """The condition, the level, and the prover's sources: another version might not prove the boxes that are closed."""
+        """The condition, the level, and the prover's sources: another version might not prove its closed boxes."""
         return [self.about, self.wanted, hash_of_sources()]
 
     def write(self, proof: Standing) -> None:

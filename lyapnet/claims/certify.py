@@ -1,5 +1,6 @@
 """lyapnet.certify: what can be said of a controller, proved or by a draw."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -42,7 +43,19 @@ def certify(
         UsageError: the claims do not fit the controller, each other or the budget.
         Interrupted: Ctrl-C or SIGTERM; says what is kept.
     """
-    budget = budget if isinstance(budget, Budget) else Budget(budget)
+    for claim in claims:
+        if not isinstance(claim, Claim):
+            raise UsageError(
+                f"Expected claims such as lyapnet.Funnel(alpha=0.9), got {claim!r}; make one of its class."
+            )
+    if not isinstance(controller, Controller | str | Path):
+        raise UsageError(f"Expected a controller or the path of its checkpoint, got {controller!r}; see lyapnet.load.")
+    if not isinstance(budget, Budget):
+        if isinstance(budget, bool) or not isinstance(budget, int | float) or not 0 < budget < math.inf:
+            raise UsageError(f"Expected budget as seconds > 0 or a lyapnet.Budget, got {budget!r}; for example 60.")
+        budget = Budget(budget)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise UsageError(f"Expected seed as a whole number ≥ 0, got {seed!r}; for example 0.")
     run = Run(budget=budget, seed=seed, keep=None if keep is None else Path(keep), report=report)
     controller = controller if isinstance(controller, Controller) else load(controller)
     below = [claim for claim in claims if isinstance(claim, LowerBound)]

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -51,8 +52,15 @@ def flag_of(f: dataclasses.Field[Any]) -> str | None:
 
 def kind_of_number(f: dataclasses.Field[Any]) -> type | None:
     """int or float, for a field that holds one."""
-    kinds = {*(get_args(f.type) or (f.type,))} - {NoneType}
-    return next((kind for kind in (int, float) if kinds == {kind}), None)
+    kinds = _types_of(f) - {NoneType, "None"}
+    return next((kind for kind in (int, float) if kinds in ({kind}, {kind.__name__})), None)
+
+
+def _types_of(f: dataclasses.Field[Any]) -> set[Any]:
+    """The types of a union; by their names in a module in which annotations are not evaluated."""
+    if isinstance(f.type, str):
+        return {name.strip() for name in re.sub(r"Optional\[(.*)\]", r"\1 | None", f.type).split("|")}
+    return {*(get_args(f.type) or (f.type,))}
 
 
 def check_number(f: dataclasses.Field[Any], value: Any, name: str) -> None:
@@ -61,7 +69,7 @@ def check_number(f: dataclasses.Field[Any], value: Any, name: str) -> None:
     Args:
         name: what the message calls the option.
     """
-    if value is None or kind_of_number(f) is None:
+    if kind_of_number(f) is None or (value is None and {NoneType, "None"} & _types_of(f)):
         return
     above, at_least, below, at_most = f.metadata.get("bounds", [None] * 4)
     remedy = f.metadata.get("remedy", "correct it")
@@ -161,6 +169,8 @@ class Claim(ABC):
         states = getattr(self, "states", None)  # a set, where a claim has one
         if states is not None:
             sides_of(states)
+        _check_names("disturbance", getattr(self, "disturbance", None), _is_number, '{"velocity": 0.1}')
+        _check_names("parameters", getattr(self, "parameters", None), _is_interval, '{"mass": (0.9, 1.1)}')
 
     @abstractmethod
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
@@ -175,6 +185,21 @@ class Claim(ABC):
         """Its fields as plain data, by their names on the command line: numbers, texts as they are written there."""
         given = {flag: (f.name, getattr(self, f.name)) for flag, f in flags_of(type(self))}
         return {flag: _plain(name, value) for flag, (name, value) in given.items()}
+
+
+def _check_names(option: str, given: Any, holds: Callable[[Any], bool], example: str) -> None:
+    """Refuse what is no mapping of names to values of a kind."""
+    fits = isinstance(given, Mapping) and all(isinstance(name, str) and holds(each) for name, each in given.items())
+    if given is not None and not fits:
+        raise UsageError(f"Expected {option} as numbers by name, got {given!r}; for example {example}.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_interval(value: Any) -> bool:
+    return isinstance(value, Sequence) and len(value) == 2 and all(map(_is_number, value))
 
 
 def flags_of(claim: type) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
@@ -200,6 +225,13 @@ def _written(value: Any) -> str:
     return ":".join(f"{float(end)!r}".removesuffix(".0") for end in ends)
 
 
+def is_same(one: Any, other: Any) -> bool:
+    """Whether two values of an option are equal, sets by their sides."""
+    if isinstance(one, int | float) or one is None or other is None:
+        return one == other
+    return sides_of(one) == sides_of(other)
+
+
 def sides_of(states: Any) -> tuple[list[float], list[float]]:
     """(lower, upper) of a Box or of [[lower, …], [upper, …]].
 
@@ -209,7 +241,7 @@ def sides_of(states: Any) -> tuple[list[float], list[float]]:
     try:
         sides = states if isinstance(states, Sequence) else (states.lower.tolist(), states.upper.tolist())
         lower, upper = ([float(end) for end in side] for side in sides)
-        if not all(-math.inf < low <= high < math.inf for low, high in zip(lower, upper, strict=True)):
+        if not lower or not all(-math.inf < low <= high < math.inf for low, high in zip(lower, upper, strict=True)):
             raise ValueError("ends that are none")
     except (AttributeError, TypeError, ValueError) as error:
         raise UsageError(

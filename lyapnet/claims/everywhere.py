@@ -15,10 +15,10 @@ from lyapnet.claims.arguments import box_of
 from lyapnet.claims.certificates import FROZEN, Certificate, listed
 from lyapnet.claims.claim import Claim, Run, option
 from lyapnet.claims.funnel import proof_within
-from lyapnet.claims.preconditions import check_states, freeze, over_time
+from lyapnet.claims.preconditions import check_states, freeze, over_time, require_dimension
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.prover.condition import DecreaseCondition
+from lyapnet.prover.condition import DecreaseCondition, require_own_gradient
 from lyapnet.prover.proof import Proof
 from lyapnet.prover.verdict import Verdict, time_spent
 from lyapnet.task.sets import Box
@@ -69,8 +69,10 @@ class Everywhere(Claim):
     def establish(self, controller: Controller, run: Run) -> "EverywhereCertificate":
         states = box_of(self.states) or box_of(controller.initial_states)
         assert states is not None
+        require_dimension(states, controller.initial_states)
         domain = over_time(states, controller.horizon.duration)
         condition = PointwiseCondition(copied(controller.closed_loop).requires_grad_(False), self.margin)
+        require_own_gradient(condition.V, domain)
         memory = freeze(condition, domain)
         check_states(condition, domain)
         memory.check()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims.claim import Claim, Run, flag_of, option
+from lyapnet.claims.claim import Claim, Run, flag_of, is_same, option
 
 if TYPE_CHECKING:  # as in claim.py
     from lyapnet.claims.certificates import Certificate
@@ -199,11 +199,12 @@ class LowerBound(Claim):
         """The same with the share, the slack and the set of a claim from above that has them.
 
         Raises:
-            UsageError: it was given others.
+            UsageError: it was given others than that claim, or some where that claim finds its own.
         """
         taken = {mine: getattr(above, its) for mine, its in self._shared_with(above).items()}
         for name, value in taken.items():
-            if getattr(self, name) not in (None, value):
+            own = getattr(self, name)
+            if own is not None and not is_same(own, value):
                 raise UsageError(f"Expected the {name} of the {above.kind} claim beside it, got another; leave it out.")
         return replace(self, **taken)
 

@@ -206,14 +206,19 @@ def require_still(
         raise UsageError(f"Expected ẋ = 0 for the constants of a system{under}, got others; leave them out.")
 
 
-def domain_around(
-    states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
-) -> tuple[Corner, Corner]:
-    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+def require_dimension(states: Box, initial_states: Box) -> None:
+    """Refuse a set D of another number of states."""
     if states.dimension != initial_states.dimension:
         raise UsageError(
             f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
         )
+
+
+def domain_around(
+    states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
+) -> tuple[Corner, Corner]:
+    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+    require_dimension(states, initial_states)
     outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
     for i in constants:
         outside[i] = states.lower[i] > initial_states.lower[i] or states.upper[i] < initial_states.upper[i]

@@ -28,6 +28,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file, write_atomically
 from lyapnet.base.plain_data import plain_data_of
 from lyapnet.base.types import Corner
+from lyapnet.graphs import tracing
 from lyapnet.graphs.compilation import FLAGS
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import CutTree
@@ -39,14 +40,16 @@ from lyapnet.prover.operators import files
 SOURCES = (Path(__file__).parent,)
 """The folder of what a proof is made by: the search, the bounds and their kernel.
 
-f, g, ℓ, V, u, the calculus that assembles c from them and the tracing itself need no place here: their outcome is in
-the fingerprint of the traced function, operation by operation and number by number.
+f, g, ℓ, V, u and the calculus that assembles c from them need no place here: their outcome is in the fingerprint of the
+traced function, operation by operation and number by number. The file of the tracing is hashed beside the folder: it
+joins equal operations of what is bounded.
 """
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
-    """A hash of every source file in some folders, with their names, of how C++ is compiled, and of own operators."""
-    found = hashlib.sha256(repr((FLAGS, *files())).encode())
+    """A hash of every source file in some folders, with their names, the compilation, torch and own operators."""
+    found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
+    found.update(Path(tracing.__file__).read_bytes())
     for folder in folders:
         for path in sorted(path for path in folder.rglob("*") if path.suffix in (".py", ".cpp", ".h")):
             content = path.read_bytes()

@@ -29,6 +29,7 @@ Bound = Elementary | Callable[..., Any]
 BOXES, POINTS = 40, 40  # on which bounds are held against values
 CLOSE = 1e-7  # how far a derivative may be from torch's, relative to its size, or to 1 where it is smaller
 
+KINDS: dict[str, dict[Any, Any]] = {"smooth": {}, "kink": KINKS, "jump": JUMPS}
 _files = list[bytes]()
 
 
@@ -44,6 +45,10 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
     Raises:
         UsageError: the table has it already, or torch does not; or a value was found that lies outside its bounds.
     """
+    if kind not in KINDS:
+        raise UsageError(f"Expected kind as one of {', '.join(KINDS)}, got {kind!r}; choose one.")
+    if not isinstance(row, Operator):
+        raise UsageError(f"Expected an Operator, got {row!r}; take a row of OPERATORS, or make one.")
     caller = Path(sys._getframe(1).f_code.co_filename)
     is_new = OPERATORS.get(row.name) is not row
     if is_new:
@@ -52,18 +57,46 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         raise UsageError(f"Expected an operator without bounds, got {row.name}.")
     if bound is None:
         return
-    for overload in row.overloads:
-        composed = not isinstance(bound, Elementary)
-        rule = on_forms(bound, RULES) if composed else bound
-        for rules in (RULES, {"smooth": {}, "kink": KINKS, "jump": JUMPS}[kind]):
-            rules[overload] = rule
-        if composed:
-            writing.RULES[overload] = in_programs(bound, writing.RULES)
-    wrong = next(complaints(row), None)
+    _files.extend(map(_content, {caller, *_files_of(bound)}))
+    try:
+        _put_beside(row, bound, kind)
+        wrong = next(complaints(row), None)
+    except Exception as error:
+        forget(row, is_new)
+        raise UsageError(
+            f"Expected bounds of {row.name}, got {one_line(error)} as they were tried; mend it."
+        ) from error
+    except BaseException:  # Ctrl-C: a rule that nobody has checked does not stay
+        forget(row, is_new)
+        raise
     if wrong is not None:
         forget(row, is_new)
         raise UsageError(f"Expected bounds of {row.name} that hold its values, got {wrong}.")
-    _files.append(caller.read_bytes() if caller.is_file() else os.urandom(16))
+
+
+def _put_beside(row: Operator, bound: Bound, kind: str) -> None:
+    """Give bounds to all overloads of a row."""
+    for overload in row.overloads:
+        composed = not isinstance(bound, Elementary)
+        rule = on_forms(bound, RULES) if composed else bound
+        for rules in (RULES, KINDS[kind]):
+            rules[overload] = rule
+        if composed:
+            writing.RULES[overload] = in_programs(bound, writing.RULES)
+
+
+def _files_of(bound: Bound) -> Iterator[Path]:
+    """The files in which the functions of a bound are written."""
+    parts = vars(bound).values() if isinstance(bound, Elementary) else [bound]
+    for part in [*parts, *(getattr(bound, "derivatives", None) or ())]:
+        code = getattr(part, "__code__", None)
+        if code is not None:
+            yield Path(code.co_filename)
+
+
+def _content(file: Path) -> bytes:
+    """The content of a file; of what was typed, something else in each process."""
+    return file.read_bytes() if file.is_file() else os.urandom(16)
 
 
 def forget(row: Operator, is_new: bool = True) -> None:
@@ -93,6 +126,9 @@ def complaints(row: Operator) -> Iterator[str]:
     box = torch.zeros(1 + row.operands).double(), torch.ones(1 + row.operands).double()
     lower, upper, points = _boxes(1 + row.operands)
     values = row(*row.at(points[..., 1:])).double()
+    if not values.isfinite().all():
+        yield f"a domain {row.domain} in which it is not finite"
+        return
     for degree in (1, 2, 3):
         try:
             bounded = BoundedFunction(lambda t, x: (row(*row.at(x)).double(),), box, degree)
@@ -104,7 +140,8 @@ def complaints(row: Operator) -> Iterator[str]:
             if not form.radius.isfinite().any():
                 yield f"none in forms of degree {degree}"
             room = form.radius * (1 + 1e-9) + 1e-13 * form.magnitude  # for the rounding of these lines
-            outside = int(((values - _at(form, points, lower, upper)).abs() > room).sum())
+            inside = (values - _at(form, points, lower, upper)).abs() <= room  # not where one of them is no number
+            outside = int((~inside).sum())
             if outside:
                 yield f"{outside} of {values.numel()} values outside, in forms of degree {degree}"
 

@@ -62,7 +62,8 @@ class ScalarLogger(Callback):
     ) -> None:
         rate = trainer.optimizers[0].param_groups[0]["lr"]
         for member, loggers in with_loggers(trainer, pl_module):
-            log_scalars(trainer, loggers, {**member.training_scalars(), "learning_rate": rate})
+            if member.output is not None:
+                log_scalars(trainer, loggers, {**member.training_scalars(), "learning_rate": rate})
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if not trainer.sanity_checking:

@@ -70,7 +70,7 @@ class Learner(nn.Module):
         self.validation_optimum: PerState | None = None  # J* of the validation states, once it is known
         # measures of the last training step and the last validation
         self.gradient_norm = self.steps_per_second = math.nan
-        self.output: ProgramOutput | None = None
+        self.output: ProgramOutput | None = None  # also None once its training has ended
         self.validation: StateTable | None = None
         self.validation_loss: float = math.nan
         self.measured_at: int = -1  # step of the last validation

@@ -67,8 +67,10 @@ class TrainingModule(L.LightningModule):
         draw = (POINTS, self.global_rank, self.global_step)
 
         def train(member: Learner, states: Tensor) -> Tensor | None:
-            ended = self._has_ended(member, self.global_step)
-            return None if ended else member.train_on(member.rollout(states), draw)
+            if self._has_ended(member, self.global_step):
+                member.output = None
+                return None
+            return member.train_on(member.rollout(states), draw)
 
         return {"loss": torch.stack([loss for loss in self._for_each(x0, train) if loss is not None]).sum()}
 
@@ -221,6 +223,8 @@ class TrainingModule(L.LightningModule):
         return {self._stored_name(key): tensor for key, tensor in own.items() if not _is_alias(key)}
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        for member in self.members:  # of other weights, after a divergence
+            member.measured_at = -1
         wanted = {key: self._stored_name(key) for key in super().state_dict() if not _is_alias(key)}
         missing = [name for name in wanted.values() if name not in state_dict]
         if strict and missing:

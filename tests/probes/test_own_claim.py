@@ -3,6 +3,8 @@
 import importlib
 import json
 import re
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -98,3 +100,69 @@ def test_it_is_shown_and_reported_like_any_other(effort, controller, tmp_path):
 def test_its_options_are_checked(effort, options, message):
     with pytest.raises(UsageError, match=re.escape(message)):
         effort.Effort(**options)
+
+
+def test_rules_hold_in_a_module_whose_annotations_are_texts(effort, tmp_path, monkeypatch):
+    (tmp_path / "late.py").write_text("from __future__ import annotations\n" + MODULE, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    late = importlib.import_module("late")
+    for wrong in (-5, True, None, "5"):
+        with pytest.raises(UsageError, match="Expected limit"):
+            late.Effort(limit=wrong)
+
+
+def test_a_set_of_other_dimension_is_refused(effort, controller):
+    with pytest.raises(UsageError, match="Expected a set of 2 states, got 1"):
+        lyapnet.certify(controller, effort.Effort(limit=50, states=[[-1], [1]]))
+
+
+def test_a_v_that_declares_another_gradient_is_refused(controller):
+    class Flat(type(controller.V)):
+        def value_and_state_gradient(self, t, x):
+            value, slope = super().value_and_state_gradient(t, x)
+            return value, 0 * slope
+
+    controller.V.__class__ = Flat
+
+    class Slope(lyapnet.Everywhere):
+        kind = "slope"
+
+        def margin(self, loop, t, x):
+            return (loop.V.value_and_state_gradient(t, x)[1] ** 2).sum(-1) - 1e-6
+
+        def in_words(self):
+            return "V is flat."
+
+        def in_formulas(self):
+            return ["V_x = 0"]
+
+    with pytest.raises(UsageError, match="Expected a V whose gradient is its derivative"):
+        lyapnet.certify(controller, Slope(), budget=10)
+
+
+WRONG = {
+    "certify('zoo:double_integrator', Funnel)": "Expected claims such as",
+    "certify('zoo:double_integrator', 'sound')": "Expected claims such as",
+    "certify(5, Sampled())": "Expected a controller or the path",
+    "certify('zoo:double_integrator', Sampled(), budget=0)": "Expected budget",
+    "certify('zoo:double_integrator', Sampled(), budget='60')": "Expected budget",
+    "certify('zoo:double_integrator', Sampled(), seed=-1)": "Expected seed",
+    "Funnel(disturbance={'velocity': '0.1'})": "Expected disturbance as numbers by name",
+    "Funnel(disturbance='velocity=0.1')": "Expected disturbance as numbers by name",
+    "Funnel(disturbance={'velocity': True})": "Expected disturbance as numbers by name",
+    "Funnel(alpha=None)": "Expected alpha as a number",
+    "Region(parameters={'mass': 1})": "Expected parameters as numbers by name",
+    "Funnel(states=[[], []])": "Expected states",
+}
+
+
+@pytest.mark.gate
+def test_what_is_no_claim_option_budget_or_seed_is_one_line():
+    """In a process without the tests' own checks of types."""
+    lines = ["from lyapnet import LyapnetError, Funnel, Region, Sampled, certify"]
+    for call in WRONG:
+        lines += ["try:", f"    {call}", "    print('accepted')", "except LyapnetError as error:", "    print(error)"]
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, check=True)
+    said = done.stdout.splitlines()
+    assert len(said) == len(WRONG)
+    assert [line for line, expected in zip(said, WRONG.values(), strict=True) if not line.startswith(expected)] == []

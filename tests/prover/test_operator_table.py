@@ -26,6 +26,7 @@ from lyapnet.graphs.number_kernel.kernel import NumberKernel
 from lyapnet.graphs.operators import OPERATORS, READERS, Operator, add, remove
 from lyapnet.graphs.tracing import NOT_CORE, SHAPED, core_trace, is_view, name_of, trace
 from lyapnet.prover import kept_proofs
+from lyapnet.prover import operators as own
 from lyapnet.prover.bound_kernel import writing
 from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_SHAPE, RULES
 from lyapnet.prover.bounds import BoundedFunction
@@ -389,3 +390,37 @@ def test_the_overview_of_a_reader_that_lacks_a_rule_is_another(monkeypatch):
 if __name__ == "__main__":
     text = PAGE.read_text(encoding="utf-8")
     PAGE.write_text(re.sub(r"\| operator \|.*", lambda _: overview() + "\n", text, flags=re.DOTALL), encoding="utf-8")
+
+
+# What is registered and fails leaves nothing behind
+
+ERFINV = Operator("erfinv", domain=((-0.9, 0.9),))
+
+
+@pytest.mark.parametrize(
+    ("row", "bound", "kind", "says"),
+    [
+        (ERFINV, lambda operators, x: None, "smooth", "as they were tried"),
+        (Operator("erfinv", domain=((-0.9, 0.9),) * 2), lambda operators, x: x, "smooth", "as they were tried"),
+        (Operator("erfinv", domain=((2.0, 3.0),)), lambda operators, x: operators.mul(x, 0.0), "smooth", "not finite"),
+        (ERFINV, lambda operators, x: operators.mul(x, 0.0), "smooth", "values outside"),
+        (ERFINV, lambda operators, x: x, "bogus", "kind as one of smooth, kink, jump"),
+    ],
+    ids=["None", "operands", "no numbers", "wrong", "kind"],
+)
+def test_a_registration_that_fails_leaves_no_rule(row, bound, kind, says):
+    with pytest.raises(UsageError, match=says):
+        register(row, bound, kind)
+    assert "erfinv" not in OPERATORS
+    assert torch.ops.aten.erfinv.default not in RULES
+
+
+def test_the_file_in_which_a_bound_is_written_joins_what_a_proof_depends_on(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(own, "_files", [])
+    (tmp_path / "written_elsewhere.py").write_text("def bound(operators, x, y):\n    return x\n", encoding="utf-8")
+    from written_elsewhere import bound
+
+    with pytest.raises(UsageError, match="values outside"):
+        register(SOFT, bound)
+    assert (tmp_path / "written_elsewhere.py").read_bytes() in own.files()

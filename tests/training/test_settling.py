@@ -8,6 +8,8 @@ import pytest
 from rich.console import Console
 
 from lyapnet.experiment.checkpoint import read_checkpoint
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.training.build import build_module
 from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
 from lyapnet.training.runs import Run
@@ -166,6 +168,27 @@ def test_a_seed_that_has_settled_costs_no_more_rollouts(tmp_path):
     steps = [line.split() for line in counts.read_text(encoding="utf-8").splitlines()]
     last = {label: max(int(step) for name, step in steps if name == label) for label in ("seed_0", "seed_1")}
     assert last == {"seed_0": EVERY + COOLING, "seed_1": 40 + COOLING - 1}
+
+
+@pytest.mark.gate
+def test_a_run_of_which_one_seed_has_settled_resumes(tmp_path):
+    two = desk(tmp_path, seeds=2)
+    first = partial(both, without_figures, partial(settles_at, 40))
+    step = EVERY + COOLING + 3  # seed 0 has settled and seed 1 has not
+    dies = partial(dies_at, "lyapnet.training.modules:TrainingModule", "training_step", step)
+    assert two.train(prepare=partial(both, first, dies))[0] != 0
+    status, out, errors = two.train("--resume", "last", prepare=first)
+    assert (status, errors) == (0, "")
+    assert f"step {40 + COOLING}/{40 + COOLING}" in out
+
+
+def test_other_weights_are_measured_again():
+    """As after a divergence, which goes back to a checkpoint."""
+    module = build_module(config_from_plain(SMALL))
+    (member,) = module.members
+    member.measured_at = 70
+    module.load_state_dict(module.state_dict())
+    assert member.measured_at == -1
 
 
 def test_a_seed_that_has_settled_waits_for_the_others(tmp_path):

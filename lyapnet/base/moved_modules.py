@@ -49,7 +49,7 @@ class MovedModules(MetaPathFinder):
         for k in (2, 1):
             if (today := MOVED.get(".".join(parts[:k]))) is not None:
                 name = ".".join(["lyapnet", today, *parts[k:]])
-                return ModuleSpec(fullname, _CurrentModule(name), is_package=True)
+                return ModuleSpec(fullname, _CurrentModule(name))
         return None
 
 

@@ -7,6 +7,7 @@ a kept proof depends on is this folder, and the file that registers an operator 
 import os
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,21 +58,19 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         raise UsageError(f"Expected an operator without bounds, got {row.name}.")
     if bound is None:
         return
-    _files.extend(map(_content, {caller, *_files_of(bound)}))
-    try:
-        _put_beside(row, bound, kind)
-        wrong = next(complaints(row), None)
-    except Exception as error:
-        forget(row, is_new)
-        raise UsageError(
-            f"Expected bounds of {row.name}, got {one_line(error)} as they were tried; mend it."
-        ) from error
-    except BaseException:  # Ctrl-C: a rule that nobody has checked does not stay
-        forget(row, is_new)
-        raise
-    if wrong is not None:
-        forget(row, is_new)
-        raise UsageError(f"Expected bounds of {row.name} that hold its values, got {wrong}.")
+    with ExitStack() as undo:  # a rule that nobody has checked does not stay, after Ctrl-C neither
+        undo.callback(forget, row, is_new)
+        try:
+            _put_beside(row, bound, kind)
+            wrong = next(complaints(row), None)
+        except Exception as error:
+            raise UsageError(
+                f"Expected bounds of {row.name}, got {one_line(error)} as they were tried; mend it."
+            ) from error
+        if wrong is not None:
+            raise UsageError(f"Expected bounds of {row.name} that hold its values, got {wrong}.")
+        _files.extend(_content(file) for file in dict.fromkeys([caller, *_files_of(bound)]))  # always in this order
+        undo.pop_all()
 
 
 def _put_beside(row: Operator, bound: Bound, kind: str) -> None:

@@ -6,9 +6,8 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import DivergenceError
-from lyapnet.base.types import PerState
+from lyapnet.base.types import PerState, State
 from lyapnet.loop.programs.terms import value_floored
-from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.cost import spread
 from lyapnet.training.curves import data_of, log_scalars, with_loggers
 from lyapnet.training.learner import Learner
@@ -51,5 +50,6 @@ def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
     return (cost - value) / (value_floored(value, cost) if has_goal else spread(cost))
 
 
-def _excess_of(learner: Learner, trajectory: Trajectory) -> PerState:
+def _excess_of(learner: Learner, x0: State) -> PerState:
+    trajectory = learner.rollout(x0)
     return excess(trajectory.cost, trajectory.require_value()[0], learner.problem.has_goal)

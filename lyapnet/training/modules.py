@@ -20,7 +20,7 @@ from lyapnet.base.errors import CheckpointError, DivergenceError, UsageError
 from lyapnet.base.random_streams import POINTS
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.loop.programs import PointwiseCondition, Program
-from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout, Trajectory
+from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.task.problem import Problem
 from lyapnet.training.checkpoint_files import CheckpointFiles
@@ -91,8 +91,7 @@ class TrainingModule(L.LightningModule):
             member.measured_at = self.global_step
             return member.measure_on(member.rollout(states))
 
-        with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
-            return self._for_each(x0.clone(), validate)
+        return self.without_gradient(x0, validate)
 
     def _has_ended(self, member: Learner, step: int) -> bool:
         """Whether a member's training has ended before a step; no for processes that train together, which wait for a
@@ -100,10 +99,10 @@ class TrainingModule(L.LightningModule):
         """
         return member.cooling is not None and step > member.cooling[1] and self.trainer.world_size == 1
 
-    def without_gradient(self, x0: Tensor, evaluate: Callable[[Learner, Trajectory], Tensor]) -> list[Tensor]:
-        """Evaluate each member's trajectories without recording a gradient."""
+    def without_gradient(self, x0: Tensor, evaluate: Callable[[Learner, Tensor], T]) -> list[T]:
+        """Evaluate each member on its initial states without recording a gradient."""
         with torch.inference_mode(False), torch.no_grad():  # V_x needs gradients, which inference mode forbids
-            return self._for_each(x0.clone(), lambda member, states: evaluate(member, member.rollout(states)))
+            return self._for_each(x0.clone(), evaluate)
 
     def _for_each(self, x0: Tensor, evaluate: Callable[[Learner, Tensor], T]) -> list[T]:
         """Evaluate each member on its initial states; adds iteration and member to the message of a divergence."""

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST = range(8)
+TRAINING, VALIDATION, TEST, FIGURES, CERTIFICATION, POINTS, START, LOST, NOISE = range(9)
 
 
 def stream(seed: int, *path: int) -> torch.Generator:

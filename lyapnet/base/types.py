@@ -22,6 +22,7 @@ Coordinates = Float[Tensor, "*batch d"]  # q or q̇ of a mechanical system, n = 
 MassMatrix = Float[Tensor, "*batch d d"]
 InputMatrix = Float[Tensor, "*batch n m"]
 ControlMatrix = Float[Tensor, "*batch m m"]
+Noise = Float[Tensor, "*batch n sources"]  # σ(x)
 Matrix = Float[Tensor, "rows columns"]
 
 Times = Float[Tensor, " nodes"]

@@ -3,6 +3,7 @@
 import inspect
 import logging
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -10,7 +11,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from lyapnet.base.errors import UsageError
+from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
+from lyapnet.base.random_streams import NOISE, stream
 from lyapnet.experiment.assembly import Parts, build_problem, build_rollout, member
 from lyapnet.experiment.config import Config, SystemConfig
 from lyapnet.loop.programs import Program, ValueProgram
@@ -50,6 +52,8 @@ class ArrayTrajectory(NamedTuple):
     running_cost: np.ndarray  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: np.ndarray  # (*batch,): φ(x_N)
     value: np.ndarray  # (N + 1, *batch): V(t_n, x_n)
+    surprise: np.ndarray | None = None  # (N, *batch): V_{n+1} − E[V_{n+1} | x_n]; None without noise
+    martingale: np.ndarray | None = None  # (*batch,): Σ_n V_xᵀσΔW, of mean zero; None without noise
 
     def require_value(self) -> np.ndarray:
         """V along the trajectory."""
@@ -117,7 +121,8 @@ class Controller:
         self.V = V.requires_grad_(False).eval()
         if rollout is not None and policy is not None:
             raise ValueError("Expected a rollout or a policy, got both; the rollout has one: leave the other out.")
-        self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient="backprop")
+        gradient = "backprop" if problem.noise is None else "discrete"  # the only one that knows noise
+        self._rollout = rollout or Rollout(problem, (policy or _law_of(problem, V))(problem, V), gradient=gradient)
         if self._rollout.problem is not problem or self._rollout.closed_loop.V is not V:
             raise ValueError("Expected the rollout of this V on this problem, got another one; build it from both.")
         law = self.closed_loop.policy
@@ -258,27 +263,36 @@ class Controller:
         return Controller(self.problem, self.V, self._rollout, self.program, self._config, beyond, self._parts)
 
     @overload
-    def rollout(self, x0: Tensor, steps: int | None = None, **parameters: float) -> Trajectory: ...
+    def rollout(
+        self, x0: Tensor, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+    ) -> Trajectory: ...
     @overload
-    def rollout(self, x0: ArrayLike, steps: int | None = None, **parameters: float) -> ArrayTrajectory: ...
-    def rollout(self, x0: Any, steps: int | None = None, **parameters: float) -> Any:
+    def rollout(
+        self, x0: ArrayLike, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+    ) -> ArrayTrajectory: ...
+    def rollout(
+        self, x0: Any, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+    ) -> Any:
         """The closed loop from x₀ (*batch, n): a Trajectory of tensors, an ArrayTrajectory of arrays and lists.
 
         Args:
             steps: number of steps of Δt; None: that of the horizon. φ is evaluated at the last state; after T the law
                 is `beyond`.
+            noise: seed of one path of the noise from each state, or ΔW of each step (N, *batch, k), as problem.noise
+                draws it; None: the closed loop without its noise.
             parameters: parameters of a family by name; none if x₀ is (x₀, p).
 
         Raises:
-            ValueError: the shape does not fit.
+            ValueError: the shape does not fit; or noise after T, or for a problem without noise.
             DivergenceError: the closed loop is not finite.
         """
         if parameters:
-            return self.with_(**parameters).rollout(x0, steps)
+            return self.with_(**parameters).rollout(x0, steps, noise=noise)
         if steps is not None and (not isinstance(steps, int) or steps < 1):
             raise ValueError(f"Expected steps as a whole number ≥ 1, got {steps!r}; give how many steps of Δt to take.")
         with torch.no_grad():
-            trajectory: Trajectory = self._rollout(self._state(x0))
+            state = self._state(x0)
+            trajectory: Trajectory = self._rollout(state, self._increments(state, steps, noise))
             if steps is not None and steps < self.horizon.steps:
                 trajectory = self._cut(trajectory, steps)
             elif steps is not None and steps > self.horizon.steps:
@@ -286,6 +300,19 @@ class Controller:
         return (
             trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_in_form_of(x0, field) for field in trajectory))
         )
+
+    def _increments(self, x0: Tensor, steps: int | None, given: Tensor | int | None) -> Tensor | None:
+        """ΔW of each step from a batch of states; None without noise."""
+        noise, horizon = self.problem.noise, self.horizon
+        if given is None:
+            return None
+        if noise is None:
+            raise ValueError("Expected no noise for a task without, got some; leave it out.")
+        if steps not in (None, horizon.steps):
+            raise ValueError(f"Expected the {horizon.steps} steps of the horizon with noise, got {steps}; leave it out.")
+        if isinstance(given, Tensor):
+            return given
+        return noise.draw(horizon.steps, horizon.dt, x0, stream(given, NOISE))
 
     def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
         """The first steps of a trajectory."""
@@ -299,6 +326,12 @@ class Controller:
         if own is not None and other is not None and other.compiled_batch:
             draw = torch.Generator().manual_seed(0)
             own.share_code(other, self.problem.initial_states.sample(other.compiled_batch, draw))
+
+    def compile_for(self, x0: Tensor) -> None:
+        """Compile the closed loop for batches like x₀ (b, n), where that is possible; it then runs faster."""
+        if self._rollout.discrete is not None and not self._rollout.discrete.compiled_batch:
+            with suppress(UntraceableError, CompilationError):
+                self._rollout.discrete.compile(x0)
 
     def _prolong(self, first: Trajectory, steps: int) -> Trajectory:
         """Continue a trajectory after T by a number of steps, under the law after T."""
@@ -371,4 +404,4 @@ def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
 
 
 def _in_form_of(given: Any, result: Any) -> Any:
-    return result if isinstance(given, Tensor) else result.detach().cpu().numpy()
+    return result if result is None or isinstance(given, Tensor) else result.detach().cpu().numpy()

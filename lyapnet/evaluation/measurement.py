@@ -13,13 +13,14 @@ from lyapnet.base.files import plain
 from lyapnet.base.random_streams import TEST, stream
 from lyapnet.base.sizes import require_memory, size_of_loops
 from lyapnet.base.tables import csv_text
-from lyapnet.base.types import PerState
+from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.afterwards import share_at_goal
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.evaluation.under_noise import NoiseMeasures, measure_under_noise
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import names_of
 from lyapnet.task.domain import BORDER_ROUNDING, SLACK
@@ -27,6 +28,7 @@ from lyapnet.task.problem import Problem
 from lyapnet.value.after_horizon import LOOPS
 
 PAPER_STATES = 100  # K, the number of states on which the paper counts satisfied conditions
+PATHS = 32  # paths of the noise from each state
 CORNER_AXES = 8  # axes of X₀ whose corners are tested, at most 2⁸ = 256
 
 
@@ -48,11 +50,12 @@ class Evaluation(NamedTuple):
     seed: int
     problem: Problem
     corner: Corner
-    held_cost: PerState  # cost from each state in continuous time with u held for Δt; infinite if it diverges
+    held_cost: PerState | None  # cost from each state in continuous time with u held; infinite if it diverges
     lqr_cost: PerState | None  # cost from each state under LQR; None if there is no such law
     at_goal: float | None  # share of closed loops that the law after T keeps near the goal; None: see share_at_goal
     after: str  # name of the law after T
     optimum_of: str = ""  # model of the optimum: its steps, or continuous time; empty if none was computed
+    noise: NoiseMeasures | None = None  # with noise; costs are then expectations
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -76,6 +79,7 @@ class Evaluation(NamedTuple):
             **({"terminal_errors": self._terminal_errors()} if self.problem.has_goal else {}),
             **used,
             **counts,
+            **({} if self.noise is None else {"noise": self.noise._asdict()}),
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
@@ -136,26 +140,37 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+    controller: Controller,
+    samples: int = 256,
+    seed: int = 0,
+    optimum: bool = True,
+    progress: Report = silent,
+    paths: int = PATHS,
 ) -> dict[str, Any]:
     """The summary of a controller on new states of X₀; see Evaluation.result.
 
     Raises:
-        ValueError: fewer than one sample.
+        ValueError: fewer than one sample, or than two paths.
         DivergenceError: a closed loop is not finite.
     """
-    return evaluation(controller, samples, seed, optimum, progress).result()
+    return evaluation(controller, samples, seed, optimum, progress, paths).result()
 
 
 def evaluation(
-    controller: Controller, samples: int = 256, seed: int = 0, optimum: bool = True, progress: Report = silent
+    controller: Controller,
+    samples: int = 256,
+    seed: int = 0,
+    optimum: bool = True,
+    progress: Report = silent,
+    paths: int = PATHS,
 ) -> Evaluation:
-    """The measures of a controller on new states of X₀.
+    """The measures of a controller on new states of X₀; with noise, expectations over paths from each of them.
 
     Args:
         samples: number of states; K = 100 further states are drawn for the satisfied shares.
         optimum: whether costs are compared with the optimum, if there is an oracle.
         progress: progress callback of the oracle.
+        paths: paths of the noise from each state, if the task has noise.
 
     Raises:
         ValueError: fewer than one sample.
@@ -165,7 +180,10 @@ def evaluation(
         raise ValueError(f"Expected samples ≥ 1, got {samples}; choose how many initial states to draw.")
     size = size_of_loops(samples, controller.horizon.steps, controller.system.n)
     require_memory("samples", samples, size, "draw fewer")
-    trajectory = controller.rollout(controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST)))
+    x0 = controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST))
+    if controller.problem.noise is not None:
+        return _evaluation_under_noise(controller, x0, samples, seed, optimum, progress, paths)
+    trajectory = controller.rollout(x0)
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
     cost, left = _within_domain(controller.problem, trajectory)
@@ -187,21 +205,48 @@ def evaluation(
     return Evaluation(dataclasses.replace(first, optimal_cost=optima.cost), paper, optima.reasons, *further, about)
 
 
+def _evaluation_under_noise(
+    controller: Controller, x0: State, samples: int, seed: int, optimum: bool, progress: Report, paths: int
+) -> Evaluation:
+    """The measures under noise; there is no reference in continuous time, and nothing is said of the time after T."""
+    if paths < 2:
+        raise ValueError(f"Expected paths ≥ 2 for an interval, got {paths}; choose how many to draw from each state.")
+    problem = controller.problem
+    table, noise, lqr = measure_under_noise(controller, x0, paths, samples, seed, progress)
+    first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
+    lqr, after = None if lqr is None else lqr[:samples], controller.law.beyond
+    further = (seed, problem, dearest_corner(controller, noise=seed), None, lqr, None, after)
+    about, notes = "", [""] * samples
+    if optimum:
+        try:
+            first = dataclasses.replace(first, optimal_cost=oracle_of(problem, controller.method)(first.x0))
+            about = f"steps of {problem.horizon.dt:g} s ({controller.method}) with u held, in expectation"
+        except OracleError as reason:
+            notes = [str(reason)] * samples
+    else:
+        notes = ["not asked for"] * samples
+    return Evaluation(first, paper, notes, *further, about, noise)
+
+
 def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
     """J_N of closed loops, infinite if they are far outside the domain, and whether they leave it; None without one."""
     if problem.domain is None:
-        return trajectory.cost, None
+        return trajectory.expected_cost, None
     far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
-    return trajectory.cost.masked_fill(far, torch.inf), left
+    return trajectory.expected_cost.masked_fill(far, torch.inf), left
 
 
-def dearest_corner(controller: Controller) -> Corner:
-    """The corner of X₀ with the most expensive closed loop, among the corners along its first CORNER_AXES axes."""
+def dearest_corner(controller: Controller, noise: int | None = None) -> Corner:
+    """The corner of X₀ with the most expensive closed loop, among the corners along its first CORNER_AXES axes.
+
+    Args:
+        noise: seed of one path of the noise from each corner; None: without noise.
+    """
     x0 = controller.initial_states.corners(CORNER_AXES)
     with torch.no_grad():
         value = controller.value(0.0, x0)
         try:
-            cost = _within_domain(controller.problem, controller.rollout(x0))[0]
+            cost = _within_domain(controller.problem, controller.rollout(x0, noise=noise))[0]
         except DivergenceError:
             cost = torch.full_like(value, torch.inf)
     i = int(cost.argmax())

@@ -8,6 +8,7 @@ from torch import nn
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Control, PerState, State
 from lyapnet.task.horizon import Horizon
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import in_float64, path_under, regulator
 
@@ -43,15 +44,19 @@ def costs_of_plant(problem: Problem, policy: nn.Module, x0: State) -> PerState:
     return costs_of_holding(policy, problem.horizon, in_continuous_time(problem), x0)
 
 
-def costs_of_lqr(problem: Problem, x0: State) -> PerState | None:
+def costs_of_lqr(problem: Problem, x0: State, increments: Increments | None = None) -> PerState | None:
     """The costs of LQR: u = ū_n + K_n(x − x*) of the problem linearised at its goal, over N steps, projected onto U.
 
     None if there is no goal or no finite linearisation there, or if the limits of U are unknown.
+
+    Args:
+        increments: ΔW of each step; None: without noise.
     """
     law = _lqr(problem) if problem.has_goal and problem.controls.limits is not None else None
     if law is None:
         return None
-    return path_under(in_float64(problem), law, x0.double().cpu()).cost.to(x0)
+    drawn = None if increments is None else increments.double().cpu()
+    return path_under(in_float64(problem), law, x0.double().cpu(), drawn).cost.to(x0)
 
 
 def _lqr(problem: Problem) -> Callable[[int, State], Control] | None:

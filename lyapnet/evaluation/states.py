@@ -118,21 +118,24 @@ def measure(
 ) -> StateTable:
     """The table of a batch (b,) of trajectories under the control law of a V.
 
+    With noise a cost is a sample of E J_N, and V falls or rises in expectation (see Trajectory.compensated).
+
     Args:
         optimal_cost: J* of each trajectory, if known.
     """
+    cost, trajectory = trajectory.expected_cost, trajectory.compensated()
     values = trajectory.require_value()
     worst, worst_time = _worst(problem, trajectory)
     return StateTable(
         x0=trajectory.x[0],
-        cost=trajectory.cost,
+        cost=cost,
         value=values[0],
         optimal_cost=optimal_cost,
         constraint_loss=program.constraint_loss(values, trajectory),
         hinge=hinge(values, trajectory.step_cost),
         decreasing=(values.diff(dim=0) <= 0).all(0),
-        falling=falls(values, trajectory.step_cost, trajectory.cost),
-        largest_rise=largest_rise(values, trajectory.cost),
+        falling=falls(values, trajectory.step_cost, cost),
+        largest_rise=largest_rise(values, cost),
         terminal_state=trajectory.x[-1],
         terminal_error=torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1),
         at_limits=_at_limits(problem.controls, trajectory.u),

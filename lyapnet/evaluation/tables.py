@@ -46,6 +46,8 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
         table.add_row(label, _entry(key, result[key]))
+    for label, entry in _noise_rows(result).items():
+        table.add_row(label, entry)
     for name, error in result.get("terminal_errors", {}).items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
     for name, share in result.get("at_limits", {}).items():
@@ -60,6 +62,23 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
         table.add_row(f"dearest of {corner['count']} corners of X₀: cost J, V(0, x₀)", f"{cost}, {corner['value']:.4g}")
     table.caption = _caption([result])
     return table
+
+
+def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
+    """The rows of a task with noise."""
+    if (noise := result.get("noise")) is None:
+        return {}
+    levels = noise["quantiles"]
+    return {
+        f"E J with its 95 % interval, {noise['paths']} paths from each state": (
+            f"{result['cost_mean']:.5g} ± {noise['half_width']:.2g}"
+        ),
+        "… from costs alone, without V as a control variate": (
+            f"{noise['plain_mean']:.5g} ± {noise['plain_half_width']:.2g}"
+        ),
+        f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(f"{level:.4g}" for level in levels.values()),
+        "paths lost, J beyond 1.5 V(0, x₀) and not by its noise": f"{noise['lost_fraction']:.2%}",
+    }
 
 
 def table_over_seeds(title: str, result: dict[str, Any]) -> Table:

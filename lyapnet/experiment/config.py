@@ -285,6 +285,9 @@ class Config:
     family: dict[str, list[float]] = option(
         {}, "Ranges of parameters in V: of the system, and target_STATE; each as [least, greatest]."
     )
+    noise: dict[str, float] = option(
+        {}, "σ of states that noise drives, each as STATE: σ in its unit per √s; see the page on noise.", at_least=0
+    )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -16,7 +16,7 @@ from torch import Tensor
 from lyapnet.base.contracts import differences, state_of
 from lyapnet.base.errors import UsageError, one_line
 from lyapnet.base.shapes import Shape
-from lyapnet.base.types import Control, ControlMatrix, InputMatrix, PerState, State
+from lyapnet.base.types import Control, ControlMatrix, InputMatrix, Noise, PerState, State
 from lyapnet.graphs.tracing import trace
 from lyapnet.task.cost import Cost
 from lyapnet.task.systems import ControlAffineSystem
@@ -85,6 +85,17 @@ class FamilySystem(ControlAffineSystem):
     def dynamics(self, x: State, u: Control) -> State:
         x, p = self.split(x)
         return torch.cat([self.member(p).dynamics(x, u), torch.zeros_like(p)], -1)
+
+    @property
+    def noisy(self) -> bool:
+        return self.system.noisy
+
+    def noise(self, x: State) -> Noise:
+        """σ(x; p) of each member, with zeros for the parameters."""
+        x, p = self.split(x)
+        member: Any = self.member(p)
+        sigma = member.noise(x)
+        return torch.cat([sigma, sigma.new_zeros(*sigma.shape[:-2], p.shape[-1], sigma.shape[-1])], -2)
 
     def inverse_mass(self, x: State) -> ControlMatrix:
         """BᵀM(q; p)⁻¹B of each member, if the system has a mass matrix."""

@@ -17,6 +17,7 @@ from lyapnet.task.constraints import Constraints
 from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
+from lyapnet.task.noise import Noise, SystemNoise
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 
@@ -38,6 +39,9 @@ class Response(NamedTuple):
 class Problem(nn.Module):
     """minimise J(x₀) = ∫₀ᵀ ℓ(x, u) dt + φ(x(T)) over u(t) ∈ U subject to ẋ = f(x) + g(x)u, h(x) ≤ 0, for all x₀ ∈ X₀.
 
+    With noise σ, dx = (f + gu) dt + σ(x) dW, and the expectation E J(x₀) is minimised. Methods about a step, such as
+    `step` and `response`, are about the step without noise.
+
     Args:
         system: f and g.
         cost: ℓ and φ.
@@ -45,6 +49,7 @@ class Problem(nn.Module):
         initial_states: X₀.
         horizon: T, its steps, and their integrator with u held.
         constraints: h; None: there are none.
+        noise: σ; None: that of the system, if it has a method `noise(x)`.
 
     Raises:
         ValueError: the dimension of X₀, or of the cost's goal or rest, differs from that of the system.
@@ -56,6 +61,7 @@ class Problem(nn.Module):
     initial_states: Box
     horizon: Horizon
     constraints: Constraints | None
+    noise: Noise | None
     findings: Findings
 
     def __init__(
@@ -66,6 +72,7 @@ class Problem(nn.Module):
         initial_states: Box,
         horizon: Horizon,
         constraints: Constraints | None = None,
+        noise: Noise | None = None,
     ):
         super().__init__()
         if initial_states.dimension != system.n:
@@ -82,6 +89,7 @@ class Problem(nn.Module):
                 )
         self.system, self.cost, self.controls = system, cost, controls
         self.initial_states, self.horizon, self.constraints = initial_states, horizon, constraints
+        self.noise = SystemNoise(system, initial_states.center) if noise is None and system.noisy else noise
         self.findings = Findings()
 
     @property
@@ -196,12 +204,23 @@ class Problem(nn.Module):
 
     def replaced(self, **parts: Any) -> "Problem":
         """The problem with some of its parts replaced."""
-        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
-        other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints", "noise")
+        own = {name: getattr(self, name) for name in names}
+        if "system" in parts and isinstance(self.noise, SystemNoise):
+            own["noise"] = None  # that of the other system
+        other = Problem(**{**own, **parts})
         if parts.keys().isdisjoint(("cost", "system")):
             other.findings = self.findings
         if "initial_states" in parts:
             other.findings = Findings({name: found for name, found in other.findings.items() if name != "no_goal"})
+        return other
+
+    def without_noise(self) -> "Problem":
+        """The deterministic problem with the same f and g; the problem itself if it has no noise."""
+        if self.noise is None:
+            return self
+        other = self.replaced()
+        other.noise = None
         return other
 
     def in_steps(self, **changes: Any) -> "Problem":
@@ -266,6 +285,8 @@ class Problem(nn.Module):
             (f"R(x) of {type(cost).__name__}", cost.R, (m, m)),
         ):
             check_function(symbol, function, [x[:TRIED]], shape)
+        if own.noise is not None:
+            check_function(f"{name}.noise(x)", own.noise, [x[:TRIED]], (n, own.noise.sources))
         cost.check(x)
         own._check_constraints(x)
         b = torch.randn(len(x), m, generator=generator, dtype=torch.float64)
@@ -297,6 +318,8 @@ class Problem(nn.Module):
         _ = system.dynamics(x, u), cost.running(x, u), cost.terminal(x), self.controls.contains(u), self.rates(x, u)
         if self.constraints is not None:
             self.constraints(x)
+        if self.noise is not None:
+            self.noise(x)
 
     def _check_constraints(self, x: State) -> None:
         """Check the contract of h, and that states of X₀ satisfy h ≤ 0."""
@@ -369,6 +392,9 @@ class Problem(nn.Module):
             numbers["u*"] = cost.rest.expand(3, m)
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
+        if own.noise is not None:
+            sigma = own.noise(x)
+            numbers["σσᵀ"] = sigma @ sigma.mT
         if own.controls.limits is not None:
             for side, limit in zip(LIMITS, own.controls.limits, strict=True):
                 numbers[side] = limit.to(x).expand(1, m)
@@ -383,6 +409,9 @@ class Problem(nn.Module):
         unsaid = {side: [[sign * math.inf] * m] for side, sign in LIMITS.items()} | {"u*": [[0.0] * m] * 3}
         if "u*" in record:
             own = {"u*": unsaid["u*"], **own}
+        if "σσᵀ" in record or "σσᵀ" in own:
+            none = torch.zeros(3, self.system.n, self.system.n).tolist()
+            unsaid["σσᵀ"], own = none, {"σσᵀ": none, **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}
         return [name for name, value in own.items() if not _agree(record.get(name, unsaid.get(name)), value)]

@@ -57,7 +57,7 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
     problem = learner.problem
     x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
     with torch.no_grad():
-        sample = learner.rollout(x0)
+        sample = learner.roll_out(x0, FIGURES)
     drawn = {
         "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),
@@ -73,7 +73,7 @@ def film_of(learner: Learner) -> Film:
     """The animation of closed loops from five states of X₀."""
     x0 = learner.problem.initial_states.sample(5, stream(learner.seed, FIGURES))
     with torch.no_grad():
-        return Film(learner.rollout(x0), learner.problem, learner.V, rate=15)
+        return Film(learner.roll_out(x0, FIGURES), learner.problem, learner.V, rate=15)
 
 
 def log_figure(loggers: Sequence[Logger], name: str, figure: Figure, step: int) -> None:

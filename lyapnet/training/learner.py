@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
-from lyapnet.base.random_streams import POINTS, VALIDATION, stream
+from lyapnet.base.random_streams import NOISE, POINTS, VALIDATION, stream
 from lyapnet.base.types import PerState, State
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
@@ -101,6 +101,17 @@ class Learner(nn.Module):
         times = self.problem.horizon.times(goal)
         return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
 
+    def roll_out(self, x0: State, *draw: int) -> Trajectory:
+        """The closed loop from x₀, under noise if the problem has some.
+
+        Args:
+            draw: identifies the random stream of the noise, which also depends on the seed.
+        """
+        noise, horizon = self.problem.noise, self.problem.horizon
+        if noise is None:
+            return self.rollout(x0)
+        return self.rollout(x0, noise.draw(horizon.steps, horizon.dt, x0, stream(self.seed, NOISE, *draw)))
+
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
         """The loss of a training batch; its terms are stored in `output`.
 
@@ -150,6 +161,7 @@ class Learner(nn.Module):
         over_processes: Callable[[Tensor], Tensor] = lambda value: value,
     ) -> ProgramOutput:
         """Evaluate the program, with its pointwise condition if there is one."""
+        trajectory = trajectory.compensated()
         output = self.program(trajectory, over_processes, spread_of_costs)
         if self.pointwise is None:
             return output

@@ -6,6 +6,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import DivergenceError
+from lyapnet.base.random_streams import LOST
 from lyapnet.base.types import PerState, State
 from lyapnet.loop.programs.terms import value_floored
 from lyapnet.task.cost import spread
@@ -51,5 +52,5 @@ def excess(cost: PerState, value: PerState, has_goal: bool = True) -> PerState:
 
 
 def _excess_of(learner: Learner, x0: State) -> PerState:
-    trajectory = learner.rollout(x0)
-    return excess(trajectory.cost, trajectory.require_value()[0], learner.problem.has_goal)
+    trajectory = learner.roll_out(x0, LOST)
+    return excess(trajectory.expected_cost, trajectory.require_value()[0], learner.problem.has_goal)

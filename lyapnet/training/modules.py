@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from lyapnet import __version__
 from lyapnet.base.errors import CheckpointError, DivergenceError, UsageError
-from lyapnet.base.random_streams import POINTS
+from lyapnet.base.random_streams import POINTS, TRAINING, VALIDATION
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.loop.programs import PointwiseCondition, Program
 from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
@@ -70,7 +70,7 @@ class TrainingModule(L.LightningModule):
             if self._has_ended(member, self.global_step):
                 member.output = None
                 return None
-            return member.train_on(member.rollout(states), draw)
+            return member.train_on(member.roll_out(states, TRAINING, *draw[1:]), draw)
 
         return {"loss": torch.stack([loss for loss in self._for_each(x0, train) if loss is not None]).sum()}
 
@@ -89,7 +89,7 @@ class TrainingModule(L.LightningModule):
             if self._has_ended(member, member.measured_at):
                 return states.new_tensor(member.validation_loss)
             member.measured_at = self.global_step
-            return member.measure_on(member.rollout(states))
+            return member.measure_on(member.roll_out(states, VALIDATION))
 
         return self.without_gradient(x0, validate)
 

@@ -121,7 +121,7 @@ def _improve_by_oracle(
 
     Also returns the oracle's controls from the other states, NaN where it ran out of time; None if it did not try them.
     """
-    oracle, began = optimal_cost(problem), time.thread_time()
+    oracle, began = optimal_cost(problem.without_noise()), time.thread_time()
     if oracle is None:  # not installed, or not applicable to this problem
         return optimum, None
     progress = partial(report, f"optima by the oracle within {SEARCH_SECONDS:.0f} s of work")

@@ -4,6 +4,7 @@ import importlib.util
 
 from lyapnet.base.errors import OracleError, one_line
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.evaluation.oracles.noisy_riccati import noisy_riccati
 from lyapnet.evaluation.oracles.of_rounded import OracleOfRounded
 from lyapnet.evaluation.oracles.riccati import (
     RiccatiOracle,
@@ -36,6 +37,8 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
 
     * Riccati, if the system is `Linear`, R is a constant matrix, U = ℝᵐ and there are no constraints: of the
       discretised task for Euler steps, of the continuous task for any other integrator.
+    * With noise, the Riccati recursion of the steps for such tasks whose σ is affine in x; no other task with noise has
+      an oracle.
     * Direct transcription otherwise, within the limits of U and h(x) ≤ 0, with the steps of the integrator (rk4 for an
       adaptive one) and u held over each step. A law that is not held is evaluated at every stage of a step, and may
       therefore cost less, by O(Δt²).
@@ -57,6 +60,8 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
     system, cost, horizon = problem.system, problem.cost, problem.horizon
     method = method or horizon.method
     free = problem.constraints is None and not problem.controls.limited
+    if problem.noise is not None:
+        return noisy_riccati(problem, free)
     if free and is_linear(system) and is_quadratic(cost) and cost.R_constant is not None:
         solve = discrete_riccati if method == "euler" else continuous_riccati
         try:

@@ -26,13 +26,20 @@ class PathWithDerivatives(NamedTuple):
     node_bar: StatePath  # derivative by x
     cost_bar: ValuePath  # derivative by ∫ℓ over the step
     value_bar: ValuePath  # derivative by V
+    increments: Tensor | None = None  # ΔW over the step, 0 at the last node; None without noise
+
+    @property
+    def columns(self) -> list[Tensor]:
+        """The fields that there are."""
+        return [column for column in self if column is not None]
 
 
 class StepwiseGradient:
     """(state, columns) ↦ (x̄₀, θ̄), one step pulled back at a time.
 
     Args:
-        pull_back: (*state, t, Δt, x, x̄, c̄, V̄, λ'), columns with the latest node first ↦ (λ at the nodes, *θ̄).
+        pull_back: (*state, t, Δt, x, x̄, c̄, V̄, λ'), columns with the latest node first ↦ (λ at the nodes, *θ̄); with
+            noise ΔW before λ'.
         limit: largest length of costates, see `limit_costates`; applied at each LIMIT_INTERVAL-th node.
     """
 
@@ -41,7 +48,7 @@ class StepwiseGradient:
 
     def __call__(self, state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
         nodes = len(path.t)
-        t, dt, stages, *derivatives = path
+        t, dt, stages, *derivatives = path.columns
         columns = [column.flip(0) for column in (t, dt, stages[:, 0], *derivatives)]
         ends = (
             [0, nodes]
@@ -80,7 +87,8 @@ class BlockwiseGradient:
         length = K * math.ceil(nodes / K)
         columns = [
             (repeated if name in ("t", "stages") else padded)(column, length).contiguous()
-            for name, column in zip(PathWithDerivatives._fields, path, strict=True)
+            for name, column in path._asdict().items()
+            if column is not None
         ]
         costate, gradient = torch.zeros_like(path.node_bar[0]), list[Tensor]()
         for start in reversed(range(0, length, K)):

@@ -5,6 +5,7 @@ from torch import Tensor, nn
 
 from lyapnet.base.types import Control, State, Time
 from lyapnet.task.cost import Cost
+from lyapnet.task.noise import Noise
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
@@ -17,10 +18,12 @@ class ClosedLoop(nn.Module):
     system: ControlAffineSystem
     cost: Cost
     policy: nn.Module
+    noise: Noise | None
 
     def __init__(self, problem: Problem, policy: nn.Module):
         super().__init__()
         self.system, self.cost, self.policy = problem.system, problem.cost, policy
+        self.noise = problem.noise
 
     @property
     def V(self) -> ValueFunction | None:
@@ -34,6 +37,11 @@ class ClosedLoop(nn.Module):
     def slope(self, x: State, u: Control) -> Tensor:
         """(f + g u, ℓ), (*batch, n + 1)."""
         return torch.cat([self.system.dynamics(x, u), self.cost.running(x, u)[..., None]], -1)
+
+    def displacement(self, x: State, increment: Tensor) -> State:
+        """σ(x)ΔW, which noise adds to a step from x."""
+        assert self.noise is not None
+        return self.noise.displacement(x, increment)
 
     def control(self, t: Time, x: State) -> PolicyOutput:
         """u, V and V_x; zeros for V and V_x if the law is not defined by a V."""

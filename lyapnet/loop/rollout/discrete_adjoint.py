@@ -27,6 +27,7 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.loop.rollout.routines import BATCH_AXES, Nodes, Routines, TracedRoutines
 from lyapnet.loop.rollout.runge_kutta import Linearise, Step
 from lyapnet.task.horizon import TABLEAUX
+from lyapnet.task.noise import Increments
 
 _LOG = logging.getLogger(__name__)
 RolledPath = tuple[StatePath, ValuePath, ValuePath, ControlPath]  # (x, ∫ℓ, V, u) at the nodes
@@ -68,17 +69,21 @@ class DiscreteAdjoint:
         """Without traces and code, which belong to these very tensors; a copy makes its own."""
         return {**vars(self), "_traced": {}, "_routines": {}, "_compiled": None, "_compiled_key": None}
 
-    def __call__(self, x0: State) -> RolledPath:
+    def __call__(self, x0: State, increments: Increments | None = None) -> RolledPath:
         """(x, ∫ℓ, V, u) at the nodes, from x₀ (b, n).
+
+        Args:
+            increments: ΔW of each step (N, b, k), data for the gradient; None: the loop without its noise.
 
         Raises:
             UsageError: the loop draws random numbers, which the backward pass could not repeat.
         """
         x0, theta = x0.contiguous(), self.trained()  # compiled code assumes contiguous tensors without a check
+        noise = self._noise(x0, increments)
         if torch.is_grad_enabled() and (x0.requires_grad or any(p.requires_grad for p in theta)):
-            x, running_cost, value, u = _Rollout.apply(self, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
+            x, running_cost, value, u = _Rollout.apply(self, noise, x0, *theta)  # pyright: ignore[reportGeneralTypeIssues]
             return x, running_cost, value, u
-        return _path_of(self._integrate_without_gradient(x0, theta))
+        return _path_of(self._integrate_without_gradient(x0, theta, noise))
 
     def trained(self) -> list[Tensor]:
         """The loop's parameters that require a gradient."""
@@ -142,11 +147,12 @@ class DiscreteAdjoint:
     def _agrees(self, routines: Routines, x0: State) -> bool:
         """Whether routines give this loop's steps from x₀, and the gradient of the sum of x, ∫ℓ and V."""
         theta, step = self.trained(), Step(self.loop, self._tableau)
-        nodes, (t, dt) = self.integrate(routines, x0, theta), self._grid(x0, self.steps + 1)
+        noise = self._drawn_noise(x0)
+        nodes, columns = self.integrate(routines, x0, theta, noise), [*self._grid(x0, self.steps + 1), *noise]
         found, expected = list[Tensor](), list[Tensor]()
         with torch.no_grad():
             for k in self._steps_to_check():
-                following, *kept = step(t[k], dt[k], nodes.stages[k, 0])
+                following, *kept = step(*(column[k] for column in columns), nodes.stages[k, 0])
                 found += [column[k] for column in nodes]
                 expected += kept
                 if k < self.steps:
@@ -155,7 +161,7 @@ class DiscreteAdjoint:
         if theta:
             ones = [torch.ones_like(each) for each in (nodes.stages[:, 0], nodes.step_cost, nodes.value)]
             for routes, results in ((routines, found), (self._eager_routines(x0), expected)):
-                x0_bar, theta_bar = self.gradient(routes, theta, nodes.stages, ones)
+                x0_bar, theta_bar = self.gradient(routes, theta, nodes.stages, ones, noise)
                 results += [x0_bar, *theta_bar]
         return all(are_close(mine, theirs) for mine, theirs in zip(found, expected, strict=True))
 
@@ -180,39 +186,76 @@ class DiscreteAdjoint:
                 self._routines[key] = self._eager_routines(x0)
         return self._routines[key]
 
-    def integrate(self, routines: Routines, x0: State, theta: Sequence[Tensor]) -> Nodes:
-        """The path from x₀; a step of length zero at its last node makes all nodes alike."""
+    def integrate(
+        self, routines: Routines, x0: State, theta: Sequence[Tensor], noise: Sequence[Tensor] = ()
+    ) -> Nodes:
+        """The path from x₀; a step of length zero at its last node makes all nodes alike.
+
+        Args:
+            noise: ΔW at the nodes (N + 1, b, k), if there is noise.
+        """
         with torch.no_grad():
-            return Nodes(*routines.integrate(*self._state(theta), *self._grid(x0, self.steps + 1), x0))
+            return Nodes(*routines.integrate(*self._state(theta), *self._grid(x0, self.steps + 1), *noise, x0))
 
     def gradient(
-        self, routines: Routines, theta: Sequence[Tensor], stages: StagePath, bars: Sequence[Tensor]
+        self,
+        routines: Routines,
+        theta: Sequence[Tensor],
+        stages: StagePath,
+        bars: Sequence[Tensor],
+        noise: Sequence[Tensor] = (),
     ) -> tuple[State, list[Tensor]]:
-        """(x̄₀, θ̄) from the loss's derivatives by x, ∫ℓ and V at the nodes."""
+        """(x̄₀, θ̄) from the loss's derivatives by x, ∫ℓ and V at the nodes, and ΔW there if there is noise."""
         x_bar, running_cost_bar, value_bar = bars
         # a step's cost is part of the running cost of every later node
         cost_bar = padded(running_cost_bar.flip(0).cumsum(0).flip(0)[1:], len(stages))
-        path = PathWithDerivatives(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar)
+        path = PathWithDerivatives(*self._grid(stages, len(stages)), stages, x_bar, cost_bar, value_bar, *noise)
         costate, share = routines.gradient(self._state(theta), path)
         return costate, share[: len(theta)]  # shared code may have gradients of parameters that are not trained here
 
-    def _integrate_without_gradient(self, x0: Tensor, theta: Sequence[Tensor]) -> Nodes:
+    def _noise(self, x0: State, increments: Increments | None) -> list[Tensor]:
+        """ΔW at the nodes (N + 1, b, k), zero at the last one; empty for a loop without noise.
+
+        Raises:
+            ValueError: increments for a loop without noise, or of another shape.
+        """
+        noise, given = self.loop.noise, None if increments is None else tuple(increments.shape)
+        expected = None if noise is None else (self.steps, len(x0), noise.sources)
+        if given is not None and given != expected:
+            raise ValueError(f"Expected increments of shape {expected or 'None'}, got {given}; see Noise.draw.")
+        if noise is None:
+            return []
+        shape = (self.steps + 1, len(x0), noise.sources)
+        return [x0.new_zeros(shape) if increments is None else padded(increments.to(x0), self.steps + 1)]
+
+    def _drawn_noise(self, x0: State) -> list[Tensor]:
+        """ΔW of fixed random draws, for comparisons."""
+        noise = self.loop.noise
+        if noise is None:
+            return []
+        return self._noise(x0, noise.draw(self.steps, self.dt, x0, torch.Generator().manual_seed(0)))
+
+    def _integrate_without_gradient(self, x0: Tensor, theta: Sequence[Tensor], noise: Sequence[Tensor]) -> Nodes:
         """The path without a gradient: by compiled routines, if necessary in slices; else eagerly."""
         if self._key(x0) in self._routines:
-            return self.integrate(self._routines[self._key(x0)], x0, theta)
+            return self.integrate(self._routines[self._key(x0)], x0, theta, noise)
         if (
             not x0.numel()
             or self._compiled is None
             or self._key(self._compiled) not in self._routines  # it was compiled for other trained parameters
             or self._key(self._compiled[0]) != self._key(x0[0])
         ):
-            return self.integrate(self._eager_routines(x0), x0, theta)
+            return self.integrate(self._eager_routines(x0), x0, theta, noise)
         size, batch = len(self._compiled), len(x0)
         full = torch.cat([x0, x0[-1:].expand(-batch % size, -1)])
+        drawn = [torch.cat([w, w[:, -1:].expand(-1, -batch % size, -1)], 1) for w in noise]
         routines = self._routines[self._key(self._compiled)]
-        parts = [part.contiguous() for part in full.split(size)]
+        parts = [
+            (full[k : k + size].contiguous(), [w[:, k : k + size].contiguous() for w in drawn])
+            for k in range(0, len(full), size)
+        ]
         on_threads = in_threads if x0.device.type == "cpu" else map
-        paths = list(on_threads(lambda part: self.integrate(routines, part, theta), parts))
+        paths = list(on_threads(lambda part: self.integrate(routines, part[0], theta, part[1]), parts))
         columns = zip(zip(*paths, strict=True), BATCH_AXES, strict=True)
         return Nodes(*(torch.cat(parts, axis).narrow(axis, 0, batch) for parts, axis in columns))
 
@@ -228,7 +271,8 @@ class DiscreteAdjoint:
         """The traced routines for batches like x₀."""
         key = self._key(x0)
         if key not in self._traced:
-            state, grid, x0 = self._state(self.trained()), self._grid(x0, self.steps + 1), x0.detach().contiguous()
+            x0 = x0.detach().contiguous()
+            state, grid = self._state(self.trained()), [*self._grid(x0, self.steps + 1), *self._drawn_noise(x0)]
             visited = partial(self._visited, x0)
             self._traced[key] = TracedRoutines(
                 self.loop, self._tableau, state, grid, x0, self._block(x0), self.costate_limit, visited
@@ -236,10 +280,11 @@ class DiscreteAdjoint:
         return self._traced[key]
 
     def _visited(self, x0: Tensor) -> list[list[Tensor]]:
-        """(t, Δt, x) of some steps of the loop run eagerly."""
-        t, dt = self._grid(x0, self.steps + 1)
-        path = self.integrate(self._eager_routines(x0), x0, self.trained()).stages[:, 0]
-        return [[t[k], dt[k], path[k]] for k in self._steps_to_check()]
+        """(t, Δt, x) of some steps of the loop run eagerly, with noise ΔW before x."""
+        noise = self._drawn_noise(x0)
+        columns = [*self._grid(x0, self.steps + 1), *noise]
+        path = self.integrate(self._eager_routines(x0), x0, self.trained(), noise).stages[:, 0]
+        return [[*(column[k] for column in columns), path[k]] for k in self._steps_to_check()]
 
     def _eager_routines(self, x0: Tensor) -> Routines:
         """The routines in Python, on the loop's own tensors."""
@@ -274,14 +319,16 @@ class DiscreteAdjoint:
 
 
 class _Rollout(torch.autograd.Function):
-    """(adjoint, x₀, *θ) ↦ (x, ∫ℓ, V, u), where u has no gradient."""
+    """(adjoint, ΔW, x₀, *θ) ↦ (x, ∫ℓ, V, u), where ΔW and u have no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, adjoint: DiscreteAdjoint, x0: Tensor, *theta: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, adjoint: DiscreteAdjoint, noise: Sequence[Tensor], x0: Tensor, *theta: Tensor
+    ) -> tuple[Tensor, ...]:
         routines = adjoint.routines(x0)
-        path = adjoint.integrate(routines, x0, theta)
+        path = adjoint.integrate(routines, x0, theta, noise)
         result = _path_of(path)
-        ctx.adjoint, ctx.routines = adjoint, routines
+        ctx.adjoint, ctx.routines, ctx.noise = adjoint, routines, noise
         ctx.save_for_backward(path.stages, *theta, *untrained_of(adjoint.loop))
         ctx.mark_non_differentiable(result[-1])
         return result
@@ -290,14 +337,14 @@ class _Rollout(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *bars: Tensor) -> tuple[Tensor | None, ...]:
         stages, *state = ctx.saved_tensors  # torch raises an error if they were changed in between
-        theta, facts = state[: len(ctx.needs_input_grad) - 2], state[len(ctx.needs_input_grad) - 2 :]
+        theta, facts = state[: len(ctx.needs_input_grad) - 3], state[len(ctx.needs_input_grad) - 3 :]
         now = [tensor.data_ptr() for tensor in untrained_of(ctx.adjoint.loop)]
         if now != [tensor.data_ptr() for tensor in facts]:
             raise RuntimeError(
                 "Expected the closed loop as it was rolled out, got another buffer; replace it afterwards."
             )
-        x0_bar, theta_bar = ctx.adjoint.gradient(ctx.routines, theta, stages, bars[:3])
-        return None, x0_bar, *theta_bar
+        x0_bar, theta_bar = ctx.adjoint.gradient(ctx.routines, theta, stages, bars[:3], ctx.noise)
+        return None, None, x0_bar, *theta_bar
 
 
 def _path_of(nodes: Nodes) -> RolledPath:

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.base.errors import DivergenceError
-from lyapnet.base.types import ControlPath, PerState, State, StatePath, Times, ValuePath
+from lyapnet.base.types import ControlPath, PerState, State, StatePath, StepPath, Times, ValuePath
 from lyapnet.loop.rollout.closed_loop import ClosedLoop, SteppedLoop
 from lyapnet.loop.rollout.discrete_adjoint import DiscreteAdjoint
+from lyapnet.loop.rollout.expectations import martingale, surprises
 from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 
 
@@ -23,6 +25,8 @@ class Trajectory(NamedTuple):
     running_cost: ValuePath  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: PerState  # (*batch,): φ(x_N)
     value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), if a V defines the control law
+    surprise: StepPath | None = None  # (N, *batch): V_{n+1} − E[V_{n+1} | x_n]; None without noise
+    martingale: PerState | None = None  # (*batch,): Σ_n V_xᵀσΔW, of mean zero; None without noise
 
     def require_value(self) -> ValuePath:
         """V along the trajectory.
@@ -40,6 +44,24 @@ class Trajectory(NamedTuple):
         return self.running_cost[-1] + self.terminal_cost
 
     @property
+    def expected_cost(self) -> PerState:
+        """A sample of E J_N given x₀: J_N, with noise less the martingale, which has the same mean and varies less."""
+        return self.cost if self.martingale is None else self.cost - self.martingale
+
+    def compensated(self) -> "Trajectory":
+        """The trajectory without the unpredicted part of V, so that programs see expectations over each step.
+
+        With the surprises D_n, V_n − Σ_{k<n} D_k replaces V_n and φ − Σ D_k replaces φ. Then V_{n+1} − V_n becomes
+        E[V_{n+1} | x_n] − V_n, and V_n minus the cost to go becomes the sum of the expected residuals from t_n on,
+        which is zero on every path if V is the cost to go. Squares of these have no floor from the noise.
+        """
+        if self.surprise is None:
+            return self
+        value, total = self.require_value(), self.surprise.sum(0)
+        before = torch.cat([torch.zeros_like(value[:1]), self.surprise.cumsum(0)])
+        return self._replace(value=value - before, terminal_cost=self.terminal_cost - total, surprise=None)
+
+    @property
     def step_cost(self) -> Any:
         """∫ℓ over each step by the integrator's quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
         return self.running_cost[1:] - self.running_cost[:-1]
@@ -54,7 +76,8 @@ GRADIENTS = ("adjoint", "backprop", "discrete")
 class Rollout(nn.Module):
     """x₀ ↦ Trajectory under u = policy(t, x), by torchdiffeq on the state augmented with the running cost.
 
-    Fixed-step methods take one step between nodes: with Euler, x_{n+1} = x_n + Δt(f + g u) and the cost is J_N.
+    Fixed-step methods take one step between nodes: with Euler, x_{n+1} = x_n + Δt(f + g u) and the cost is J_N. With
+    noise each step also adds σ(x_n)ΔW_n (see Noise), with gradient discrete alone.
 
     Args:
         problem, policy: problem and control law of the closed loop.
@@ -134,17 +157,31 @@ class Rollout(nn.Module):
             steps, dt = self.horizon.steps, self.horizon.dt
             self.discrete = DiscreteAdjoint(self.stepped, steps, dt, step, costate_limit)
 
-    def forward(self, x0: State) -> Trajectory:
+    def forward(self, x0: State, increments: Increments | None = None) -> Trajectory:
         """The closed loop from x₀ (*batch, n).
 
+        Args:
+            increments: ΔW of each step (N, *batch, k), see Noise.draw; None: the loop without its noise.
+
         Raises:
+            ValueError: increments of another shape, for a problem without noise, or with another gradient.
             DivergenceError: a state or cost is not finite; names the step and the initial state. Or an adaptive method
                 gave up.
         """
         t = self.horizon.times(x0)
-        x, running_cost, value, u = (self._integrate if self.discrete is None else self._integrate_discretely)(x0, t)
+        if self.discrete is not None:
+            x, running_cost, value, u = self._integrate_discretely(x0, increments)
+        elif increments is None:
+            x, running_cost, value, u = self._integrate(x0, t)
+        else:
+            raise ValueError(f"Expected no increments with gradient {self.gradient}, got some; take discrete.")
         _require_finite(x, running_cost, t)
-        return Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
+        trajectory = Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
+        V, noise = self.closed_loop.V, self.problem.noise
+        if increments is None or noise is None or V is None:
+            return trajectory
+        surprise = surprises(V, noise, t, x, trajectory.require_value(), increments)
+        return trajectory._replace(surprise=surprise, martingale=martingale(V, noise, t, x.detach(), increments))
 
     @property
     def takes_steps_of_problem(self) -> bool:
@@ -152,10 +189,13 @@ class Rollout(nn.Module):
         held = self.stepped is not self.closed_loop
         return self.method == self.problem.horizon.method and (held or self.method == "euler")
 
-    def _integrate_discretely(self, x0: State, t: Times) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
+    def _integrate_discretely(
+        self, x0: State, increments: Increments | None
+    ) -> tuple[StatePath, ValuePath, ValuePath | None, ControlPath]:
         """(x, ∫ℓ, V, u) at the nodes, with the gradient by DiscreteAdjoint."""
         assert self.discrete is not None
-        path = self.discrete(x0.reshape(-1, x0.shape[-1]))
+        flat = None if increments is None else increments.reshape(len(increments), -1, increments.shape[-1])
+        path = self.discrete(x0.reshape(-1, x0.shape[-1]), flat)
         x, running_cost, value, u = (y.reshape(len(y), *x0.shape[:-1], *y.shape[2:]) for y in path)
         return x, running_cost, None if self.closed_loop.V is None else value, u
 

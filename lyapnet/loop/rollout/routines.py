@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.fx import GraphModule
 
 from lyapnet.base.errors import CompilationError, LyapnetError, UntraceableError, one_line
-from lyapnet.base.types import ControlPath, StagePath, State, Times, ValuePath
+from lyapnet.base.types import ControlPath, StagePath, State, ValuePath
 from lyapnet.graphs.compilation import compilation_errors
 from lyapnet.graphs.cuda_graphs import RecordedFunction, Replay, record
 from lyapnet.graphs.number_kernel.kernel import ScanKernel
@@ -38,7 +38,7 @@ BATCH_AXES = (-2, -1, -2, -1)  # batch axis of each column of Nodes
 class Routines(NamedTuple):
     """The two routines for one batch shape; `state` is the list of tensors of the closed loop."""
 
-    integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀) ↦ the columns of Nodes at the nodes t
+    integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀), with noise ΔW before x₀ ↦ the columns of Nodes
     gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
 
 
@@ -48,11 +48,11 @@ class TracedRoutines:
     Args:
         loop, tableau: the closed loop, and the integrator of its steps.
         state: the tensors of the loop, the trained ones first.
-        grid: t and Δt at all nodes.
+        grid: t and Δt at all nodes; with noise also ΔW.
         x0: a batch (b, n).
         block: K, the number of nodes in a block.
         limit: limit of the costates, see `limit_costates`.
-        visited: returns the (t, Δt, x) at which the trace of a step is compared with the loop itself.
+        visited: returns the arguments (t, Δt, x), with noise ΔW before x, at which the trace of a step is compared with the loop itself.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class TracedRoutines:
         loop: ClosedLoop,
         tableau: ButcherTableau,
         state: list[Tensor],
-        grid: tuple[Times, Times],
+        grid: Sequence[Tensor],
         x0: State,
         block: int,
         limit: float | None,
@@ -92,30 +92,30 @@ class TracedRoutines:
         """The graphs as CUDA graphs, one for the whole path and one for the whole gradient."""
         by_blocks, tensors = BlockwiseGradient(*self._block_pieces, self.block, self.limit), len(self.state)
         integrate = RecordedFunction(self._scan().loop, [*self.state, *self.grid, self.x0], record)
-        (t, dt), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
+        (t, dt, *noise), nodes = self.grid, self.x0.expand(len(self.grid[0]), *self.x0.shape)
         stages = nodes[:, None].expand(-1, self._stages, -1, -1)
         path = PathWithDerivatives(
-            t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0])
+            t, dt, stages, nodes, torch.zeros_like(nodes[..., 0]), torch.zeros_like(nodes[..., 0]), *noise
         )
 
         def backwards(*arguments: Tensor) -> list[Tensor]:
             costate, share = by_blocks(arguments[:tensors], PathWithDerivatives(*arguments[tensors:]))
             return [costate, *share]
 
-        gradient = RecordedFunction(backwards, [*self.state, *path], record)
+        gradient = RecordedFunction(backwards, [*self.state, *path.columns], record)
 
         def unpacked(state: Sequence[Tensor], path: PathWithDerivatives) -> tuple[State, list[Tensor]]:
-            costate, *share = gradient(*state, *path)
+            costate, *share = gradient(*state, *path.columns)
             return costate, share
 
         return Routines(integrate, unpacked)
 
     def _by_kernel(self) -> Routines:
-        (t, dt), x0 = self.grid, self.x0
+        (t, dt, *noise), x0 = self.grid, self.x0
         nodes, per_node = x0.expand(len(t), *x0.shape), torch.ones_like(x0[:, 0]).expand(len(t), -1)
-        columns = [t, dt, nodes, nodes, per_node, per_node]
+        columns = [t, dt, nodes, nodes, per_node, per_node, *noise]
         try:
-            integrate = ScanKernel(*self._forwards, [*self.state, *self.grid, x0])
+            integrate = ScanKernel(*self._forwards, [*self.state, *self.grid, x0], len(self.grid))
             back = ScanKernel(*self._backwards, [*self.state, *columns, x0], len(columns), sums=self._trained)
         except NotImplementedError as error:
             raise CompilationError(f"Expected operations that the kernel has, got {error}") from error
@@ -127,17 +127,16 @@ class TracedRoutines:
     @cached_property
     def _forwards(self) -> tuple[GraphModule, GraphModule]:
         """(the part common to all steps, one step)."""
-        t, dt = self.grid
-        arguments = [*self.state, t[0], dt[0], self.x0]
+        arguments = [*self.state, *(column[0] for column in self.grid), self.x0]
         with _tracing():
             elsewhere = self._visited()
-        return cut(self._trace(self._step, arguments, elsewhere), late=3, early_outputs=0, repeat=False)
+        return cut(self._trace(self._step, arguments, elsewhere), late=1 + len(self.grid), early_outputs=0, repeat=False)
 
     @cached_property
     def _backwards(self) -> tuple[GraphModule, GraphModule]:
         """(the part common to all steps, one backward step)."""
-        (t, dt), x0 = self.grid, self.x0
-        late = [t[0], dt[0], x0, x0.clone(), torch.ones_like(x0[:, 0]), torch.ones_like(x0[:, 0]), x0.clone()]
+        (t, dt, *noise), x0 = (column[0] for column in self.grid), self.x0
+        late = [t, dt, x0, x0.clone(), torch.ones_like(x0[:, 0]), torch.ones_like(x0[:, 0]), *noise, x0.clone()]
         return cut(
             self._trace(PullBack(self._step), [*self.state, *late]), late=len(late), early_outputs=0, repeat=False
         )
@@ -149,11 +148,11 @@ class TracedRoutines:
 
     def _block_arguments(self) -> list[Tensor]:
         """Arguments for tracing the functions of a block."""
-        (t, dt), x0 = self.grid, self.x0
+        (t, dt, *noise), x0 = (column[: self.block] for column in self.grid), self.x0
         nodes = x0.expand(self.block, *x0.shape)
         stages = nodes[:, None].repeat(1, self._stages, 1, 1)
         bars = [nodes.clone(), torch.ones_like(nodes[..., 0]), torch.ones_like(nodes[..., 0])]
-        return [*self.state, t[: self.block], dt[: self.block], stages, *bars, nodes.clone()]
+        return [*self.state, t, dt, stages, *bars, *noise, nodes.clone()]
 
     def _trace(
         self, module: nn.Module, arguments: list[Tensor], elsewhere: Sequence[Sequence[Tensor]] = ()

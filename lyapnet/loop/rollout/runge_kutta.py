@@ -7,7 +7,7 @@ H_i = β b_i ℓ + μ_iᵀ(f + g u) the Hamiltonian of a stage. With d/dx the to
     μ_i = b_i λ' + Σ_{j>i} a_ji X̄_j,   X̄_i = Δt dH_i/dx,   λ = λ' + Σ_i X̄_i + λ̄,   θ̄ = Σ_i Δt u_θᵀ ∂H_i/∂u.
 
 With Euler this is λ_n = λ_{n+1} + Δt dH/dx + λ̄_n, the costate equation of the paper (arXiv 2305.15244) on the grid of
-the rollout. Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed
+the rollout. With noise a step adds σ(x)ΔW at its first stage, and λ adds (∂(σΔW)/∂x)ᵀλ'. Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed
 adjoint system", Numerische Mathematik 2000.
 """
 
@@ -35,10 +35,11 @@ from lyapnet.base.types import (
 )
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.task.horizon import ButcherTableau, weighted_sum
+from lyapnet.task.noise import Increments
 
 
 class Step(nn.Module):
-    """One step from a batch of states: (t, Δt, x) ↦ (x', stages, ∫ℓ, u, V)."""
+    """One step from a batch of states: (t, Δt, x), or (t, Δt, ΔW, x) with noise, ↦ (x', stages, ∫ℓ, u, V)."""
 
     loop: ClosedLoop
     tableau: ButcherTableau
@@ -47,7 +48,8 @@ class Step(nn.Module):
         super().__init__()
         self.loop, self.tableau = loop, tableau
 
-    def forward(self, t: Scalar, dt: Scalar, x: State) -> tuple[Tensor, ...]:
+    def forward(self, t: Scalar, dt: Scalar, *arguments: Tensor) -> tuple[Tensor, ...]:
+        *increment, x = arguments
         stages, slopes, outputs = [], [], []
         for row, c in zip(self.tableau.a, self.tableau.c, strict=True):
             X = x + dt * weighted_sum(row, [k[..., :-1] for k in slopes]) if any(row) else x
@@ -56,11 +58,14 @@ class Step(nn.Module):
             stages.append(X)
             slopes.append(self.loop.slope(X, output.u))
         step = dt * weighted_sum(self.tableau.b, slopes)
-        return x + step[..., :-1], torch.stack(stages), step[..., -1], outputs[0].u, outputs[0].value
+        following = x + step[..., :-1]
+        if increment:
+            following = following + self.loop.displacement(x, *increment)
+        return following, torch.stack(stages), step[..., -1], outputs[0].u, outputs[0].value
 
 
 class PullBack(nn.Module):
-    """One backward step by automatic differentiation: (t, Δt, x, x̄, c̄, V̄, λ') ↦ (λ, λ, *θ̄).
+    """One backward step by automatic differentiation: (t, Δt, x, x̄, c̄, V̄, λ') ↦ (λ, λ, *θ̄); with noise ΔW before λ'.
 
     Args:
         step: the step with parameters θ.
@@ -71,12 +76,20 @@ class PullBack(nn.Module):
         self.step = step
 
     def forward(
-        self, t: Scalar, dt: Scalar, x: State, node_bar: State, cost_bar: Tensor, value_bar: Tensor, costate: State
+        self,
+        t: Scalar,
+        dt: Scalar,
+        x: State,
+        node_bar: State,
+        cost_bar: Tensor,
+        value_bar: Tensor,
+        *increment_and_costate: Tensor,
     ) -> tuple[Tensor, ...]:
+        *increment, costate = increment_and_costate
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             theta = [p for p in self.step.parameters() if p.requires_grad]
-            following, _, cost, _, value = self.step(t, dt, x)
+            following, _, cost, _, value = self.step(t, dt, *increment, x)
             x_bar, *theta_bar = _vjp([following, cost, value], [x, *theta], [costate, cost_bar, value_bar])
         before = node_bar + x_bar
         return before, before.clone(), *theta_bar  # the carried state and the output of a scan
@@ -111,9 +124,16 @@ class Linearise(nn.Module):
         return linearisation.transition, linearisation.source, *self.product(linearisation, *arguments)
 
     def linearise(
-        self, t: Times, dt: Times, stages: StagePath, node_bar: StatePath, cost_bar: ValuePath, value_bar: ValuePath
+        self,
+        t: Times,
+        dt: Times,
+        stages: StagePath,
+        node_bar: StatePath,
+        cost_bar: ValuePath,
+        value_bar: ValuePath,
+        *increment: Increments,
     ) -> Linearisation:
-        """Linearise at the stages, given the loss's derivatives by x_n, by ∫ℓ over the step, and by V_n."""
+        """Linearise at the stages, given the loss's derivatives by x_n, by ∫ℓ over the step, and by V_n; and ΔW."""
         tableau, n = self.tableau, stages.shape[-1]
         with torch.enable_grad():
             x = stages.detach().requires_grad_()
@@ -126,6 +146,7 @@ class Linearise(nn.Module):
                 n + 1, *[1] * (slope.ndim - 2), n + 1
             )
             y_x, y_u = _vjp([slope], copies, [rows.expand_as(slope)])
+            noise_x = [self._displacement_jacobian(stages[:, 0], increment[0])] if increment else []
             given = self.loop.slope(x.detach(), u.detach())
         y_x = y_x + apply(u_x.mT, y_u)
         f_x, cost_x, f_u, cost_u = y_x[:n].movedim(0, -2), y_x[n], y_u[:n].movedim(0, -2), y_u[n]
@@ -141,7 +162,7 @@ class Linearise(nn.Module):
             else:
                 jacobians.append(f_x[:, i])
                 cost_jacobians.append(cost_x[:, i])
-        transition = (eye + h * weighted_sum(tableau.b, jacobians)).mT
+        transition = (sum(noise_x, eye) + h * weighted_sum(tableau.b, jacobians)).mT
         cost_x0 = dt[:, None, None] * weighted_sum(tableau.b, cost_jacobians)
         source = node_bar + value_bar[..., None] * V_x[:, 0].detach() + cost_bar[..., None] * cost_x0
         return Linearisation(transition, source, f_x, cost_x, f_u, cost_u, u, value, given)
@@ -155,9 +176,10 @@ class Linearise(nn.Module):
         node_bar: StatePath,
         cost_bar: ValuePath,
         value_bar: ValuePath,
-        costate: StatePath,
+        *increment_and_costate: Tensor,
     ) -> tuple[Tensor, ...]:
         """θ̄ of the block, given the costates λ' after each of its steps."""
+        costate = increment_and_costate[-1]
         (a, b, _), (_, _, f_x, cost_x, f_u, cost_u, u, value, slope) = self.tableau, linearisation
         h, s = dt[:, None, None], len(self.tableau.b)
         stage_bars: dict[int, Tensor] = {}
@@ -176,6 +198,14 @@ class Linearise(nn.Module):
         theta = [p for p in self.loop.parameters() if p.requires_grad]
         bars = [torch.stack(u_bars[::-1], 1), at_node, torch.stack(slope_bars[::-1], 1)]
         return _vjp([u, value, slope], theta, bars)
+
+    def _displacement_jacobian(self, x: StatePath, increment: Increments) -> Jacobians:
+        """∂(σ(x)ΔW)/∂x at the first stage of each step."""
+        n = x.shape[-1]
+        copies = x.detach().expand(n, *x.shape).clone().requires_grad_()
+        rows = torch.eye(n, dtype=x.dtype, device=x.device).reshape(n, *[1] * (x.ndim - 1), n).expand_as(copies)
+        (jacobian,) = _vjp([self.loop.displacement(copies, increment.expand(n, *increment.shape))], [copies], [rows])
+        return jacobian.movedim(0, -2)
 
     def _times(self, t: Times, dt: Times) -> Float[Tensor, "nodes stages 1"]:
         """The times of the stages."""

@@ -21,7 +21,8 @@ class ControlAffineSystem(nn.Module, ABC):
 
     A subclass implements f and g with torch operations on tensors of any leading shape, and declares its coordinates.
     Physical parameters are constructor arguments, stored as Python floats or buffers. A subclass may have a method
-    `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction.
+    `energy(x)`, (*batch,), in J, which is constant for u = 0 without friction. It may also have a method `noise(x)`,
+    σ(x) of shape (*batch, n, k) in state units per √s, if it is driven by noise: dx = (f + gu)dt + σ(x)dW.
     """
 
     state_names: Sequence[str] = ()
@@ -60,6 +61,11 @@ class ControlAffineSystem(nn.Module, ABC):
     def title(self) -> str:
         """The name of the system in tables."""
         return type(self).__name__
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the system declares noise by a method `noise(x)`."""
+        return callable(getattr(type(self), "noise", None))
 
     @property
     def n(self) -> int:

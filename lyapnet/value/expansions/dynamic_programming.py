@@ -6,6 +6,9 @@ from V_N = φ is, to second order in (x, u),
 
     k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
 
+With noise V_n also has the mean of V_{n+1} over σ(x)ΔW, ½ Δt tr(σᵀHσ) with σ to first order in x. Trajectories are those
+without noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
+
 Along an optimal trajectory k = 0, and V_n is the value function to second order. At a constant state, with F linearised
 and q, φ quadratic, it is the Riccati solution; of an affine system if f does not vanish there.
 
@@ -24,6 +27,7 @@ from torch import Tensor
 from lyapnet.base.linear_algebra import is_positive_definite, solve
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 from lyapnet.task.cost import PenaltyCost, spread
+from lyapnet.task.noise import Noise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Unbounded
 from lyapnet.value.derivatives import StepDerivatives, Steps, costates, jacobian, steps_along, with_curvature
@@ -86,7 +90,7 @@ def _at_goal(problem: Problem) -> "_Backward":
     """The backward pass at x*, without control limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
-    return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False)
+    return _backward(problem, StepDerivatives(problem.step, problem.system.n), x, u, curved=False, noise=problem.noise)
 
 
 def optimal_trajectories(
@@ -103,7 +107,7 @@ def optimal_trajectories(
     The first phase ignores the second derivatives of F, which are misleading far from an optimum; the second phase
     includes them. For integrators of higher order a phase with Euler steps comes first, because these are cheaper and
     equally good far from an optimum; its result is used if it improves the initial guess. The cost is infinite if the
-    controls lead to a non-finite trajectory.
+    controls lead to a non-finite trajectory. Trajectories and costs are those without noise; the expansions include it.
 
     Args:
         iterations: largest number of iterations of each phase.
@@ -113,7 +117,7 @@ def optimal_trajectories(
         seconds: CPU seconds of this thread after which the descent stops.
     """
     until = time.thread_time() + seconds
-    problem = in_float64(problem)
+    noise, problem = in_float64(problem).noise, in_float64(problem).without_noise()
     x0, u = x0.double(), problem.controls.project(u.double())
 
     def under(controls: ControlPath, problem: Problem = problem) -> Path:
@@ -135,8 +139,9 @@ def optimal_trajectories(
     now = descend(programs, now, curved=False, kind=kinds - 2).now
     descent = descend(programs, now, curved=True, kind=kinds - 1)
     if not programs.agrees(descent.now) and programs.forget():  # the problem's constants have changed
+        problem = problem if noise is None else problem.replaced(noise=noise)
         return optimal_trajectories(problem, x0, u, iterations, rivals, progress, until - time.thread_time())
-    return descent.optimum()
+    return descent.optimum(noise)
 
 
 def follow_expansions(problem: Problem, expansion: Expansion, x0: State) -> Path:
@@ -202,23 +207,30 @@ class _Descent:
                 least = self.now.cost[settled].min()
                 settled |= self.now.cost > least + (HOPELESS_COST_RATIO - 1) * least.abs()
 
-    def optimum(self) -> Optimum:
-        """The trajectories with their expansions; those without a stored backward pass get one now."""
+    def optimum(self, noise: Noise | None) -> Optimum:
+        """The trajectories with their expansions; those without a stored backward pass get one now.
+
+        Args:
+            noise: σ, which the stored passes leave out.
+        """
         has_no_pass = torch.ones_like(self.now.cost, dtype=torch.bool)
-        for rows, _ in self._passes:
+        passes = self._passes if noise is None else []
+        for rows, _ in passes:
             has_no_pass[rows] = False
-        others, passes = torch.nonzero(has_no_pass).flatten(), self._passes
+        others = torch.nonzero(has_no_pass).flatten()
         if len(others):
-            passes = [*passes, (others, self._pass(others)[1])]
+            passes = [*passes, (others, self._pass(others, noise=noise)[1])]
         order = torch.cat([rows for rows, _ in passes]).argsort()
         parts = zip(*(backward.expansion for _, backward in passes), strict=True)
         replaced = torch.cat([backward.replaced for _, backward in passes], 1)[:, order].sum(0)
         return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), replaced)
 
-    def _pass(self, rows: Tensor, damping: Tensor | None = None) -> tuple[Path, _Backward]:
+    def _pass(
+        self, rows: Tensor, damping: Tensor | None = None, noise: Noise | None = None
+    ) -> tuple[Path, _Backward]:
         """Some of the trajectories, and the backward pass along them."""
         path = self.now.member(rows)
-        return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved)
+        return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved, noise)
 
 
 def sizes(problem: Problem, cost: PerState) -> PerState:
@@ -260,6 +272,7 @@ def _backward(
     u: ControlPath,
     damping: Tensor | None = None,
     curved: bool = True,
+    noise: Noise | None = None,
 ) -> _Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded at F(x_n, u_n).
 
@@ -273,14 +286,17 @@ def _backward(
         derivatives: derivatives of the problem's steps.
         damping: added to Q_uu, in units of the control cost.
         curved: whether to include the second derivatives of F.
+        noise: σ; None: without noise.
     """
     steps = steps_along(derivatives, problem.cost.terminal, x, u)
     if curved:
         steps = with_curvature(derivatives, steps, costates(steps))
-    return _recursion(problem, x, u, steps, damping)
+    return _recursion(problem, x, u, steps, damping, noise)
 
 
-def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None) -> _Backward:
+def _recursion(
+    problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None, noise: Noise | None
+) -> _Backward:
     """The recursion of V_n(δ) = ½ (1, δ)ᵀW_n(1, δ) backwards from W_N, with c, p and H in W = [[2c, pᵀ], [p, H]]."""
     n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
@@ -288,9 +304,12 @@ def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, dam
     M = torch.cat([one, torch.cat([(steps.F - x[1:])[..., None], steps.F_z], -1)], -2)
     L = _quadratic(steps.paid, steps.l_z, steps.l_zz)
     W = _quadratic(*steps.end)
+    S = None if noise is None else _noise_maps(problem, noise, x[:-1])
     nodes, gains = [W], []
     for k in reversed(range(len(M))):
         Q = L[k] + M[k].mT @ W @ M[k]
+        if S is not None:
+            Q = Q + (S[k].mT @ W[..., None, 1:, 1:] @ S[k]).sum(-3)
         Q_uu, Q_ua = Q[..., 1 + n :, 1 + n :], Q[..., 1 + n :, : 1 + n]
         regularised = _regularised(Q_uu, FLOOR * least[k], None if damping is None else damping * least[k])
         gain = _gains(problem, u[k], regularised, Q_ua)
@@ -301,6 +320,16 @@ def _recursion(problem: Problem, x: StatePath, u: ControlPath, steps: Steps, dam
     W, gain = torch.stack(nodes[::-1]), torch.stack(gains[::-1])
     expansion = Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:])
     return _Backward(gain[..., 0], gain[..., 1:], expansion, steps.replaced)
+
+
+def _noise_maps(problem: Problem, noise: Noise, x: StatePath) -> Tensor:
+    """√Δt (σ_j, ∂σ_j/∂x, 0) for each column σ_j of σ, which maps (1, δx, δu) to a displacement: (N, *batch, k, n, …)."""
+    with torch.enable_grad():
+        z = x.detach().requires_grad_()
+        sigma = noise(z).mT  # (N, *batch, k, n)
+        slope = jacobian(sigma.flatten(-2), z).unflatten(-2, sigma.shape[-2:])
+    none = x.new_zeros(*sigma.shape, problem.system.m)
+    return math.sqrt(problem.horizon.dt) * torch.cat([sigma[..., None], slope, none], -1).detach()
 
 
 def _quadratic(c: PerState, p: Tensor, H: Tensor) -> Tensor:

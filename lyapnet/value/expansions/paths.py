@@ -9,6 +9,7 @@ from torch import Tensor
 from lyapnet.base.contracts import copied
 from lyapnet.base.types import Control, ControlPath, PerState, State, StatePath
 from lyapnet.graphs.poles import Poles, poles_of
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 
 
@@ -25,12 +26,20 @@ class Path(NamedTuple):
 
 
 @torch.no_grad()
-def path_under(problem: Problem, law: Callable[[int, State], Control], x0: State) -> Path:
-    """The closed loops of a law (n, x_n) ↦ u_n from a batch of states; they may diverge."""
+def path_under(
+    problem: Problem, law: Callable[[int, State], Control], x0: State, increments: Increments | None = None
+) -> Path:
+    """The closed loops of a law (n, x_n) ↦ u_n from a batch of states; they may diverge.
+
+    Args:
+        increments: ΔW of each step; None: without noise.
+    """
     x, u, J = [x0], [], torch.zeros_like(x0[..., 0])
     for n in range(problem.horizon.steps):
         u.append(law(n, x[-1]))
         following, paid = problem.step(x[-1], u[-1])
+        if increments is not None and problem.noise is not None:
+            following = following + problem.noise.displacement(x[-1], increments[n])
         x.append(following)
         J = J + paid
     return path_of(problem, torch.stack(x), torch.stack(u), J)

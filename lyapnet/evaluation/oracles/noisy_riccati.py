@@ -1,0 +1,56 @@
+"""Exact solution of linear-quadratic tasks with noise, by the Riccati recursion of their steps."""
+
+import math
+
+import torch
+
+from lyapnet.base.errors import OracleError
+from lyapnet.base.types import ControlPath, State
+from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
+from lyapnet.task.cost import is_quadratic
+from lyapnet.task.noise import Noise
+from lyapnet.task.problem import Problem
+from lyapnet.task.systems import is_linear
+from lyapnet.value.expansions import Expansion, riccati
+
+AFFINE_TOLERANCE = 1e-9  # relative difference below which σ at the middle of two states counts as the mean of both
+
+
+class NoisyRiccatiOracle(Oracle):
+    """J*(x₀) = V(0, x₀), which is quadratic in x₀, with a constant that is the cost of the noise."""
+
+    def __init__(self, solution: Expansion):
+        self.solution = solution
+
+    def solve(
+        self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
+    ) -> Optima:
+        return Optima(self.solution.initially(x0.double().cpu()).to(x0), [""] * len(x0))
+
+
+def noisy_riccati(problem: Problem, free: bool) -> NoisyRiccatiOracle:
+    """The oracle of a task with noise.
+
+    Args:
+        free: whether the task has neither control limits nor constraints.
+
+    Raises:
+        OracleError: the task is not linear-quadratic, or σ is not affine in x.
+    """
+    system, cost, noise = problem.system, problem.cost, problem.noise
+    assert noise is not None
+    quadratic = is_linear(system) and is_quadratic(cost) and cost.R_constant is not None
+    if not (free and quadratic and _is_affine(problem, noise)):
+        raise OracleError(
+            "Expected a linear system without limits, a quadratic cost, and σ affine in x, for an optimum under noise, "
+            "got others; costs stand alone."
+        )
+    return NoisyRiccatiOracle(riccati(problem))
+
+
+def _is_affine(problem: Problem, noise: Noise) -> bool:
+    """Whether σ at the middle of two states is the mean of both, at some states of X₀."""
+    one, other = problem.initial_states.sample(64, torch.Generator().manual_seed(0)).to(problem.goal).split(32)
+    mean = (noise(one) + noise(other)) / 2
+    error = (noise((one + other) / 2) - mean).abs().max()
+    return bool(error <= AFFINE_TOLERANCE * mean.abs().max())

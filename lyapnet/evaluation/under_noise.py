@@ -1,0 +1,98 @@
+"""Measures of a controller on a task with noise: expectations over many paths from each initial state."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from lyapnet.base.random_streams import NOISE, TEST, stream
+from lyapnet.base.types import PerState, State
+from lyapnet.controller.controller import Controller
+from lyapnet.evaluation.oracles import Report, silent
+from lyapnet.evaluation.references import costs_of_lqr
+from lyapnet.evaluation.states import StateTable, measure
+
+NORMAL_95 = 1.96  # standard errors on each side of a mean that hold 95 % of a normal distribution
+QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
+LOST_RATIO = 1.5  # E J relative to V(0, x₀) on a path, less what its noise explains, above which it counts as lost
+
+
+class NoiseMeasures(NamedTuple):
+    """The measures of many paths of noise.
+
+    E J is estimated by the mean of J − M, with M the martingale of V (see lyapnet.loop.rollout.expectations): it has
+    the mean of J for any V, and varies less if V is close to the cost to go.
+    """
+
+    paths: int  # from each initial state
+    half_width: float  # of the 95 % interval of E J, averaged over the states
+    plain_mean: float  # mean of J itself
+    plain_half_width: float  # of its 95 % interval
+    quantiles: dict[str, float]  # of J over all states and paths, by probability
+    lost_fraction: float  # share of paths with J − M > LOST_RATIO · V(0, x₀)
+
+
+@torch.no_grad()
+def measure_under_noise(
+    controller: Controller, x0: State, paths: int, counted: int, seed: int = 0, progress: Report = silent
+) -> tuple[StateTable, NoiseMeasures, PerState | None]:
+    """(table with one row for each state, measures of the noise, E J under LQR or None if there is no such law).
+
+    LQR is rolled out on the same paths; its E J is that of the controller plus the mean difference of both costs.
+
+    Args:
+        counted: number of first states that the measures are about.
+    """
+    problem, horizon = controller.problem, controller.horizon
+    assert problem.noise is not None
+    controller.compile_for(x0)
+    tables, plain, lqr = list[StateTable](), list[Tensor](), list[Tensor]()
+    for path in range(paths):
+        progress(path, paths)
+        noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
+        trajectory = controller.rollout(x0, noise=noise)
+        tables.append(measure(problem, controller.program, trajectory))
+        plain.append(trajectory.cost)
+        other = costs_of_lqr(problem, x0, noise)
+        lqr += [] if other is None else [other - trajectory.cost]
+    table = average(tables)
+    cost, J = torch.stack([each.cost for each in tables])[:, :counted], torch.stack(plain)[:, :counted]
+    levels = torch.quantile(J.double().flatten(), torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
+    measures = NoiseMeasures(
+        paths, _half_width(cost), float(J.mean()), _half_width(J),
+        {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
+        float((cost > LOST_RATIO * table.value[:counted]).double().mean()),
+    )  # fmt: skip
+    return table, measures, table.cost + torch.stack(lqr).mean(0) if lqr else None
+
+
+def _half_width(samples: Tensor) -> float:
+    """The half-width of the 95 % interval of the mean over the states of expectations, from samples (paths, states)."""
+    if len(samples) < 2:
+        return math.inf
+    return NORMAL_95 * float((samples.var(0) / len(samples)).sum().sqrt()) / samples.shape[1]
+
+
+def average(tables: Sequence[StateTable]) -> StateTable:
+    """One table of several of the same states: means of numbers, whether a truth holds in all, the largest h."""
+
+    def merged(name: str, columns: list[Any]) -> Any:
+        if not isinstance(columns[0], Tensor):
+            return columns[0]
+        stacked = torch.stack(columns)
+        if name == "left":
+            return stacked.any(0)
+        if stacked.dtype == torch.bool:
+            return stacked.all(0)
+        return stacked.mean(0)
+
+    names = [field.name for field in fields(StateTable)]
+    table = StateTable(**{name: merged(name, [getattr(each, name) for each in tables]) for name in names})
+    if table.worst is None:
+        return table
+    worst, times = (torch.stack([getattr(each, name) for each in tables]) for name in ("worst", "worst_time"))
+    most, at = worst.max(0)
+    return replace(table, worst=most, worst_time=times.gather(0, at[None])[0])

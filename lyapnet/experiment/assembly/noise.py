@@ -1,0 +1,56 @@
+"""Builds the noise of a config."""
+
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly.classes import section
+from lyapnet.experiment.assembly.entries import index_of
+from lyapnet.experiment.config import Config
+from lyapnet.task.noise import Noise, StateNoise
+from lyapnet.task.systems import ControlAffineSystem
+
+
+def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
+    """The noise of a config; None if it lists none, and the system's own applies.
+
+    Raises:
+        UsageError: a name or a number does not fit, the system declares noise too, or the task is one that has no noise.
+    """
+    if config.noise and system.noisy:
+        raise UsageError(
+            f"Expected noise in the config or noise(x) in {type(system).__name__}, got both; leave one of them out."
+        )
+    if not config.noise and not system.noisy:
+        return None
+    _require_support(config)
+    if system.noisy:
+        return None
+    strengths = [0.0] * system.n
+    for name, strength in config.noise.items():
+        i = index_of(name, "noise", system)
+        if i in system.constants:
+            raise UsageError(f"Expected noise of states that move, got {name}, a parameter of the family; leave it out.")
+        strengths[i] = strength
+    with section("noise"):
+        return StateNoise(strengths)
+
+
+def _require_support(config: Config) -> None:
+    """Raise UsageError for settings that know no noise."""
+    if config.horizon.stationary:
+        raise UsageError(
+            "Expected horizon.stationary: false with noise, got true; the cost of noise over an infinite time is "
+            "infinite: give a horizon that ends."
+        )
+    if config.rollout.gradient != "discrete":
+        raise UsageError(
+            f"Expected rollout.gradient=discrete with noise, got {config.rollout.gradient}; the other gradients know "
+            "none: take it."
+        )
+    if config.network.name in ("icnn", "anchored", "quadratic"):
+        raise UsageError(
+            f"Expected network.name=expansion or fcn with noise, got {config.network.name}, which is 0 at the goal, where "
+            "V is what noise costs; take another."
+        )
+    if config.pointwise.weight:
+        raise UsageError(
+            "Expected pointwise.weight=0 with noise, got more; the condition at points knows none: leave it out."
+        )

@@ -1,0 +1,87 @@
+"""Noise of a stochastic system, dx = (f + g u) dt + σ(x) dW."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import Noise as NoiseMatrix
+from lyapnet.base.types import State
+from lyapnet.task.systems import ControlAffineSystem
+
+Increments = Float[Tensor, "steps *batch sources"]  # ΔW of each step, in √s
+
+
+class Noise(nn.Module, ABC):
+    """σ(x), (*batch, n, k), in state units per √s, for k independent Wiener processes W.
+
+    The equation is Itô's. A step of Euler–Maruyama adds σ(x)ΔW, with ΔW normal with variance Δt, to the step without
+    noise; its strong order is ½, or 1 for a constant σ, and its weak order is 1.
+
+    Source: Kloeden, Platen, Numerical Solution of Stochastic Differential Equations, 1992, ch. 10.
+    """
+
+    sources: int  # k
+
+    @abstractmethod
+    def forward(self, x: State) -> NoiseMatrix:
+        """σ(x)."""
+
+    def draw(self, steps: int, dt: float, x0: State, generator: torch.Generator) -> Increments:
+        """ΔW of each step of Δt from a batch of states."""
+        shape = (steps, *x0.shape[:-1], self.sources)
+        return (math.sqrt(dt) * torch.randn(shape, generator=generator, dtype=torch.float64)).to(x0)
+
+    def displacement(self, x: State, increment: Float[Tensor, "*batch sources"]) -> State:
+        """σ(x)ΔW."""
+        return apply(self(x), increment)
+
+    def half_trace(self, x: State, hessian: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
+        """½ tr(σσᵀH), the rate at which noise raises the mean of a function with Hessian H."""
+        sigma = self(x)
+        return (sigma * (hessian @ sigma)).sum((-2, -1)) / 2
+
+
+class StateNoise(Noise):
+    """A Wiener process of its own for some states: σ is constant, with one column for each noisy state.
+
+    Args:
+        strengths: standard deviation of each state per √s, (n,); 0 for a state without noise.
+
+    Raises:
+        ValueError: a strength is negative or not finite, or all are zero.
+    """
+
+    sigma: Float[Tensor, "n sources"]
+
+    def __init__(self, strengths: Sequence[float]):
+        super().__init__()
+        if not all(0 <= s < math.inf for s in strengths) or not any(strengths):
+            raise ValueError(f"Expected strengths ≥ 0 with a positive one, got {[*strengths]}; leave noise out if none.")
+        noisy = [i for i, s in enumerate(strengths) if s]
+        self.sources = len(noisy)
+        self.register_buffer("sigma", torch.diag(torch.tensor(strengths))[:, noisy], persistent=False)
+
+    def forward(self, x: State) -> NoiseMatrix:
+        return self.sigma.expand(*x.shape[:-1], -1, -1)
+
+
+class SystemNoise(Noise):
+    """The noise that a system declares by its method `noise(x)`.
+
+    Args:
+        system: the system.
+        like: a state (n,), at which the number of sources is read off.
+    """
+
+    def __init__(self, system: ControlAffineSystem, like: State):
+        super().__init__()
+        self.system = system
+        self.sources = system.noise(like).shape[-1]  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+
+    def forward(self, x: State) -> NoiseMatrix:
+        return self.system.noise(x)  # pyright: ignore[reportCallIssue]

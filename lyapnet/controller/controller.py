@@ -309,7 +309,9 @@ class Controller:
         if noise is None:
             raise ValueError("Expected no noise for a task without, got some; leave it out.")
         if steps not in (None, horizon.steps):
-            raise ValueError(f"Expected the {horizon.steps} steps of the horizon with noise, got {steps}; leave it out.")
+            raise ValueError(
+                f"Expected the {horizon.steps} steps of the horizon with noise, got {steps}; leave it out."
+            )
         if isinstance(given, Tensor):
             return given
         return noise.draw(horizon.steps, horizon.dt, x0, stream(given, NOISE))

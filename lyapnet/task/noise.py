@@ -61,7 +61,9 @@ class StateNoise(Noise):
     def __init__(self, strengths: Sequence[float]):
         super().__init__()
         if not all(0 <= s < math.inf for s in strengths) or not any(strengths):
-            raise ValueError(f"Expected strengths ≥ 0 with a positive one, got {[*strengths]}; leave noise out if none.")
+            raise ValueError(
+                f"Expected strengths ≥ 0 with a positive one, got {[*strengths]}; leave noise out if none."
+            )
         noisy = [i for i, s in enumerate(strengths) if s]
         self.sources = len(noisy)
         self.register_buffer("sigma", torch.diag(torch.tensor(strengths))[:, noisy], persistent=False)

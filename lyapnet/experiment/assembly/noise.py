@@ -12,7 +12,7 @@ def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
     """The noise of a config; None if it lists none, and the system's own applies.
 
     Raises:
-        UsageError: a name or a number does not fit, the system declares noise too, or the task is one that has no noise.
+        UsageError: a name or a number does not fit, the system declares noise too, or the task can have none.
     """
     if config.noise and system.noisy:
         raise UsageError(
@@ -27,7 +27,9 @@ def build_noise(config: Config, system: ControlAffineSystem) -> Noise | None:
     for name, strength in config.noise.items():
         i = index_of(name, "noise", system)
         if i in system.constants:
-            raise UsageError(f"Expected noise of states that move, got {name}, a parameter of the family; leave it out.")
+            raise UsageError(
+                f"Expected noise of states that move, got {name}, a parameter of the family; leave it out."
+            )
         strengths[i] = strength
     with section("noise"):
         return StateNoise(strengths)
@@ -47,8 +49,8 @@ def _require_support(config: Config) -> None:
         )
     if config.network.name in ("icnn", "anchored", "quadratic"):
         raise UsageError(
-            f"Expected network.name=expansion or fcn with noise, got {config.network.name}, which is 0 at the goal, where "
-            "V is what noise costs; take another."
+            f"Expected network.name=expansion or fcn with noise, got {config.network.name}; that V is 0 at the goal, "
+            "where V has to be what the noise costs: take another."
         )
     if config.pointwise.weight:
         raise UsageError(

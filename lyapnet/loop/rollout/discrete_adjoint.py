@@ -186,9 +186,7 @@ class DiscreteAdjoint:
                 self._routines[key] = self._eager_routines(x0)
         return self._routines[key]
 
-    def integrate(
-        self, routines: Routines, x0: State, theta: Sequence[Tensor], noise: Sequence[Tensor] = ()
-    ) -> Nodes:
+    def integrate(self, routines: Routines, x0: State, theta: Sequence[Tensor], noise: Sequence[Tensor] = ()) -> Nodes:
         """The path from x₀; a step of length zero at its last node makes all nodes alike.
 
         Args:

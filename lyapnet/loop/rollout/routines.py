@@ -38,7 +38,8 @@ BATCH_AXES = (-2, -1, -2, -1)  # batch axis of each column of Nodes
 class Routines(NamedTuple):
     """The two routines for one batch shape; `state` is the list of tensors of the closed loop."""
 
-    integrate: Callable[..., Sequence[Tensor]]  # (*state, t, Δt, x₀), with noise ΔW before x₀ ↦ the columns of Nodes
+    # (*state, t, Δt, x₀), with noise ΔW before x₀ ↦ the columns of Nodes at the nodes t
+    integrate: Callable[..., Sequence[Tensor]]
     gradient: Callable[[Sequence[Tensor], PathWithDerivatives], tuple[State, list[Tensor]]]  # (x̄₀, θ̄)
 
 
@@ -52,7 +53,8 @@ class TracedRoutines:
         x0: a batch (b, n).
         block: K, the number of nodes in a block.
         limit: limit of the costates, see `limit_costates`.
-        visited: returns the arguments (t, Δt, x), with noise ΔW before x, at which the trace of a step is compared with the loop itself.
+        visited: returns the arguments (t, Δt, x), with noise ΔW before x, at which the trace of a step is compared with
+            the loop itself.
     """
 
     def __init__(
@@ -130,7 +132,9 @@ class TracedRoutines:
         arguments = [*self.state, *(column[0] for column in self.grid), self.x0]
         with _tracing():
             elsewhere = self._visited()
-        return cut(self._trace(self._step, arguments, elsewhere), late=1 + len(self.grid), early_outputs=0, repeat=False)
+        return cut(
+            self._trace(self._step, arguments, elsewhere), late=1 + len(self.grid), early_outputs=0, repeat=False
+        )
 
     @cached_property
     def _backwards(self) -> tuple[GraphModule, GraphModule]:

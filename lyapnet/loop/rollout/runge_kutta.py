@@ -7,8 +7,10 @@ H_i = β b_i ℓ + μ_iᵀ(f + g u) the Hamiltonian of a stage. With d/dx the to
     μ_i = b_i λ' + Σ_{j>i} a_ji X̄_j,   X̄_i = Δt dH_i/dx,   λ = λ' + Σ_i X̄_i + λ̄,   θ̄ = Σ_i Δt u_θᵀ ∂H_i/∂u.
 
 With Euler this is λ_n = λ_{n+1} + Δt dH/dx + λ̄_n, the costate equation of the paper (arXiv 2305.15244) on the grid of
-the rollout. With noise a step adds σ(x)ΔW at its first stage, and λ adds (∂(σΔW)/∂x)ᵀλ'. Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed
-adjoint system", Numerische Mathematik 2000.
+the rollout. With noise a step adds σ(x)ΔW at its first stage, and λ adds (∂(σΔW)/∂x)ᵀλ'.
+
+Source of the general form: Hager, "Runge-Kutta methods in optimal control and the transformed adjoint system",
+Numerische Mathematik 2000.
 """
 
 from collections.abc import Sequence

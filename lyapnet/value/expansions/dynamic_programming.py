@@ -6,8 +6,8 @@ from V_N = φ is, to second order in (x, u),
 
     k = −Q_uu⁻¹Q_u,   K = −Q_uu⁻¹Q_ux,   V_n = Q at u = ū + k + K(x − x̄).
 
-With noise V_n also has the mean of V_{n+1} over σ(x)ΔW, ½ Δt tr(σᵀHσ) with σ to first order in x. Trajectories are those
-without noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
+With noise V_n also has the mean of V_{n+1} over σ(x)ΔW, ½ Δt tr(σᵀHσ) with σ to first order in x. Trajectories are
+those without noise: around them V_n is the value function to first order in σσᵀ, and exact for a linear system.
 
 Along an optimal trajectory k = 0, and V_n is the value function to second order. At a constant state, with F linearised
 and q, φ quadratic, it is the Riccati solution; of an affine system if f does not vanish there.
@@ -225,9 +225,7 @@ class _Descent:
         replaced = torch.cat([backward.replaced for _, backward in passes], 1)[:, order].sum(0)
         return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), replaced)
 
-    def _pass(
-        self, rows: Tensor, damping: Tensor | None = None, noise: Noise | None = None
-    ) -> tuple[Path, _Backward]:
+    def _pass(self, rows: Tensor, damping: Tensor | None = None, noise: Noise | None = None) -> tuple[Path, _Backward]:
         """Some of the trajectories, and the backward pass along them."""
         path = self.now.member(rows)
         return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved, noise)
@@ -323,7 +321,7 @@ def _recursion(
 
 
 def _noise_maps(problem: Problem, noise: Noise, x: StatePath) -> Tensor:
-    """√Δt (σ_j, ∂σ_j/∂x, 0) for each column σ_j of σ, which maps (1, δx, δu) to a displacement: (N, *batch, k, n, …)."""
+    """√Δt (σ_j, ∂σ_j/∂x, 0), (N, *batch, k, n, 1 + n + m), for each column σ_j of σ: (1, δx, δu) ↦ its displacement."""
     with torch.enable_grad():
         z = x.detach().requires_grad_()
         sigma = noise(z).mT  # (N, *batch, k, n)

@@ -1,0 +1,263 @@
+"""Closed loops under noise: their exact gradient, the expectations that programs see, and what must fail."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.testing import assert_close
+
+from lyapnet.base.interpolation import Curve
+from lyapnet.loop.programs import LyapunovProgram, ValueProgram
+from lyapnet.loop.rollout import Rollout
+from lyapnet.loop.rollout.expectations import expected_value
+from lyapnet.loop.rollout.runge_kutta import Step
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.horizon import TABLEAUX, Horizon
+from lyapnet.task.noise import Noise, StateNoise
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box, Unbounded
+from lyapnet.task.systems import Linear
+from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import riccati
+from lyapnet.value.networks import FCN, Scaling
+from lyapnet.value.policy import HJBPolicy, SampledPolicy
+
+N, DT = 20, 0.1
+
+
+class BilinearNoise(Linear):
+    """A double integrator with two sources of noise that depend on the state."""
+
+    def noise(self, x: Tensor) -> Tensor:
+        position, velocity = x.unbind(-1)
+        none = torch.zeros_like(position)
+        first = torch.stack([0.3 * position + 0.1, 0.2 * velocity], -1)
+        return torch.stack([first, torch.stack([none, 0.5 + 0.1 * position], -1)], -1)
+
+
+def problem(constant: bool = True, method: str = "euler", noise: Noise | None = None) -> Problem:
+    """A double integrator with noise."""
+    own = StateNoise([0.0, 0.4]) if noise is None else noise
+    system = (Linear if constant else BilinearNoise)([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]])
+    cost = QuadraticCost(torch.eye(2), 0.3 * torch.eye(1), 2 * torch.eye(2))
+    box, horizon = Box([-1.0, -1.0], [1.0, 1.0]), Horizon(N, DT, method)
+    return Problem(system, cost, Unbounded(), box, horizon, noise=own if constant else None)
+
+
+class Quadratic(ValueFunction):
+    """V from an expansion at the goal, with p and c scaled: 1 for the value function."""
+
+    def __init__(self, problem: Problem, share: float = 1.0, constant: float = 1.0):
+        super().__init__()
+        self.share, self.constant = share, constant
+        _, c, p, H = riccati(problem)
+        self.parts = Curve(problem.horizon.times(c), torch.cat([c[:, None], p, H.flatten(1)], 1))
+        self.weight = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        parts = self.parts(t)
+        p, H = parts[..., 1:3], parts[..., 3:].unflatten(-1, (2, 2))
+        quadratic = ((p + (H @ x[..., None])[..., 0] / 2) * x).sum(-1)
+        return self.weight * (self.constant * parts[..., 0] + self.share * quadratic)
+
+
+def initial_states(problem: Problem, count: int = 8) -> Tensor:
+    return problem.initial_states.sample(count, torch.Generator().manual_seed(1))
+
+
+def drawn(problem: Problem, x0: Tensor, seed: int = 2) -> Tensor:
+    assert problem.noise is not None
+    return problem.noise.draw(N, DT, x0, torch.Generator().manual_seed(seed))
+
+
+def loss_of(x: Tensor, running_cost: Tensor, value: Tensor) -> Tensor:
+    return 0.3 * (x**2).sum() + running_cost.mean() + (value**2).mean()
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.gate)])
+@pytest.mark.parametrize("law", [HJBPolicy, SampledPolicy])
+@pytest.mark.parametrize("method", ["euler", "rk4"])
+@pytest.mark.parametrize("constant", [True, False])
+def test_the_gradient_is_that_of_autograd_through_the_same_path(constant, method, law, compiled):
+    task = problem(constant, method)
+    torch.manual_seed(0)
+    V = FCN(Scaling([1.0, 1.0], 2.0, 1.0), [16, 16])
+    rollout, x0 = Rollout(task, law(task, V), gradient="discrete"), initial_states(task).requires_grad_()
+    increments = drawn(task, x0)
+    step = Step(rollout.stepped, TABLEAUX["euler" if rollout.stepped is not rollout.closed_loop else method])
+    x, paid, values = [x0], torch.zeros(()), []
+    for n in range(N):
+        following, _, cost, _, value = step(torch.tensor(n * DT), torch.tensor(DT), increments[n], x[-1])
+        x.append(following)
+        paid = paid + cost
+        values.append(value)
+    values.append(V(torch.tensor(N * DT), x[-1]))
+    leaves = [x0, *V.parameters()]
+    expected = torch.autograd.grad(loss_of(torch.stack(x), paid, torch.stack(values)), leaves)
+    if compiled:
+        assert rollout.discrete is not None
+        rollout.discrete.compile(x0.detach())
+    trajectory = rollout(x0, increments)
+    found = torch.autograd.grad(loss_of(trajectory.x, trajectory.running_cost[-1], trajectory.require_value()), leaves)
+    assert_close(trajectory.x, torch.stack(x), rtol=1e-13, atol=1e-13)
+    for one, other in zip(found, expected, strict=True):
+        assert (one - other).abs().max() <= 1e-12 * other.abs().max()
+
+
+def test_without_increments_the_loop_is_that_without_noise():
+    task = problem()
+    V = Quadratic(task)
+    x0 = initial_states(task)
+    with torch.no_grad():
+        quiet = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0)
+        other = Rollout(task.without_noise(), SampledPolicy(task, V), gradient="discrete")(x0)
+    assert torch.equal(quiet.x, other.x)
+    assert quiet.martingale is None
+    assert quiet.compensated() is quiet
+
+
+def test_the_same_seed_draws_the_same_noise_with_variance_dt():
+    task = problem()
+    x0 = task.initial_states.sample(4000, torch.Generator().manual_seed(0))
+    assert torch.equal(drawn(task, x0), drawn(task, x0))
+    assert not torch.equal(drawn(task, x0), drawn(task, x0, seed=3))
+    assert abs(float(drawn(task, x0).var()) / DT - 1) < 0.02
+
+
+@pytest.mark.parametrize("constant", [True, False])
+def test_for_the_value_function_every_path_has_residual_zero(constant):
+    task = problem(constant)
+    V, x0 = Quadratic(task), initial_states(task)
+    trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0))
+    seen = trajectory.compensated()
+    program = ValueProgram(constraint=1, cost_to_go=1, terminal=1, normalise=False)
+    output = program(seen)
+    for name in ("constraint", "cost_to_go", "terminal"):
+        assert output.terms[name].item() < 1e-20
+    (gradient,) = torch.autograd.grad(output.terms["cost_to_go"], V.weight)
+    assert abs(gradient.item()) < 1e-12
+    raw = program(trajectory)  # without expectations the noise is a floor
+    assert raw.terms["cost_to_go"].item() > 1e-3
+
+
+@pytest.mark.parametrize(("share", "constant"), [(1.05, 1.0), (1.0, 1.05)])
+def test_a_wrong_value_has_a_residual(share, constant):
+    task = problem()
+    x0 = initial_states(task)
+    V = Quadratic(task, share, constant)
+    trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)).compensated()
+    assert ValueProgram(cost_to_go=1, normalise=False)(trajectory).terms["cost_to_go"].item() > 1e-5
+
+
+def test_the_minimiser_is_not_biased():
+    """Over many paths the gradient by a factor of V vanishes at the value function; the raw residual's does not."""
+    task = problem()
+    V = Quadratic(task)
+    x0 = task.initial_states.sample(2000, torch.Generator().manual_seed(0))
+    trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0))
+    program = ValueProgram(constraint=1, normalise=False)
+    slopes = [
+        torch.autograd.grad(program(each).terms["constraint"], V.weight, retain_graph=True)[0]
+        for each in (trajectory.compensated(), trajectory)
+    ]
+    assert abs(float(slopes[0])) < 1e-10
+    assert float(slopes[1]) > 1e-2  # a smaller V has less variance
+
+
+def test_the_lyapunov_condition_is_one_in_expectation():
+    task = problem()
+    x0, program = initial_states(task, 64), LyapunovProgram(terminal=1)
+    for V, holds in ((Quadratic(task), True), (Quadratic(task, constant=0.5), False)):
+        loop = Rollout(task, SampledPolicy(task, V), gradient="discrete")
+        trajectory = loop(x0, drawn(task, x0)).compensated()
+        hinge = program.constraint_loss(trajectory.require_value(), trajectory)
+        assert (hinge.max().item() < 1e-12) == holds
+
+
+@torch.no_grad()
+def test_the_control_variate_keeps_the_mean_and_removes_variance():
+    task, paths = problem(), 4000
+    x0 = torch.tensor([0.5, -0.3]).expand(paths, -1)
+    optimal, other = Quadratic(task), Quadratic(task, 1.3, 0.0)
+    trajectory, wrong = (
+        Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)) for V in (optimal, other)
+    )
+    for each in (trajectory, wrong):  # M has mean zero for any V
+        assert each.martingale is not None
+        assert abs(float(each.martingale.mean())) < 4 * float(each.martingale.std()) / math.sqrt(paths)
+    cost, expected = trajectory.expected_cost, float(optimal(torch.zeros(()), x0[:1]))
+    assert abs(float(cost.mean()) - expected) < 4 * float(cost.std()) / math.sqrt(paths)
+    assert float(cost.std()) < 0.6 * float(trajectory.cost.std())
+    assert float(wrong.cost.mean()) > expected
+
+
+def test_points_are_exact_for_the_third_degree_and_not_for_the_fourth():
+    class Power(ValueFunction):
+        def __init__(self, degree: int):
+            super().__init__()
+            self.degree = degree
+
+        def forward(self, t: Tensor, x: Tensor) -> Tensor:
+            return (x[..., 0] + 2 * x[..., 1]) ** self.degree
+
+    noise, x = StateNoise([0.3, 0.5]), torch.tensor([[0.7, -0.2]])
+    mean, variance = 0.3, DT * (0.3**2 + 4 * 0.5**2)
+    third, fourth = mean**3 + 3 * mean * variance, mean**4 + 6 * mean**2 * variance + 3 * variance**2
+    found = [float(expected_value(Power(d), noise, torch.zeros(()), x, x, DT)) for d in (3, 4)]
+    assert abs(found[0] - third) < 1e-12
+    assert abs(found[1] - fourth) > 1e-4
+
+
+def test_euler_maruyama_converges_with_its_orders():
+    """Strong order 1/2 for σ = 0.8 x on geometric Brownian motion, whose path is known; 1 for a constant σ."""
+
+    class Geometric(Linear):
+        def noise(self, x: Tensor) -> Tensor:
+            return 0.8 * x[..., None]
+
+    def error(steps: int, geometric: bool) -> float:
+        fine, T, paths = 256, 1.0, 2000
+        draw = torch.Generator().manual_seed(0)
+        w = math.sqrt(T / fine) * torch.randn(fine, paths, 1, generator=draw)
+        cost = QuadraticCost(torch.eye(1), torch.eye(1), torch.eye(1))
+        system = Geometric([[0.0]], [[1.0]]) if geometric else Linear([[-1.0]], [[1.0]])
+        own = None if geometric else StateNoise([0.5])
+        task = Problem(system, cost, Unbounded(), Box([1.0], [1.0]), Horizon(steps, T / steps, "euler"), noise=own)
+        V = FCN(Scaling([1.0], T, 0.0), [4])
+        with torch.no_grad():
+            for parameter in V.parameters():
+                parameter.zero_()
+            path = Rollout(task, HJBPolicy(task, V), gradient="discrete")(
+                torch.ones(paths, 1), w.reshape(steps, fine // steps, paths, 1).sum(1)
+            )
+        if geometric:
+            exact = torch.exp(-0.32 + 0.8 * w.sum(0))
+        else:  # the Ornstein–Uhlenbeck path on the finest grid
+            exact = torch.ones(paths, 1)
+            for k in range(fine):
+                exact = exact - T / fine * exact + 0.5 * w[k]
+        return float((path.x[-1] - exact).abs().mean())
+
+    for geometric, order in ((True, 0.5), (False, 1.0)):
+        coarse, finer = error(8, geometric), error(32, geometric)
+        assert abs(math.log2(coarse / finer) / 2 - order) < 0.2
+
+
+@pytest.mark.parametrize("strengths", [[0.0, 0.0], [-0.1, 0.2], [math.inf, 0.1], [math.nan, 0.1]])
+def test_noise_of_no_or_negative_strength_is_refused(strengths):
+    with pytest.raises(ValueError, match="Expected strengths ≥ 0"):
+        StateNoise(strengths)
+
+
+def test_increments_of_another_shape_or_without_noise_are_refused():
+    task = problem()
+    V, x0 = Quadratic(task), initial_states(task)
+    rollout = Rollout(task, SampledPolicy(task, V), gradient="discrete")
+    with pytest.raises(ValueError, match="Expected increments of shape"):
+        rollout(x0, drawn(task, x0)[:-1])
+    quiet = Rollout(task.without_noise(), SampledPolicy(task, V), gradient="discrete")
+    with pytest.raises(ValueError, match="Expected increments of shape None"):
+        quiet(x0, drawn(task, x0))
+    with pytest.raises(ValueError, match="take discrete"):
+        Rollout(task, SampledPolicy(task, V), gradient="backprop")(x0, drawn(task, x0))

@@ -33,6 +33,9 @@ def evaluate(
         float | None,
         typer.Option(help="Also where each law that can follow T leads, up to this many T.", metavar="MULTIPLE"),
     ] = None,
+    paths: Annotated[
+        int, typer.Option(min=2, help="Paths of the noise from each state, where the task has noise.")
+    ] = 32,
     debug: Debug = False,
 ) -> None:
     """Measure a controller on fresh initial states of X₀; of a family, on fresh states and parameters.
@@ -55,7 +58,7 @@ def evaluate(
         check_multiple(controller, until, count)
     report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
     report(f"closed loops from {samples:,} states of X₀")
-    measured = evaluation(controller, samples, seed, optimum, partial(report, "optima of states"))
+    measured = evaluation(controller, samples, seed, optimum, partial(report, "optima of states"), paths)
     result = measured.result()
     if not as_json:
         report.rest()
@@ -100,15 +103,20 @@ def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
     from lyapnet.evaluation.afterwards_figure import distances
+    from lyapnet.evaluation.noise_figure import bands, states_to_draw
     from lyapnet.evaluation.path_figure import has_plane, paths
 
-    trajectory, problem = controller.rollout(measured.table.x0[:12]), controller.problem
+    x0, problem = measured.table.x0[:12], controller.problem
+    seed = None if problem.noise is None else measured.seed
+    trajectory = controller.rollout(x0, noise=seed)
     drawn = {
         "trajectories": figures.trajectories(trajectory, problem),
         "value_slices": figures.value_slices(controller.value, problem),
     }
     if has_plane(problem):
         drawn["paths"] = paths(trajectory, problem)
+    if seed is not None:
+        drawn["noise"] = bands(controller.rollout(states_to_draw(x0), noise=seed), problem)
     if measured.result()["optimal_cost_mean"] is not None:
         drawn["optimality"] = figures.optimality(measured.table)
     if any(one.distance is not None for one in later):

@@ -301,6 +301,11 @@ class Controller:
             trajectory if isinstance(x0, Tensor) else ArrayTrajectory(*(_in_form_of(x0, field) for field in trajectory))
         )
 
+    @torch.no_grad()
+    def closed_loops(self, x0: Tensor, increments: Tensor, surprising: bool = True) -> Trajectory:
+        """The closed loops under given noise, see Rollout.forward."""
+        return self._rollout(x0, increments, surprising)
+
     def _increments(self, x0: Tensor, steps: int | None, given: Tensor | int | None) -> Tensor | None:
         """ΔW of each step from a batch of states; None without noise."""
         noise, horizon = self.problem.noise, self.horizon

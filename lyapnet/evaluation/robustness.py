@@ -160,6 +160,7 @@ def robustness(
 
 def _row(disturbance: Disturbance, optimum: bool) -> DisturbanceRow:
     name, problem, policy, x0, method = disturbance
+    problem = problem.without_noise()  # one disturbance at a time
     try:
         with torch.no_grad():
             path = Rollout(problem, policy, method, "backprop")(x0)

@@ -77,7 +77,7 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
             f"{noise['plain_mean']:.5g} ± {noise['plain_half_width']:.2g}"
         ),
         f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(f"{level:.4g}" for level in levels.values()),
-        "paths lost, J beyond 1.5 V(0, x₀) and not by its noise": f"{noise['lost_fraction']:.2%}",
+        "paths lost, which cost half more than V and not by their noise": f"{noise['lost_fraction']:.2%}",
     }
 
 

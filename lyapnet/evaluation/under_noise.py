@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +17,7 @@ from lyapnet.evaluation.states import StateTable, measure
 
 NORMAL_95 = 1.96  # standard errors on each side of a mean that hold 95 % of a normal distribution
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
-LOST_RATIO = 1.5  # E J relative to V(0, x₀) on a path, less what its noise explains, above which it counts as lost
+LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
 
 class NoiseMeasures(NamedTuple):
@@ -32,7 +32,7 @@ class NoiseMeasures(NamedTuple):
     plain_mean: float  # mean of J itself
     plain_half_width: float  # of its 95 % interval
     quantiles: dict[str, float]  # of J over all states and paths, by probability
-    lost_fraction: float  # share of paths with J − M > LOST_RATIO · V(0, x₀)
+    lost_fraction: float  # share of paths whose J − M exceeds V(0, x₀) by LOST_EXCESS
 
 
 @torch.no_grad()
@@ -53,18 +53,19 @@ def measure_under_noise(
     for path in range(paths):
         progress(path, paths)
         noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
-        trajectory = controller.rollout(x0, noise=noise)
+        trajectory = controller.closed_loops(x0, noise, surprising=path == 0)
         tables.append(measure(problem, controller.program, trajectory))
         plain.append(trajectory.cost)
         other = costs_of_lqr(problem, x0, noise)
         lqr += [] if other is None else [other - trajectory.cost]
     table = average(tables)
     cost, J = torch.stack([each.cost for each in tables])[:, :counted], torch.stack(plain)[:, :counted]
+    value = table.value[:counted]
     levels = torch.quantile(J.double().flatten(), torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
     measures = NoiseMeasures(
         paths, _half_width(cost), float(J.mean()), _half_width(J),
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
-        float((cost > LOST_RATIO * table.value[:counted]).double().mean()),
+        float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
     )  # fmt: skip
     return table, measures, table.cost + torch.stack(lqr).mean(0) if lqr else None
 
@@ -76,23 +77,18 @@ def _half_width(samples: Tensor) -> float:
     return NORMAL_95 * float((samples.var(0) / len(samples)).sum().sqrt()) / samples.shape[1]
 
 
+AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits")  # columns of a table that are averaged over paths
+
+
 def average(tables: Sequence[StateTable]) -> StateTable:
-    """One table of several of the same states: means of numbers, whether a truth holds in all, the largest h."""
+    """One table of several of the same states: means of AVERAGED columns, the largest h, the rest of the first."""
+    first = tables[0]
 
-    def merged(name: str, columns: list[Any]) -> Any:
-        if not isinstance(columns[0], Tensor):
-            return columns[0]
-        stacked = torch.stack(columns)
-        if name == "left":
-            return stacked.any(0)
-        if stacked.dtype == torch.bool:
-            return stacked.all(0)
-        return stacked.mean(0)
+    def stacked(name: str) -> Tensor:
+        return torch.stack([getattr(each, name) for each in tables])
 
-    names = [field.name for field in fields(StateTable)]
-    table = StateTable(**{name: merged(name, [getattr(each, name) for each in tables]) for name in names})
-    if table.worst is None:
-        return table
-    worst, times = (torch.stack([getattr(each, name) for each in tables]) for name in ("worst", "worst_time"))
-    most, at = worst.max(0)
-    return replace(table, worst=most, worst_time=times.gather(0, at[None])[0])
+    merged: dict[str, Any] = {name: stacked(name).mean(0) for name in AVERAGED if getattr(first, name) is not None}
+    if first.worst is not None:
+        merged["worst"], at = stacked("worst").max(0)
+        merged["worst_time"] = stacked("worst_time").gather(0, at[None])[0]
+    return replace(first, **merged)

@@ -14,6 +14,7 @@ from lyapnet.base.errors import DivergenceError
 from lyapnet.base.random_streams import FIGURES, stream
 from lyapnet.evaluation import figures
 from lyapnet.evaluation.animation import Film
+from lyapnet.evaluation.noise_figure import bands, states_to_draw
 from lyapnet.evaluation.path_figure import has_plane, paths
 from lyapnet.training.curves import with_loggers
 from lyapnet.training.learner import Learner
@@ -58,14 +59,17 @@ def figures_of(learner: Learner) -> dict[str, Figure]:
     x0 = problem.initial_states.sample(12, stream(learner.seed, FIGURES))
     with torch.no_grad():
         sample = learner.roll_out(x0, FIGURES)
+        noisy = None if problem.noise is None else learner.roll_out(states_to_draw(x0), FIGURES)
     drawn = {
         "trajectories": figures.trajectories(sample, problem),
         "value_slices": figures.value_slices(learner.V, problem),
     }
-    if problem.has_goal:
+    if problem.has_goal and problem.noise is None:
         drawn["certified_region"] = figures.certified_region(learner.rollout, problem)
     if has_plane(problem):
         drawn["paths"] = paths(sample, problem)
+    if noisy is not None:
+        drawn["noise"] = bands(noisy, problem)
     return drawn
 
 

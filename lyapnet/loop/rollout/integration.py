@@ -157,11 +157,12 @@ class Rollout(nn.Module):
             steps, dt = self.horizon.steps, self.horizon.dt
             self.discrete = DiscreteAdjoint(self.stepped, steps, dt, step, costate_limit)
 
-    def forward(self, x0: State, increments: Increments | None = None) -> Trajectory:
+    def forward(self, x0: State, increments: Increments | None = None, surprising: bool = True) -> Trajectory:
         """The closed loop from x₀ (*batch, n).
 
         Args:
             increments: ΔW of each step (N, *batch, k), see Noise.draw; None: the loop without its noise.
+            surprising: whether to compute the surprises, for which V is evaluated at 2k states in each step.
 
         Raises:
             ValueError: increments of another shape, for a problem without noise, or with another gradient.
@@ -180,8 +181,11 @@ class Rollout(nn.Module):
         V, noise = self.closed_loop.V, self.problem.noise
         if increments is None or noise is None or V is None:
             return trajectory
-        surprise = surprises(V, noise, t, x, trajectory.require_value(), increments)
-        return trajectory._replace(surprise=surprise, martingale=martingale(V, noise, t, x.detach(), increments))
+        trajectory = trajectory._replace(martingale=martingale(V, noise, t, x.detach(), increments))
+        if surprising:
+            value = trajectory.require_value()
+            trajectory = trajectory._replace(surprise=surprises(V, noise, t, x, value, increments))
+        return trajectory
 
     @property
     def takes_steps_of_problem(self) -> bool:

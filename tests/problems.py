@@ -6,6 +6,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lyapnet.base.interpolation import Curve
 from lyapnet.controller.controller import Controller
 from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
 from lyapnet.experiment.config import load_config
@@ -16,8 +17,9 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet, Unbounded
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.expansions import Expansion
 from lyapnet.value.networks import ExpansionNetwork
-from lyapnet.value.policy import HJBPolicy
+from lyapnet.value.policy import HJBPolicy, SampledPolicy
 
 CONF = Path(__file__).parents[1] / "conf"
 AMPLE = 300.0  # wall seconds that no proof of a test takes, on a busy machine too: what bounds it is its boxes
@@ -91,3 +93,26 @@ def with_expansion(V: ValueFunction) -> ValueFunction:
             t, 0.1 * wave * torch.randn(V.n), wave[:, 0], wave * torch.randn(V.n), H, 1.1 * H, torch.randn(20, V.n)
         )
     return V
+
+
+class OfExpansion(ValueFunction):
+    """V of a single expansion, c + pᵀδ + ½ δᵀHδ at the nodes of a problem's horizon; c and the rest may be scaled."""
+
+    made_for = SampledPolicy
+
+    def __init__(self, problem: Problem, expansion: Expansion, share: float = 1.0, constant: float = 1.0):
+        super().__init__()
+        x, c, p, H = expansion
+        n = self.n = x.shape[-1]
+        self.share, self.constant, self.weight = share, constant, nn.Parameter(torch.ones(()))
+        self.parts = Curve(problem.horizon.times(c), torch.cat([c[:, None], p, x, H.flatten(1)], 1))
+        assert self.parts(torch.zeros(())).shape == (1 + 2 * n + n * n,)
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        n, parts = self.n, self.parts(t)
+        p, delta, H = parts[..., 1 : 1 + n], x - parts[..., 1 + n : 1 + 2 * n], self.curvature(t)
+        rest = ((p + (H @ delta[..., None])[..., 0] / 2) * delta).sum(-1)
+        return self.weight * (self.constant * parts[..., 0] + self.share * rest)
+
+    def curvature(self, t: Tensor) -> Tensor:
+        return self.parts(t)[..., 1 + 2 * self.n :].unflatten(-1, (self.n, self.n))

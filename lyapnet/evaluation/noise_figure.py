@@ -14,7 +14,7 @@ STATES = 2  # initial states, so that bands can be told apart
 BAND = (0.05, 0.95)  # probabilities of the edges of a band
 
 
-def states_to_draw(x0: State) -> State:
+def states_to_draw(x0: State) -> Tensor:
     """The two of some initial states (b, n) that are farthest apart, each repeated PATHS times: (PATHS, STATES, n)."""
     extent = (x0.amax(0) - x0.amin(0)).clamp_min(torch.finfo(x0.dtype).tiny)
     distance = torch.cdist(x0 / extent, x0 / extent)

@@ -203,12 +203,11 @@ class Problem(nn.Module):
         return Response(after, self.system.g(x), apply(R2, u if rest is None else u - rest), R2)
 
     def replaced(self, **parts: Any) -> "Problem":
-        """The problem with some of its parts replaced."""
-        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints", "noise")
-        own = {name: getattr(self, name) for name in names}
-        if "system" in parts and isinstance(self.noise, SystemNoise):
-            own["noise"] = None  # that of the other system
-        other = Problem(**{**own, **parts})
+        """The problem with some of its parts replaced; noise that a system declares is replaced with the system."""
+        names = ("system", "cost", "controls", "initial_states", "horizon", "constraints")
+        other = Problem(**{**{name: getattr(self, name) for name in names}, **parts})
+        if "noise" not in parts and not ("system" in parts and isinstance(self.noise, SystemNoise)):
+            other.noise = self.noise
         if parts.keys().isdisjoint(("cost", "system")):
             other.findings = self.findings
         if "initial_states" in parts:

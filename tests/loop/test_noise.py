@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 from torch.testing import assert_close
 
-from lyapnet.base.interpolation import Curve
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.loop.rollout import Rollout
 from lyapnet.loop.rollout.expectations import expected_value
@@ -22,6 +21,7 @@ from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import riccati
 from lyapnet.value.networks import FCN, Scaling
 from lyapnet.value.policy import HJBPolicy, SampledPolicy
+from tests.problems import OfExpansion
 
 N, DT = 20, 0.1
 
@@ -45,21 +45,9 @@ def problem(constant: bool = True, method: str = "euler", noise: Noise | None = 
     return Problem(system, cost, Unbounded(), box, horizon, noise=own if constant else None)
 
 
-class Quadratic(ValueFunction):
-    """V from an expansion at the goal, with p and c scaled: 1 for the value function."""
-
-    def __init__(self, problem: Problem, share: float = 1.0, constant: float = 1.0):
-        super().__init__()
-        self.share, self.constant = share, constant
-        _, c, p, H = riccati(problem)
-        self.parts = Curve(problem.horizon.times(c), torch.cat([c[:, None], p, H.flatten(1)], 1))
-        self.weight = torch.nn.Parameter(torch.ones(()))
-
-    def forward(self, t: Tensor, x: Tensor) -> Tensor:
-        parts = self.parts(t)
-        p, H = parts[..., 1:3], parts[..., 3:].unflatten(-1, (2, 2))
-        quadratic = ((p + (H @ x[..., None])[..., 0] / 2) * x).sum(-1)
-        return self.weight * (self.constant * parts[..., 0] + self.share * quadratic)
+def value_of(problem: Problem, share: float = 1.0, constant: float = 1.0) -> OfExpansion:
+    """The value function of a problem, with its constant and the rest scaled."""
+    return OfExpansion(problem, riccati(problem), share, constant)
 
 
 def initial_states(problem: Problem, count: int = 8) -> Tensor:
@@ -107,7 +95,7 @@ def test_the_gradient_is_that_of_autograd_through_the_same_path(constant, method
 
 def test_without_increments_the_loop_is_that_without_noise():
     task = problem()
-    V = Quadratic(task)
+    V = value_of(task)
     x0 = initial_states(task)
     with torch.no_grad():
         quiet = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0)
@@ -128,7 +116,7 @@ def test_the_same_seed_draws_the_same_noise_with_variance_dt():
 @pytest.mark.parametrize("constant", [True, False])
 def test_for_the_value_function_every_path_has_residual_zero(constant):
     task = problem(constant)
-    V, x0 = Quadratic(task), initial_states(task)
+    V, x0 = value_of(task), initial_states(task)
     trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0))
     seen = trajectory.compensated()
     program = ValueProgram(constraint=1, cost_to_go=1, terminal=1, normalise=False)
@@ -145,7 +133,7 @@ def test_for_the_value_function_every_path_has_residual_zero(constant):
 def test_a_wrong_value_has_a_residual(share, constant):
     task = problem()
     x0 = initial_states(task)
-    V = Quadratic(task, share, constant)
+    V = value_of(task, share, constant)
     trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)).compensated()
     assert ValueProgram(cost_to_go=1, normalise=False)(trajectory).terms["cost_to_go"].item() > 1e-5
 
@@ -153,7 +141,7 @@ def test_a_wrong_value_has_a_residual(share, constant):
 def test_the_minimiser_is_not_biased():
     """Over many paths the gradient by a factor of V vanishes at the value function; the raw residual's does not."""
     task = problem()
-    V = Quadratic(task)
+    V = value_of(task)
     x0 = task.initial_states.sample(2000, torch.Generator().manual_seed(0))
     trajectory = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0))
     program = ValueProgram(constraint=1, normalise=False)
@@ -168,7 +156,7 @@ def test_the_minimiser_is_not_biased():
 def test_the_lyapunov_condition_is_one_in_expectation():
     task = problem()
     x0, program = initial_states(task, 64), LyapunovProgram(terminal=1)
-    for V, holds in ((Quadratic(task), True), (Quadratic(task, constant=0.5), False)):
+    for V, holds in ((value_of(task), True), (value_of(task, constant=0.5), False)):
         loop = Rollout(task, SampledPolicy(task, V), gradient="discrete")
         trajectory = loop(x0, drawn(task, x0)).compensated()
         hinge = program.constraint_loss(trajectory.require_value(), trajectory)
@@ -179,7 +167,7 @@ def test_the_lyapunov_condition_is_one_in_expectation():
 def test_the_control_variate_keeps_the_mean_and_removes_variance():
     task, paths = problem(), 4000
     x0 = torch.tensor([0.5, -0.3]).expand(paths, -1)
-    optimal, other = Quadratic(task), Quadratic(task, 1.3, 0.0)
+    optimal, other = value_of(task), value_of(task, 1.3, 0.0)
     trajectory, wrong = (
         Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)) for V in (optimal, other)
     )
@@ -252,7 +240,7 @@ def test_noise_of_no_or_negative_strength_is_refused(strengths):
 
 def test_increments_of_another_shape_or_without_noise_are_refused():
     task = problem()
-    V, x0 = Quadratic(task), initial_states(task)
+    V, x0 = value_of(task), initial_states(task)
     rollout = Rollout(task, SampledPolicy(task, V), gradient="discrete")
     with pytest.raises(ValueError, match="Expected increments of shape"):
         rollout(x0, drawn(task, x0)[:-1])

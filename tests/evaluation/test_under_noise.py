@@ -1,0 +1,231 @@
+"""What evaluations report of tasks with noise, against closed forms and a grid; and what must fail."""
+
+import numpy as np
+import pytest
+import torch
+from torch.testing import assert_close
+
+import lyapnet
+from lyapnet.base.errors import OracleError, UsageError
+from lyapnet.controller.controller import Controller
+from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
+from lyapnet.evaluation.oracles import oracle_of
+from lyapnet.evaluation.tables import evaluation_table
+from lyapnet.evaluation.under_noise import measure_under_noise
+from lyapnet.experiment.assembly import build_problem
+from lyapnet.experiment.config import config_from_plain
+from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.horizon import Horizon
+from lyapnet.task.noise import StateNoise
+from lyapnet.task.problem import Problem
+from lyapnet.task.sets import Box, Unbounded
+from lyapnet.task.systems import Linear, Pendulum
+from lyapnet.value.expansions import Expansion, optimal_trajectories, riccati
+from tests.grid_solver import solve_on_grid
+from tests.problems import OfExpansion
+
+TASK = {
+    "experiment": "noisy",
+    "system": {"name": "double_integrator"},
+    "cost": {"Q": [1, 0.1], "R": 0.1, "Q_T": [2, 1]},
+    "initial_states": {"lower": -1, "upper": 1},
+    "horizon": {"steps": 30, "dt": 0.1},
+    "noise": {"velocity": 0.4},
+}
+DISCRETE = {"rollout": {"gradient": "discrete"}}
+
+
+def task(**changes) -> Problem:
+    return build_problem(config_from_plain({**TASK, **changes}))
+
+
+def controller_of(problem: Problem, expansion: Expansion | None = None) -> Controller:
+    """The controller of an expansion, by default the Riccati solution with its noise."""
+    return Controller(problem, OfExpansion(problem, riccati(problem) if expansion is None else expansion))
+
+
+def ornstein_uhlenbeck(steps: int, method: str = "rk4") -> Problem:
+    """A state of the quadratic easy task of SOC-matching, whose V(0, x) is known."""
+    cost = QuadraticCost([[0.2]], [[0.5]], [[0.1]])
+    horizon = Horizon(steps, 1 / steps, method)
+    return Problem(Linear([[0.2]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), horizon, noise=StateNoise([1.0]))
+
+
+def test_the_expansion_converges_to_the_closed_form():
+    """V(0, x) = 0.292554 x² + 4.055382 / 20 in continuous time; the error of N steps falls as 1/N."""
+    errors = []
+    for steps in (50, 100):
+        _, c, p, H = (part[0] for part in riccati(ornstein_uhlenbeck(steps)))
+        assert abs(float(p)) < 1e-12
+        errors.append([float(H) / 2 - 0.292554, float(c) - 4.055382 / 20])
+    for coarse, fine, exact in zip(*errors, (0.292554, 0.2027691), strict=True):
+        assert abs(fine) < 0.01 * exact
+        assert abs(fine) < 0.6 * abs(coarse) or abs(fine) < 1e-6
+
+
+def test_noise_that_grows_with_the_state_is_in_the_riccati_equation():
+    """dx = u dt + s x dW: the recursion of x² with F = 1, G = Δt, by hand."""
+
+    class Multiplicative(Linear):
+        def noise(self, x):
+            return 0.6 * x[..., None]
+
+    cost = QuadraticCost([[1.0]], [[0.5]], [[2.0]])
+    problem = Problem(
+        Multiplicative([[0.0]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), Horizon(20, 0.1, "euler")
+    )
+    P = 2.0
+    for _ in range(20):
+        K = P / (0.5 + 0.1 * P)
+        P = 0.1 * (1 + 0.5 * K**2) + P * (1 - 0.1 * K) ** 2 + 0.1 * 0.36 * P
+    assert_close(float(riccati(problem).hessian[0]) / 2, P)
+    assert float(riccati(problem.without_noise()).hessian[0]) / 2 < P - 0.1
+    assert_close(oracle_of(problem)(torch.tensor([[0.7]])), torch.tensor([P * 0.49]))
+
+
+def test_an_expansion_along_a_path_has_the_cost_of_the_noise_and_the_path_has_none():
+    problem = task()
+    x0 = problem.initial_states.sample(3, torch.Generator().manual_seed(0))
+    guess = torch.zeros(30, 3, 1)
+    optimum, quiet = (optimal_trajectories(each, x0, guess) for each in (problem, problem.without_noise()))
+    assert_close(optimum.path.cost, quiet.path.cost)
+    assert_close(quiet.expansion.value[0], quiet.path.cost)
+    assert_close(optimum.expansion.value[0] - quiet.expansion.value[0], riccati(problem).value[0].expand(3))
+
+
+def test_expected_costs_are_those_of_the_oracle_within_their_interval():
+    problem = task()
+    x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
+    table, noise, lqr = measure_under_noise(controller_of(problem), x0, 40, 64)
+    optimum = oracle_of(problem)(x0)
+    error = float((table.cost - optimum).mean())
+    assert abs(error) < 2 * noise.half_width < 0.01 * float(optimum.mean())
+    assert noise.half_width < noise.plain_half_width
+    assert lqr is not None
+    assert_close(lqr, table.cost)  # the certainty-equivalent law is the optimal one here
+    assert noise.lost_fraction < 0.01
+    assert [*noise.quantiles.values()] == sorted(noise.quantiles.values())
+
+
+def test_a_worse_law_costs_more_and_a_wrong_V_keeps_the_mean():
+    problem = task()
+    x0 = problem.initial_states.sample(64, torch.Generator().manual_seed(0))
+    own = riccati(problem)
+    worse = controller_of(problem, own._replace(hessian=0.3 * own.hessian, value=own.value + 5))
+    table, noise, _ = measure_under_noise(worse, x0, 40, 64)
+    optimum = oracle_of(problem)(x0)
+    assert float((table.cost - optimum).mean()) > 3 * noise.half_width
+    assert abs(float(table.cost.mean()) - noise.plain_mean) < 2 * (noise.half_width + noise.plain_half_width)
+
+
+def test_the_summary_names_what_noise_does():
+    result = lyapnet.evaluate(controller_of(task()), samples=32, paths=8)
+    assert result["noise"]["paths"] == 8
+    assert abs(result["cost_ratio"] - 1) < 0.05
+    assert "held_cost_mean" not in result
+    printed = evaluation_table("title", result)
+    labels = [str(cell) for cell in printed.columns[0]._cells]
+    assert any("95 % interval" in label for label in labels)
+    quiet = lyapnet.evaluate(controller_of(task(noise={})), samples=32)
+    assert "noise" not in quiet
+    assert result["cost_mean"] > quiet["cost_mean"]
+
+
+def test_one_path_has_no_interval_and_is_refused():
+    with pytest.raises(ValueError, match="Expected paths ≥ 2"):
+        lyapnet.evaluate(controller_of(task()), samples=4, paths=1)
+
+
+def test_a_nonlinear_or_limited_task_has_no_oracle_under_noise():
+    pendulum = {"system": {"name": "pendulum"}}
+    for changes in (pendulum, {"controls": {"lower": -1, "upper": 1}}):
+        with pytest.raises(OracleError, match="for an optimum under noise"):
+            oracle_of(task(**changes))
+
+
+@pytest.mark.gate
+def test_the_riccati_solution_is_that_of_a_grid():
+    problem = task()
+    x0 = problem.initial_states.sample(16, torch.Generator().manual_seed(0))
+    optimum = solve_on_grid(problem, [-3, -4], [3, 4], 49, np.linspace(-8, 8, 33))
+    assert_close(optimum(x0), oracle_of(problem)(x0), rtol=1e-3, atol=0)
+    assert float(optimum(x0).mean()) > 1.05 * float(oracle_of(task(noise={}))(x0).mean())
+
+
+def test_a_rollout_takes_a_seed_or_increments():
+    problem = task()
+    controller, x0 = controller_of(problem), torch.tensor([[0.5, 0.1]])
+    first, again, other = (controller.rollout(x0, noise=seed) for seed in (0, 0, 1))
+    assert torch.equal(first.x, again.x)
+    assert not torch.equal(first.x, other.x)
+    quiet = controller.rollout(x0)
+    assert torch.equal(controller.rollout(x0, noise=torch.zeros(30, 1, 1)).x, quiet.x)
+    arrays = controller.rollout(x0.numpy(), noise=0)
+    assert isinstance(arrays.martingale, np.ndarray)
+    with pytest.raises(ValueError, match="Expected no noise for a task without"):
+        controller_of(task(noise={})).rollout(x0, noise=0)
+    with pytest.raises(ValueError, match="steps of the horizon with noise"):
+        controller.rollout(x0, steps=3, noise=0)
+
+
+def test_bands_show_both_states_and_the_cost():
+    problem = task()
+    x0 = states_to_draw(problem.initial_states.sample(12, torch.Generator().manual_seed(0)))
+    assert x0.shape == (PATHS, 2, 2)
+    assert not torch.equal(x0[0, 0], x0[0, 1])
+    figure = bands(controller_of(problem).rollout(x0, noise=0), problem)
+    labels = [axes.get_ylabel() for axes in figure.axes]
+    assert [label.split("\n")[0] for label in labels[:4]] == ["position", "velocity", "force", "cost"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"noise": {"speed": 1}}, "Expected noise among position, velocity"),
+        ({"noise": {"velocity": -1}}, "noise"),
+        ({"noise": {"velocity": 0.1}, "rollout": {"gradient": "adjoint"}}, "rollout.gradient=discrete with noise"),
+        ({"network": {"name": "icnn"}, "program": {"name": "value"}, **DISCRETE}, "network.name=expansion or fcn"),
+        ({"pointwise": {"weight": 1}}, "pointwise.weight=0 with noise"),
+        ({"cost": {"Q": 1, "R": 1}, "horizon": {"steps": 30, "dt": 0.1, "stationary": True}}, "stationary: false"),
+    ],
+)
+def test_what_knows_no_noise_is_refused_by_name(changes, message):
+    with pytest.raises(UsageError, match=message):
+        task(**changes)
+
+
+def test_noise_is_part_of_the_record_of_a_problem():
+    problem, quiet = task(), task(noise={})
+    assert problem.differences(problem.record()) == []
+    assert problem.differences(quiet.record()) == ["σσᵀ"]
+    assert quiet.differences(problem.record()) == ["σσᵀ"]
+    assert quiet.differences(quiet.record()) == []
+
+
+class Gusty(Pendulum):
+    """A pendulum with noise of its own."""
+
+    def noise(self, x):
+        rate = 0.3 + 0.1 * x[..., 1] ** 2
+        return torch.stack([torch.zeros_like(rate), rate], -1)[..., None]
+
+
+def test_a_system_s_own_noise_is_taken_and_follows_the_system():
+    pendulum, box = Gusty(), Box([-1.0, -1.0], [1.0, 1.0])
+    cost = QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2))
+    problem = Problem(pendulum, cost, Unbounded(), box, Horizon(10, 0.1, "euler"))
+    assert problem.noise is not None
+    assert problem.noise.sources == 1
+    assert problem.replaced(system=Pendulum()).noise is None
+    assert problem.without_noise().noise is None
+    problem.check()
+
+
+def test_a_noise_of_the_wrong_shape_is_refused():
+    class Wrong(Linear):
+        def noise(self, x):
+            return x  # no column
+
+    cost = QuadraticCost([[1.0]], [[1.0]], [[1.0]])
+    with pytest.raises(UsageError, match=r"noise\(x\)"):
+        Problem(Wrong([[0.0]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), Horizon(5, 0.1, "euler")).check()

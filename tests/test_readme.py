@@ -189,13 +189,21 @@ def test_the_environment_example_runs(trained, monkeypatch):
     assert names["mean_return"] < 0
 
 
-def test_the_table_of_the_comparison_is_that_of_its_report():
-    lines = [line for line in PAGES[ROOT / "docs" / "compare.md"].splitlines() if line.startswith("| ")]
-    start = next(k for k, line in enumerate(lines) if line.startswith("| task | method"))
-    shown = [line for line in lines[start:] if line.count("|") == lines[start].count("|")]
-    report = REPORT.read_text(encoding="utf-8")
-    assert len(shown) == 2 + 4 * 5
-    assert "\n".join(shown) in report
+def table_after(text: str, start: str) -> list[list[str]]:
+    """The cells of each row of the first table that starts so, its line of dashes left out."""
+    rows = (start + text.partition(start)[2]).partition("\n\n")[0].splitlines()
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in (rows[0], *rows[2:])]
+
+
+def test_the_tables_of_the_comparison_are_those_of_its_report():
+    """Methods by tasks; the first cell names the report's columns that a cell holds."""
+    head, *rows = table_after(REPORT.read_text(encoding="utf-8"), "| task | method | seeds | cost / J*")
+    measured = {(row[0], row[1]): dict(zip(head, row, strict=True)) for row in rows}
+    assert len(measured) == 4 * 5
+    for start in ("| cost / J*; at our", "| seconds to 10 %", "| steps to 10 %"):
+        (names, *tasks), *lines = table_after(PAGES[ROOT / "docs" / "compare.md"], start)
+        shown = {(task, line[0]): cell for line in lines for task, cell in zip(tasks, line[1:], strict=True)}
+        assert shown == {key: "; ".join(row[name] for name in names.split("; ")) for key, row in measured.items()}
 
 
 @pytest.mark.gate

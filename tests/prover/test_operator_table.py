@@ -373,8 +373,13 @@ def is_free(name):
 
 
 def overview():
-    rows = [f"| `{name}` | {' | '.join(marks)} |" for name, marks in coverage().items()]
-    return "\n".join([f"| operator | {' | '.join(COLUMNS)} |", "|---|" + ":-:|" * len(COLUMNS), *rows])
+    """The operators that the same readers have in one row, the largest group first."""
+    groups = {}
+    for name, marks in coverage().items():
+        groups.setdefault(tuple(marks), []).append(f"`{name}`")
+    groups = sorted(groups.items(), key=lambda group: -len(group[1]))
+    rows = [f"| {' | '.join(marks)} | {', '.join(names)} |" for marks, names in groups]
+    return "\n".join([f"| {' | '.join(COLUMNS)} | operators |", "|" + ":-:|" * len(COLUMNS) + "---|", *rows])
 
 
 def test_the_overview_is_that_of_the_readers():
@@ -389,7 +394,7 @@ def test_the_overview_of_a_reader_that_lacks_a_rule_is_another(monkeypatch):
 
 if __name__ == "__main__":
     text = PAGE.read_text(encoding="utf-8")
-    PAGE.write_text(re.sub(r"\| operator \|.*", lambda _: overview() + "\n", text, flags=re.DOTALL), encoding="utf-8")
+    PAGE.write_text(re.sub(r"\| bounds \|.*", lambda _: overview() + "\n", text, flags=re.DOTALL), encoding="utf-8")
 
 
 # What is registered and fails leaves nothing behind

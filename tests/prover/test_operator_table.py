@@ -400,8 +400,8 @@ ERFINV = Operator("erfinv", domain=((-0.9, 0.9),))
 @pytest.mark.parametrize(
     ("row", "bound", "kind", "says"),
     [
-        (ERFINV, lambda operators, x: None, "smooth", "as they were tried"),
-        (Operator("erfinv", domain=((-0.9, 0.9),) * 2), lambda operators, x: x, "smooth", "as they were tried"),
+        (ERFINV, lambda operators, x: None, "smooth", "while they were checked"),
+        (Operator("erfinv", domain=((-0.9, 0.9),) * 2), lambda operators, x: x, "smooth", "while they were checked"),
         (Operator("erfinv", domain=((2.0, 3.0),)), lambda operators, x: operators.mul(x, 0.0), "smooth", "not finite"),
         (ERFINV, lambda operators, x: operators.mul(x, 0.0), "smooth", "values outside"),
         (ERFINV, lambda operators, x: x, "bogus", "kind as one of smooth, kink, jump"),

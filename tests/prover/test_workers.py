@@ -69,7 +69,10 @@ def test_a_worker_that_is_killed_is_one_line():
             os.kill(os.getpid(), signal.SIGKILL)
 
     question = Killed()
-    with pytest.raises(UsageError, match="Expected workers that live on, got one killed"), bounding(question, 2) as run:
+    with (
+        pytest.raises(UsageError, match="Expected all workers to finish, got one that was killed"),
+        bounding(question, 2) as run,
+    ):
         list(run(question.undecided, chunks()))
     assert threading.active_count() < 20
 

@@ -70,7 +70,7 @@ def _divide(x: Any, y: Any) -> TaylorForm:
     """x · (1/y)."""
     if isinstance(y, TaylorForm):
         return _multiply(x, functions.reciprocal(y))
-    return taylor.scale(x, 1 / _tensor(y)).rounded()
+    return taylor.scale(x, 1 / _tensor(y)).with_rounding()
 
 
 @rule(aten.mm.default, aten.bmm.default)
@@ -105,7 +105,7 @@ def _negate(x: TaylorForm) -> TaylorForm:
 @rule(aten.sum.default, aten.sum.dim_IntList)
 def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
     """Σ x over some axes: the terms add, and so do the remainders, since |Σ η_i| ≤ Σ r_i."""
-    x, rank = x.rounded(x.shape.numel()), len(x.shape)
+    x, rank = x.with_rounding(x.shape.numel()), len(x.shape)
     if not rank:
         return x
     axes = [axis % rank for axis in dim or range(rank)]
@@ -125,7 +125,7 @@ def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) 
     y = y if isinstance(y, TaylorForm) else taylor.constant_form(_tensor(y), at)
     size = y.magnitude * (1 + 1e-9)  # the factor covers the rounding of this line and the next
     radius = y.radius + (relative * size + absolute) * (1 + 1e-9)
-    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).rounded()
+    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).with_rounding()
 
 
 # Functions of one number
@@ -247,7 +247,9 @@ def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
     """x with source_i added to its entry index_i: x plus an arrangement of the source."""
     like = x if isinstance(x, TaylorForm) else source
     x, source = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, source))
-    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.rounded(len(index)))
+    moved = _rearranged(
+        lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.with_rounding(len(index))
+    )
     return taylor.add(x, moved)
 
 
@@ -260,7 +262,7 @@ def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False
         )
     like = x if isinstance(x, TaylorForm) else values
     x, values = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, values))
-    values = values.rounded(values.shape.numel())
+    values = values.with_rounding(values.shape.numel())
     moved = _rearranged(lambda base, y: torch.zeros_like(base).index_put(indices, y, accumulate=True), x, values)
     return taylor.add(x, moved)
 

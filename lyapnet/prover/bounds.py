@@ -46,7 +46,7 @@ class BoundedFunction:
             control flow does not depend on values.
         sample: a box (lower, upper) of (t, x), (1 + n,) each; the trace is checked at points of it.
         degree: degree of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
-        exact: ignore `rounded` (lyapnet.prover.rounding), so that bounds hold in real arithmetic only.
+        exact: ignore mark_rounded (lyapnet.prover.rounding); the bounds then hold in real arithmetic only.
 
     Attributes:
         graph: the torch operations of the function at one (t, x).

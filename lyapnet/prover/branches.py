@@ -77,7 +77,7 @@ def _monotone_of_intervals(function: Callable[[Tensor, Tensor], Tensor], x: Tayl
     """A function of intervals that does not fall in either argument: its extremes are at the lower and upper ends."""
     x, y = taylor.aligned(x, y)
     (x_low, x_high), (y_low, y_high) = x.interval(), y.interval()
-    return between(function(x_low, y_low), function(x_high, y_high), x).rounded(2)
+    return between(function(x_low, y_low), function(x_high, y_high), x).with_rounding(2)
 
 
 def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:
@@ -169,7 +169,7 @@ def where(truth: Any, x: Any, y: Any) -> TaylorForm:
     truth, x, y = taylor.aligned(*_forms(truth, x, y))
     certain, possible = _truth(truth)
     apart = (x.terms - y.terms).abs().sum(0) / 2
-    both = x.with_parts((x.terms + y.terms) / 2, apart + torch.maximum(x.radius, y.radius)).rounded(len(x.terms))
+    both = x.with_parts((x.terms + y.terms) / 2, apart + torch.maximum(x.radius, y.radius)).with_rounding(len(x.terms))
     return x.with_parts(
         torch.where(certain, x.terms, torch.where(possible, both.terms, y.terms)),
         torch.where(certain, x.radius, torch.where(possible, both.radius, y.radius)),

@@ -96,7 +96,7 @@ def _secant(
     nearby = (((derivative(points) - a).abs() + TINY) * 1e-12 * (1 + points.abs())).amax(0)
     largest = torch.maximum(f_l.abs(), f_u.abs()).maximum(f_p.abs().amax(0)) + 2 * a.abs() * torch.maximum(-lo, hi)
     b, e = (low + high) / 2, (high - low) / 2 + nearby + 16 * EPSILON * largest + TINY
-    return x.with_parts(torch.cat([(a * x.center + b)[None], a * x.terms[1:]]), a.abs() * x.radius + e).rounded(2)
+    return x.with_parts(torch.cat([(a * x.center + b)[None], a * x.terms[1:]]), a.abs() * x.radius + e).with_rounding(2)
 
 
 def _expanded(
@@ -137,13 +137,13 @@ def _expanded(
     higher = k.abs() + FLOOR + M.abs() * (w if cubic else 1)
     size = a.abs() + (b.abs() + FLOOR + (c.abs() + FLOOR + higher * w) * w) * w
     e = e + 32 * EPSILON * size + TINY
-    y = x.with_parts(torch.cat([(x.center - m)[None], x.terms[1:]]), x.radius).rounded()
+    y = x.with_parts(torch.cat([(x.center - m)[None], x.terms[1:]]), x.radius).with_rounding()
     yy = taylor.multiply(y, y)
     terms, radius = b * y.terms + c * yy.terms, b.abs() * y.radius + c.abs() * yy.radius
     if cubic:
         yyy = taylor.multiply(yy, y)
         terms, radius = terms + k * yyy.terms, radius + k.abs() * yyy.radius
-    return x.with_parts(torch.cat([(terms[0] + a)[None], terms[1:]]), radius + e).rounded(6)
+    return x.with_parts(torch.cat([(terms[0] + a)[None], terms[1:]]), radius + e).with_rounding(6)
 
 
 def square(x: TaylorForm) -> TaylorForm:

@@ -33,7 +33,7 @@ def solve(A: TaylorForm, B: TaylorForm) -> TaylorForm:
 
 def _from_left(K: Tensor, x: TaylorForm) -> TaylorForm:
     """K x with a constant matrix K for each box, (boxes, n, n): the terms by K, the remainder by |K|."""
-    x = x.rounded(2 * K.shape[-1])  # as in taylor.matrix_product
+    x = x.with_rounding(2 * K.shape[-1])  # as in taylor.matrix_product
     return x.with_parts(K @ x.terms, K.abs() @ x.radius + taylor.TINY)
 
 

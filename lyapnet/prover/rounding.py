@@ -1,7 +1,7 @@
 """Rounding in another program's arithmetic, as an operator of graphs: the identity for values, an error for bounds.
 
-A function that imitates another program marks its results by `rounded`. Values and derivatives are those of the exact
-function; the bounds of lyapnet.prover.bounds hold for every function whose results have the errors that are marked.
+A function that imitates another program marks its results by mark_rounded. Values and derivatives are those of the
+exact function; the bounds of lyapnet.prover.bounds hold for every function whose results have the marked errors.
 """
 
 from contextlib import AbstractContextManager
@@ -13,11 +13,11 @@ from lyapnet.base.operators import BOUNDS, are_operators, as_operators
 
 
 def rounding(counted: bool) -> AbstractContextManager[None]:
-    """A context in which `rounded` is an operator in traced graphs, if `counted`; outside, it returns its argument."""
+    """A context in which mark_rounded leaves an operator in traced graphs if `counted`; else it returns y."""
     return as_operators(BOUNDS, counted)
 
 
-def rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
+def mark_rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
     """y; for bounds, any y (1 + θ) + η with |θ| ≤ relative and |η| ≤ absolute; any number if |y| may exceed `largest`.
 
     θ and η may differ at each point and in each use of the result.

@@ -138,7 +138,7 @@ class TaylorForm:
         lower, upper = self.interval()
         return (upper - lower) / 2 - _absolute_sum(self.coefficients)
 
-    def rounded(self, operations: int = 1) -> "TaylorForm":
+    def with_rounding(self, operations: int = 1) -> "TaylorForm":
         """The form with a larger r: room for this many rounded operations on each entry, in sequence or in one sum."""
         return self.with_parts(self.terms, self.radius + (2 * operations * EPSILON) * self.magnitude + TINY)
 
@@ -188,7 +188,7 @@ def box_form(lower: Corners, upper: Corners, degree: int = 1) -> TaylorForm:
     d = len(wide)
     coefficients = (half.T[..., None] * torch.eye(lower.shape[-1], dtype=half.dtype)[:, None])[wide]
     higher = center.new_zeros(len(monomials(d, degree)) - 1 - d, *center.shape)
-    return TaylorForm(torch.cat([center[None], coefficients, higher]), torch.zeros_like(center), d).rounded(2)
+    return TaylorForm(torch.cat([center[None], coefficients, higher]), torch.zeros_like(center), d).with_rounding(2)
 
 
 def wide_axes(lower: Corners, upper: Corners) -> Tensor:
@@ -199,7 +199,7 @@ def wide_axes(lower: Corners, upper: Corners) -> Tensor:
 
 def interval_form(lower: Corners, upper: Corners) -> TaylorForm:
     """The boxes as intervals: no ε, only remainders, so that dependence on the same point is lost."""
-    return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).rounded(2)
+    return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).with_rounding(2)
 
 
 def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
@@ -222,7 +222,7 @@ def aligned(*forms: TaylorForm) -> list[TaylorForm]:
 def add(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     """x + y: the terms add, and the remainders add, since |η + η'| ≤ r + r'."""
     x, y = aligned(x, y)
-    return x.with_parts(x.terms + y.terms, x.radius + y.radius).rounded()
+    return x.with_parts(x.terms + y.terms, x.radius + y.radius).with_rounding()
 
 
 def shift(x: TaylorForm, offset: Tensor) -> TaylorForm:
@@ -230,13 +230,13 @@ def shift(x: TaylorForm, offset: Tensor) -> TaylorForm:
     x = x.as_rank(max(len(x.shape), offset.ndim))
     center = x.center + offset
     terms = torch.cat([center[None], x.terms[1:].expand(-1, *center.shape)])
-    return x.with_parts(terms, x.radius.expand_as(center)).rounded()
+    return x.with_parts(terms, x.radius.expand_as(center)).with_rounding()
 
 
 def scale(x: TaylorForm, factor: Tensor) -> TaylorForm:
     """factor · x, entry by entry; the remainder is multiplied by |factor|."""
     x = x.as_rank(max(len(x.shape), factor.ndim))
-    return x.with_parts(x.terms * factor, x.radius * factor.abs()).rounded()
+    return x.with_parts(x.terms * factor, x.radius * factor.abs()).with_rounding()
 
 
 def negate(x: TaylorForm) -> TaylorForm:
@@ -246,7 +246,7 @@ def negate(x: TaylorForm) -> TaylorForm:
 
 def matrix_product(x: TaylorForm, weight: Tensor) -> TaylorForm:
     """x @ W: the terms are multiplied by W, the remainder by |W|, since |Σ_i η_i W_ij| ≤ Σ_i r_i |W_ij|."""
-    x = x.rounded(2 * len(weight))  # the error of a sum of k products is at most kε Σ_i |x_i||W_ij|
+    x = x.with_rounding(2 * len(weight))  # the error of a sum of k products is at most kε Σ_i |x_i||W_ij|
     return x.with_parts(x.terms @ weight, x.radius @ weight.abs() + TINY)
 
 
@@ -303,7 +303,7 @@ def interval_product(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     (a, b), (c, d) = x.interval(), y.interval()
     ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, and so are then both bounds: none is known
     low, high = ends.amin(0), ends.amax(0)
-    product = x.with_parts(((low + high) / 2)[None], (high - low) / 2).rounded(4)
+    product = x.with_parts(((low + high) / 2)[None], (high - low) / 2).with_rounding(4)
     known = torch.isfinite(low) & torch.isfinite(high)
     return x.with_parts(torch.where(known, product.terms, 0.0), torch.where(known, product.radius, torch.inf))
 

@@ -267,7 +267,7 @@ def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False
     return taylor.add(x, moved)
 
 
-OF_TRUTHS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
+BOOLEAN_OPERATORS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
 """Operators whose rules are also correct for boolean results: 1 · 0 is a conjunction, but 1 + 1 is no truth value."""
 
 

@@ -29,7 +29,7 @@ from lyapnet.graphs.tracing import trace
 from lyapnet.prover import taylor
 from lyapnet.prover.bound_kernel.kernel import BoundKernel, kernel_of
 from lyapnet.prover.bound_kernel.program import Support, of_boxes
-from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
+from lyapnet.prover.bound_rules import ARRANGEMENTS, BOOLEAN_OPERATORS, RULES
 from lyapnet.prover.rounding import rounding
 from lyapnet.prover.simplification import with_known_truths, without_copies
 from lyapnet.prover.taylor import TaylorForm, box_form, wide_axes
@@ -206,7 +206,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         return result.to(torch.get_default_device(), recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
-            truth = value.dtype == torch.bool and node.target in OF_TRUTHS and _compares_unrounded(node, values)
+            truth = value.dtype == torch.bool and node.target in BOOLEAN_OPERATORS and _compares_unrounded(node, values)
             real = value.dtype == torch.float64 or truth
             if not real or form.shape != value.shape:
                 raise UsageError(

@@ -245,7 +245,7 @@ CHOICES: dict[Any, Callable[..., TaylorForm]] = {
 
 # The comparisons in a graph
 
-DECIDES = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold) of the comparison x > threshold in it)
+COMPARISONS = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold) of the comparison x > threshold in it)
     aten.threshold_backward.default: lambda gradient, x, threshold: (x, threshold),
     aten.leaky_relu_backward.default: lambda gradient, x, negative_slope, self_is_result: (x, 0.0),
 }
@@ -261,9 +261,9 @@ def decisions(graph: GraphModule) -> GraphModule | None:
     for node in list(nodes.nodes):
         if node.op == "call_function" and node.target in JUMPS:
             truth = node
-            if node.target in DECIDES:
+            if node.target in COMPARISONS:
                 with nodes.inserting_after(node):
-                    truth = nodes.call_function(aten.gt.Scalar, DECIDES[node.target](*node.args))
+                    truth = nodes.call_function(aten.gt.Scalar, COMPARISONS[node.target](*node.args))
             with nodes.inserting_after(truth):
                 found.append(nodes.call_function(aten._to_copy.default, (truth,), {"dtype": torch.float64}))
     if not found:

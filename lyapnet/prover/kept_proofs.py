@@ -58,7 +58,7 @@ def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     return found.hexdigest()
 
 
-class Standing(NamedTuple):
+class ProofState(NamedTuple):
     """The state of a proof."""
 
     search: Search
@@ -79,8 +79,9 @@ def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner,
 
 
 FORMAT = b"lyapnet proof 3\n"
-PROVED = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
-TOGETHER = {"above", "below"}
+DESCRIPTIONS = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
+"""Name of a proof ↦ what it proves, in words."""
+TWO_SIDED = {"above", "below"}
 """The two proofs of a two-sided claim, which share a file."""
 
 
@@ -105,7 +106,7 @@ class KeptProof:
         """The condition, the wanted level and a hash of the code: other code might not prove the closed boxes."""
         return [self.about, self.wanted, hash_of_sources()]
 
-    def write(self, proof: Standing) -> None:
+    def write(self, proof: ProofState) -> None:
         """Write the state of a proof; the file is replaced as a whole or not at all."""
         search, worst = proof.search, proof.worst
         node, axis = search.tree.cuts
@@ -120,7 +121,7 @@ class KeptProof:
         self._proofs[self.about["proves"]] = content
         write_proofs(self.path, self._proofs)
 
-    def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> Standing | None:
+    def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> ProofState | None:
         """The state of the proof in the file; None if there is none yet.
 
         Args:
@@ -130,7 +131,7 @@ class KeptProof:
             UsageError: the file holds something else.
         """
         name = self.about["proves"]
-        if name not in self._proofs and {name, *self._proofs} <= {name} | TOGETHER:
+        if name not in self._proofs and {name, *self._proofs} <= {name} | TWO_SIDED:
             return None
         content = part_of(self._proofs, name, self.path, "take a new file")
         with refusing(self.path):
@@ -155,9 +156,9 @@ class KeptProof:
             finished = not len(frontier)  # all leaves of a finished proof are bounded again
             given_up = float("inf") if finished else content["given_up"]
             search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
-            return Standing(search, reached, worst, content["seconds"])
+            return ProofState(search, reached, worst, content["seconds"])
 
-    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> Standing:
+    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> ProofState:
         """The claim of a kept proof: all leaves, undecided, and the level that it says is proved.
 
         Args:
@@ -174,7 +175,7 @@ class KeptProof:
                     "name its checkpoint."
                 )
             leaves, waiting = CutTree(content["node"], content["axis"]).leaves(*domain), len(content["frontier"])
-            claimed = Standing(Search(leaves), float(content["proved"]), None)
+            claimed = ProofState(Search(leaves), float(content["proved"]), None)
         if waiting and not partial:
             raise UsageError(
                 f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
@@ -192,8 +193,8 @@ def part_of(proofs: dict[str, Any], name: str, path: Path, remedy: str = "name a
     with refusing(path):
         if name not in proofs:
             raise UsageError(
-                f"Expected the proof of {PROVED[name]} in {str(path)!r}, got that of "
-                f"{' and of '.join(PROVED[each] for each in sorted(proofs))}; {remedy}."
+                f"Expected the proof of {DESCRIPTIONS[name]} in {str(path)!r}, got that of "
+                f"{' and of '.join(DESCRIPTIONS[each] for each in sorted(proofs))}; {remedy}."
             )
         return proofs[name]
 
@@ -224,7 +225,7 @@ def read_proofs(path: Path) -> dict[str, Any]:
                 "copy of it, or another."
             )
         proofs = plain_data_of(io.BytesIO(payload))
-        if not proofs or not proofs.keys() <= PROVED.keys():
+        if not proofs or not proofs.keys() <= DESCRIPTIONS.keys():
             raise ValueError("the file holds no proofs by their names")
         return proofs
 

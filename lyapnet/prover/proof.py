@@ -17,7 +17,7 @@ from lyapnet.prover.boxes import Boxes, single
 from lyapnet.prover.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.prover.kept_proofs import KeptProof, Standing, about, hash_of_sources
+from lyapnet.prover.kept_proofs import KeptProof, ProofState, about, hash_of_sources
 from lyapnet.prover.verdict import Verdict
 from lyapnet.prover.workers import bounding
 
@@ -111,21 +111,22 @@ def prove(
         leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
         budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
     else:
-        begun = (kept.read((lower, upper), question.again) if kept else None) or question.begin(lower, upper, generator)
+        begun = kept.read((lower, upper), question.level_below) if kept else None
+        begun = begun or question.begin(lower, upper, generator)
     search, earlier, saved = begun.search, begun.seconds, budget.elapsed
 
-    def standing() -> Standing:
-        return Standing(search, question.level, question.worst, earlier + budget.elapsed)
+    def state() -> ProofState:
+        return ProofState(search, question.level, question.worst, earlier + budget.elapsed)
 
-    again = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
-    with bounding(question, budget.workers, budget.ray, again) as run:
+    make_question = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
+    with bounding(question, budget.workers, budget.ray, make_question) as run:
         for _ in search.rounds(question, budget, run):
             if kept is not None and budget.elapsed > saved + SAVE_INTERVAL:
-                kept.write(standing())
+                kept.write(state())
                 saved = budget.elapsed
             if report is not None:
                 report(Progress(search.boxes, search.frontier.share(lower, upper), earlier + budget.elapsed))
-    end = standing()
+    end = state()
     if kept is not None:
         kept.write(end)
     return Proof(
@@ -188,19 +189,19 @@ class WhereItHolds(Question):
 
     def look_at(self, boxes: Boxes) -> None:
         if len(boxes.key):  # own systems and costs need not accept empty batches
-            self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
+            self.lower_level(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
 
-    def lower_to(self, found: Counterexample | None) -> None:
+    def lower_level(self, found: Counterexample | None) -> None:
         """Lower the level below a counterexample, if one was found."""
         if found is not None:
             self.worst, self.level = found, found.height - LEVEL_DROP * abs(found.height)
 
-    def begin(self, lower: Corner, upper: Corner, generator: torch.Generator | None) -> Standing:
+    def begin(self, lower: Corner, upper: Corner, generator: torch.Generator | None) -> ProofState:
         """The state at the start: the whole box, and the level below the lowest counterexample that sampling finds."""
-        self.lower_to(find_counterexample(self.condition, self.bounded, lower, upper, self.level, generator))
-        return Standing(Search(single(lower, upper)), self.level, self.worst)
+        self.lower_level(find_counterexample(self.condition, self.bounded, lower, upper, self.level, generator))
+        return ProofState(Search(single(lower, upper)), self.level, self.worst)
 
-    def again(self, worst: Counterexample | None) -> float:
+    def level_below(self, worst: Counterexample | None) -> float:
         """The level below the counterexample of a kept proof, which is evaluated again.
 
         Raises:
@@ -211,7 +212,7 @@ class WhereItHolds(Question):
             found = lowest_violation(self.condition, self.bounded, point, float("inf"))
             if found is None or not abs(found.height - worst.height) <= MARGIN * abs(found.height):
                 raise ValueError("the condition does not fail there")
-        self.lower_to(worst)
+        self.lower_level(worst)
         return self.level
 
     @property

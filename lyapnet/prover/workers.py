@@ -62,8 +62,8 @@ def bounding(
         UsageError: a worker was killed, perhaps for lack of memory, or the cluster does not answer.
     """
     if ray is not None:
-        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as ask:
-            yield partial(_undecided_in_parallel, ask, question)
+        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as run:
+            yield partial(_undecided_in_parallel, run, question)
         return
     with _copies(question, workers) as pool:
         yield map if pool is None else partial(_undecided_in_parallel, partial(pool.map, _undecided), question)
@@ -83,7 +83,7 @@ def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Call
             [each.begin.remote(make_question, torch.get_default_dtype()) for each in actors], timeout=START_TIMEOUT
         )
         pool = cluster.util.ActorPool(actors)
-        yield lambda asked: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), asked))
+        yield lambda arguments: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), arguments))
     except cluster.exceptions.GetTimeoutError as error:
         raise UsageError(
             f"Expected {workers} free cores of the cluster within {START_TIMEOUT} s, got fewer; choose fewer --workers."
@@ -104,8 +104,8 @@ class ClusterWorker:
         torch.set_default_dtype(default)
         _own[:] = [make_question()]
 
-    def undecided(self, asked: tuple[Any, ...]) -> tuple[Any, ...]:
-        return _undecided(_own_copy(asked))
+    def undecided(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return _undecided(_own_copy(arguments))
 
 
 def _own_copy(data: Any) -> Any:
@@ -122,16 +122,16 @@ def answering(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any,
     """
     with _copies(question, workers) as pool:
         if pool is None:
-            yield lambda asked: (question.of(*each) for each in asked)
+            yield lambda arguments: (question.of(*each) for each in arguments)
         else:
-            yield lambda asked: map(_as_tensors, pool.map(_answer, map(_as_arrays, asked)))
+            yield lambda arguments: map(_as_tensors, pool.map(_answer, map(_as_arrays, arguments)))
 
 
-def _answer(asked: Any) -> Any:
+def _answer(arguments: Any) -> Any:
     """In a worker: question.of, from arrays to arrays."""
     (question,) = _own
     with torch.no_grad():
-        return _as_arrays(question.of(*_as_tensors(asked)))
+        return _as_arrays(question.of(*_as_tensors(arguments)))
 
 
 def _as_arrays(data: Any) -> Any:
@@ -143,11 +143,11 @@ def _as_tensors(data: Any) -> Any:
 
 
 def _undecided_in_parallel(
-    ask: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
+    run: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
 ) -> Iterator[tuple[Boxes, Tensor]]:
-    """question.undecided of each chunk, by `ask`: a map of _undecided over tuples of the level and arrays of boxes."""
-    asked = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
-    for *parts, axis in ask(asked):
+    """question.undecided of each chunk, by `run`, a map of _undecided over tuples of the level and arrays of boxes."""
+    arguments = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
+    for *parts, axis in run(arguments):
         yield Boxes(*map(torch.from_numpy, parts)), torch.from_numpy(axis)
 
 
@@ -167,9 +167,9 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _undecided(asked: tuple[Any, ...]) -> tuple[Any, ...]:
+def _undecided(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
     """In a worker: question.undecided, from arrays to arrays."""
-    (question,), (level, *parts) = _own, asked
+    (question,), (level, *parts) = _own, arguments
     question.level = level
     boxes, axis = question.undecided(Boxes(*map(torch.from_numpy, parts)))
     return (*(part.numpy() for part in boxes), axis.numpy())

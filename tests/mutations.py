@@ -2,8 +2,8 @@
 
 Each mutation changes one place of one file of the folders of lyapnet (prover, claims, value, loop and task by default),
 drawn at random: a comparison is turned around, a sum becomes a difference, a number grows by a tenth, a minimum becomes
-a maximum, a `not` goes, `and` becomes `or`. The tests of that folder, as they run by default, should then fail. A copy
-of the checkout is mutated, never the checkout itself.
+a maximum, a `not` goes, `and` becomes `or`. The tests of that folder, as they run by default, should then fail; first
+they must pass without a mutation. A copy of the checkout is mutated, never the checkout itself.
 """
 
 import argparse
@@ -14,13 +14,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ["prover", "claims", "value", "loop", "task"]
-SECONDS = 600  # after which tests that do not end have noticed something
+PATIENCE = 3  # tests that take this many times as long as without a mutation have noticed it
 COMPARISONS = {ast.Lt: ast.GtE, ast.LtE: ast.Gt, ast.Gt: ast.LtE, ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq}
 ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
 CALLS = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "sin": "cos", "cos": "sin"}
@@ -72,23 +72,43 @@ def _changed(node: ast.AST) -> str | None:
     return None
 
 
-def is_noticed(mutation: Mutation, copy: Path) -> bool:
-    """Whether the tests of a mutated file's folder fail."""
+def is_noticed(mutation: Mutation, copy: Path, seconds: float) -> bool:
+    """Whether the tests of a mutated file's folder fail, or do not end within the seconds."""
     path = copy / mutation.file
     source = path.read_text(encoding="utf-8")
     lines = source.splitlines(keepends=True)
     lines[mutation.line - 1] = mutation.after + "\n"
     path.write_text("".join(lines), encoding="utf-8")
-    folder = Path(mutation.file).parts[1]
-    tests = ["tests/prover", "tests/claims"] if folder in ("prover", "claims") else [f"tests/{folder}"]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
     try:
-        done = subprocess.run(command, cwd=copy, capture_output=True, timeout=SECONDS, check=False)
-        return done.returncode != 0
+        return failure(tests_of(mutation.file), copy, seconds) is not None
     except subprocess.TimeoutExpired:
         return True
     finally:
         path.write_text(source, encoding="utf-8")
+
+
+def tests_of(file: str) -> tuple[str, ...]:
+    """The folders of tests that should notice a mutation of a file."""
+    folder = Path(file).parts[1]
+    return ("tests/prover", "tests/claims") if folder in ("prover", "claims") else (f"tests/{folder}",)
+
+
+def failure(tests: Sequence[str], copy: Path, seconds: float | None = None) -> str | None:
+    """Run tests in the copy; the line that names the failed test, None if all pass."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *tests]
+    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=seconds, check=False)
+    if not done.returncode:
+        return None
+    lines = [line for line in (done.stdout + done.stderr).splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return lines[-1] if lines else f"exit code {done.returncode}"
+
+
+def baseline(tests: Sequence[str], copy: Path) -> float:
+    """The seconds that tests take in the copy without a mutation; exits if they fail."""
+    begun = time.monotonic()
+    if (line := failure(tests, copy)) is not None:
+        sys.exit(f"Expected {' and '.join(tests)} to pass without a mutation, got {line!r}; correct that first.")
+    return time.monotonic() - begun
 
 
 def main() -> None:
@@ -106,9 +126,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as place:
         copy = Path(place) / "lyapnet"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", "logs", "__pycache__", ".venv", "dist"))
+        seconds = {tests: baseline(tests, copy) for tests in sorted({tests_of(mutation.file) for mutation in drawn})}
         for number, mutation in enumerate(drawn, 1):
             begun = time.monotonic()
-            found = is_noticed(mutation, copy)
+            found = is_noticed(mutation, copy, PATIENCE * seconds[tests_of(mutation.file)])
             noticed += found
             print(
                 f"{number:3} {'noticed' if found else 'MISSED '} {time.monotonic() - begun:4.0f} s  "

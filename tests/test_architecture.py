@@ -135,10 +135,12 @@ def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
 
 @pytest.mark.gate
 def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning():
-    assert "torch" not in loaded("import lyapnet.training.fact, lyapnet.training.stages, lyapnet.experiment.config")
+    assert "torch" not in loaded(
+        "import lyapnet.training.config_facts, lyapnet.training.stage_messages, lyapnet.experiment.config"
+    )
     slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
     assert not slow & loaded(
-        "import lyapnet.experiment.assembly, lyapnet.training.build_learner, lyapnet.training.facts"
+        "import lyapnet.experiment.assembly, lyapnet.training.build_learner, lyapnet.training.task_facts"
     )
 
 

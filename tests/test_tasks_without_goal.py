@@ -16,8 +16,8 @@ from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import ObstacleCost, spread
 from lyapnet.training.learner import Learner
 from lyapnet.training.lost_states import excess
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.stages import silent
+from lyapnet.training.penalty_weight import find_penalty_weight
+from lyapnet.training.stage_messages import silent
 from lyapnet.value.after_horizon import choose_law
 from lyapnet.value.linearisation import Missing, riccati_or_reason
 from tests.fits import shorten_fits
@@ -240,10 +240,10 @@ def test_nothing_holds_a_goal_that_is_not_there():
 
 
 def test_the_price_of_constraints_is_positive_where_costs_are_not(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 4)
+    monkeypatch.setattr("lyapnet.training.penalty_weight.OPTIMA", 4)
     limit = lyapnet.task.constraints.StateLimits([0], [2.2], [1.0], [2.2], ["near"])
     problem = far().replaced(constraints=limit.double()).relaxed()
-    found = find_relaxation(problem, silent)
+    found = find_penalty_weight(problem, silent)
     assert found.kept == 4
     assert found.cost_ratio is None
     assert found.weight > 0

@@ -11,7 +11,7 @@ _FOLDERS = {  # current folder ↦ modules that were outside of it
     "base": "cluster contracts devices drawing errors files findings interpolation linear_algebra machine operators "
     "provenance random_streams shapes sizes tables types",
     "task": "constraints cost domain family horizon operating_points problem sets systems",
-    "value": "after_horizon beyond calculus derivatives expansions linearisation networks policy regulator",
+    "value": "after_horizon calculus derivatives expansions linearisation networks policy regulator",
     "loop": "programs rollout",
     "experiment": "checkpoint config recipe schema",
     "controller": "loading",
@@ -24,10 +24,15 @@ MOVED = {
     **{name: f"{folder}.{name}" for folder, names in _FOLDERS.items() for name in names.split()},
     **{f"graphs.{name}": f"prover.{name}" for name in _BOUNDS.split()},
     **{f"certification.{name}": f"prover.{name}" for name in _SEARCH.split()},
+    "beyond": "value.law_after_horizon",
     "build": "experiment.assembly",
     "certification": "claims",
     "comparison.sweep": "lab.sweep",
     "comparison.tuning": "lab.tuning",
+    "evaluation.afterwards": "evaluation.after_horizon",
+    "evaluation.afterwards_figure": "evaluation.after_horizon_figure",
+    "training.facts": "training.task_facts",
+    "training.relaxation": "training.penalty_weight",
     "zoo.making": "lab.zoo_making",
 }
 """Module name in 0.3 ↦ current name, both without "lyapnet."; submodules move along."""

@@ -34,7 +34,7 @@ def check(
 
     Each fact is printed as soon as it is known; after Ctrl-C those that are known stay.
     """
-    from lyapnet.training.stages import Stages
+    from lyapnet.training.stage_messages import StageMessages
 
     output = Console(highlight=False, markup=False)
     notes = Console(file=sys.stderr, highlight=False, markup=False)
@@ -54,7 +54,7 @@ def check(
 
     if config.is_file() and not as_json:
         output.print(Text(f"{config.name}, before training", "bold"), soft_wrap=True)
-    stages, experiment = Stages(shown, "check"), config.stem
+    stages, experiment = StageMessages(shown, "check"), config.stem
     try:
         with signals_taken(stop), stages:
             stages("reading the task")
@@ -79,7 +79,7 @@ def check(
 def _tell_what_is_written(config: Path, overrides: list[str], known: Any) -> str:
     """Tell the facts that need no torch; the name of the experiment."""
     from lyapnet.experiment.config import outline
-    from lyapnet.training.fact import facts_of_config
+    from lyapnet.training.config_facts import facts_of_config
 
     written = outline(config, overrides)
     for fact in facts_of_config(written):
@@ -96,7 +96,7 @@ def _find_facts(config: Path, overrides: list[str], report: Any, known: Any) -> 
         from lyapnet.experiment.assembly import default_of, parts_of
         from lyapnet.experiment.config import load_config
         from lyapnet.training.build_learner import build_learner, build_problem_to_train
-        from lyapnet.training.facts import facts_of
+        from lyapnet.training.task_facts import facts_of
     finally:
         gc.enable()
     resolved = dataclasses.replace(load_config(config, overrides), seeds=1)

@@ -14,7 +14,7 @@ from rich.console import Console
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.sizes import THREADS
 from lyapnet.cli.options import Debug, stages_of
-from lyapnet.training.stages import Stages, silent
+from lyapnet.training.stage_messages import StageMessages, silent
 
 
 def compare(
@@ -88,7 +88,9 @@ def tell_of_missing_optima(jobs: Sequence[Any], console: Console) -> None:
             console.print(f"{job.task}: cost without its optimum. {reason}", soft_wrap=True)
 
 
-def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console, stages: Stages) -> int:
+def _run(
+    jobs: Sequence[Any], total: int, workers: int, ray: str | None, console: Console, stages: StageMessages
+) -> int:
     """Run the jobs, with a line for each that ends, and in a log one for what runs; how many failed."""
     from lyapnet.lab.comparison.progress import progress
     from lyapnet.lab.comparison.workers import run_jobs
@@ -104,7 +106,9 @@ def _run(jobs: Sequence[Any], total: int, workers: int, ray: str | None, console
     return failed
 
 
-def _report(config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console, stages: Stages) -> None:
+def _report(
+    config: Any, chosen: Sequence[Any], command: Sequence[str], console: Console, stages: StageMessages
+) -> None:
     """Write and show what all finished jobs say, those beyond the config's number of seeds included."""
     from lyapnet.base.tables import terminal
     from lyapnet.lab.comparison.execution import controllers_of

@@ -13,7 +13,7 @@ from lyapnet.cli.options import Debug, Given, of_a_controller
 
 if TYPE_CHECKING:
     from lyapnet.controller.controller import Controller
-    from lyapnet.evaluation.afterwards import Afterwards
+    from lyapnet.evaluation.after_horizon import LoopsAfterHorizon
     from lyapnet.evaluation.measurement import Evaluation
 
 
@@ -43,7 +43,7 @@ def evaluate(
     The optimum of a linear task is Riccati's; that of any other takes CasADi, the extra oracle, and is computed
     once for each state: the next evaluation of any controller of the task reads it.
     """
-    from lyapnet.evaluation.afterwards import afterwards, check_multiple, in_plain_data
+    from lyapnet.evaluation.after_horizon import check_multiple, in_plain_data, loops_after_horizon
     from lyapnet.evaluation.measurement import evaluation
     from lyapnet.evaluation.robustness import robustness
     from lyapnet.evaluation.tables import evaluation_table
@@ -69,7 +69,7 @@ def evaluate(
     later = []
     if until is not None:
         report(f"closed loops up to {until:g} T")
-        later = afterwards(controller, measured.table.x0[:count], until)
+        later = loops_after_horizon(controller, measured.table.x0[:count], until)
         result["afterwards"] = in_plain_data(later, controller, until)
     report.rest()
     if as_json:
@@ -89,20 +89,22 @@ def evaluate(
 def _print_further_tables(result: dict[str, Any], controller: "Controller", count: int) -> None:
     """What was asked for besides, from `count` states."""
     from lyapnet.evaluation.robustness import nominal
-    from lyapnet.evaluation.tables import afterwards_table, robustness_table
+    from lyapnet.evaluation.tables import after_horizon_table, robustness_table
 
     console = Console(highlight=False, markup=False)
     if "robustness" in result:
         member = nominal(controller) if controller.system.constants else {}
         console.print(robustness_table(result["robustness"], count, member))
     if "afterwards" in result:
-        console.print(afterwards_table(result["afterwards"], count))
+        console.print(after_horizon_table(result["afterwards"], count))
 
 
-def _write_figures(folder: Path, controller: "Controller", measured: "Evaluation", later: "list[Afterwards]") -> str:
+def _write_figures(
+    folder: Path, controller: "Controller", measured: "Evaluation", later: "list[LoopsAfterHorizon]"
+) -> str:
     """Draw closed loops, V, and cost and V(0, x₀) against the optimum where that is known; what became of it."""
     from lyapnet.evaluation import figures
-    from lyapnet.evaluation.afterwards_figure import distances
+    from lyapnet.evaluation.after_horizon_figure import distances
     from lyapnet.evaluation.noise_figure import bands, states_to_draw
     from lyapnet.evaluation.path_figure import has_plane, paths
 

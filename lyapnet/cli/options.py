@@ -15,7 +15,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.claim import check_number, flag_of, kind_of_number
-from lyapnet.training.stages import PATIENCE, Stages
+from lyapnet.training.stage_messages import PATIENCE, StageMessages
 
 FIRST = 1.0  # seconds after which a command says what it is doing
 
@@ -40,7 +40,7 @@ class Given:
     checkpoint: Path
     own: dict[str, str | None]  # the user's own parts, as module:Class, each by its option's name
     at: list[str] | None
-    report: Stages  # is told what is being done
+    report: StageMessages  # is told what is being done
     functions: tuple[Path, Path] | None = None  # ONNX files of V and u made elsewhere; the checkpoint is a config then
 
     @property
@@ -103,12 +103,12 @@ class Given:
         return member_of(controller, self.at) if self.at else controller
 
 
-def stages_of(name: str) -> Stages:
+def stages_of(name: str) -> StageMessages:
     """What tells on stderr what a command is doing, from before torch is imported; what is quickly done is not told.
 
     It keeps to the stderr of the command, which an oracle hides from others while it searches.
     """
-    return Stages(Console(file=sys.stderr, highlight=False, markup=False), name, PATIENCE, FIRST)
+    return StageMessages(Console(file=sys.stderr, highlight=False, markup=False), name, PATIENCE, FIRST)
 
 
 def of_a_controller(command: Callable[..., None]) -> Callable[..., None]:

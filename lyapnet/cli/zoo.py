@@ -60,7 +60,7 @@ def demo(
 
         from lyapnet.claims.certify import certify
         from lyapnet.claims.kinds import Statistical
-        from lyapnet.evaluation.afterwards import share_at_goal
+        from lyapnet.evaluation.after_horizon import share_at_goal
         from lyapnet.evaluation.animation import Film
         from lyapnet.evaluation.figures import trajectories
         from lyapnet.value.after_horizon import HELD

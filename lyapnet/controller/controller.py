@@ -26,8 +26,8 @@ from lyapnet.task.sets import Box, ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.after_horizon import AfterHorizon, choose_law
 from lyapnet.value.at_parameters import AtParameters
-from lyapnet.value.beyond import ContinuedPolicy, LaterPolicy, slack
 from lyapnet.value.calculus import ValueFunction
+from lyapnet.value.law_after_horizon import ContinuedPolicy, LaterPolicy, slack
 from lyapnet.value.policy import HJBPolicy, ValuePolicy, gain_over_step, known_law
 
 MAX_LAW_DIFFERENCE = 0.2  # relative difference of V's HJB and sampled law without a note; about 1 % of the cost

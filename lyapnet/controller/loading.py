@@ -29,7 +29,7 @@ from lyapnet.task.sets import ControlSet
 from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.after_horizon import REMEDY, from_plain
 from lyapnet.value.calculus import ValueFunction
-from lyapnet.value.linearisation import rounded
+from lyapnet.value.linearisation import smooth_kinks
 
 
 def load(
@@ -76,7 +76,7 @@ def _controller_of(
 ) -> Controller:
     """The controller from the content of a checkpoint."""
     problem = build_problem(config, parts)
-    V = build_value_function(config, rounded(problem), parts.network)
+    V = build_value_function(config, smooth_kinks(problem), parts.network)
     load_value_function(V, content, path)
     problem.check_value_function(V)
     after_horizon = from_plain(content[KEY].get(AFTER_HORIZON))

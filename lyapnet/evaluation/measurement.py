@@ -15,7 +15,7 @@ from lyapnet.base.sizes import require_memory, size_of_loops
 from lyapnet.base.tables import csv_text
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
-from lyapnet.evaluation.afterwards import share_at_goal
+from lyapnet.evaluation.after_horizon import share_at_goal
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant

@@ -143,8 +143,8 @@ def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[s
     return table
 
 
-def afterwards_table(rows: list[dict[str, Any]], samples: int) -> Table:
-    """The table of distances after T under each law, from afterwards.in_plain_data."""
+def after_horizon_table(rows: list[dict[str, Any]], samples: int) -> Table:
+    """The table of distances after T under each law, from after_horizon.in_plain_data."""
     columns = [Column(f"at {at['time']:g} s", justify="right") for at in rows[0]["distances"]]
     table = Table("beyond", *columns, title=f"what follows T: mean ‖x − x*‖ of {samples} closed loops")
     for row in rows:

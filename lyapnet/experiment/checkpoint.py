@@ -117,7 +117,7 @@ def _is_as_written(path: Path, content: dict[str, Any], digest: Any) -> bool:
         with zipfile.ZipFile(path) as archive:
             # torch reads an entry that is marked as a folder as empty, and uses uninitialised memory for its tensor
             intact = archive.testzip() is None and not any(entry.external_attr for entry in archive.infolist())
-    except Exception:  # the file may be hostile
+    except (*UNREADABLE, OSError):  # a hostile file, which torch or zipfile cannot read to the end
         return False
     _note_missing_digest(path)
     return intact

@@ -13,7 +13,7 @@ from omegaconf import MISSING, OmegaConf
 
 from lyapnet.base.sizes import THREADS, check_sizes
 from lyapnet.experiment.recipe import STANDARD, with_recipe
-from lyapnet.experiment.schema import Names, check_values, checked, differences, option, read_yaml
+from lyapnet.experiment.schema import Names, check_values, checked, differences, read_yaml, setting
 
 # names of registered classes, loaded lazily: a misspelt key is reported without loading torch
 CONSTRAINTS = Names("task.constraints", "CONSTRAINTS")
@@ -34,42 +34,42 @@ LOGGERS = ("tensorboard", "csv", "wandb", "mlflow")  # csv: metrics.csv, which e
 class ProgramConfig:
     """The program, which is minimised; see Program for the loss and its units."""
 
-    name: str = option(
+    name: str = setting(
         MISSING,
         "A registered program, or module:Class of your own.",
         choices=PROGRAMS,
         user_class=True,
     )
-    constraint: float = option(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
-    terminal: float = option(0.0, "Weight of the condition on V at t = T.", at_least=0)
-    trajectory_cost: float = option(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
-    normalise: bool = option(True, "Divide the terms by the batch's mean cost; false for the paper's sums.")
-    cost_to_go: float | None = option(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
-    relative: bool | None = option(
+    constraint: float = setting(1.0, "Weight of the residual (value) or of the hinge (lyapunov).", at_least=0)
+    terminal: float = setting(0.0, "Weight of the condition on V at t = T.", at_least=0)
+    trajectory_cost: float = setting(0.0, "Weight of the cost of the closed loop itself.", at_least=0)
+    normalise: bool = setting(True, "Divide the terms by the batch's mean cost; false for the paper's sums.")
+    cost_to_go: float | None = setting(None, "Weight of V's distance from the cost to go (value only).", at_least=0)
+    relative: bool | None = setting(
         None, "Divide that distance by the cost of each trajectory, not by their mean (value only)."
     )
-    margin: float | None = option(None, "Reserve of the hinge, as a share of ℓ (lyapunov only).", at_least=0)
-    bound: float | None = option(None, "Weight of V(0, x₀), the upper bound of the cost (lyapunov only).", at_least=0)
-    share: float | None = option(None, "Smallest decrease of V, as a share of ℓ (region only).", above=0)
-    growth: float | None = option(None, "Weight of the share of D outside the region (region only).", at_least=0)
-    parameters: dict[str, Any] = option({}, "Further arguments of a program of your own.")
+    margin: float | None = setting(None, "Reserve of the hinge, as a share of ℓ (lyapunov only).", at_least=0)
+    bound: float | None = setting(None, "Weight of V(0, x₀), the upper bound of the cost (lyapunov only).", at_least=0)
+    share: float | None = setting(None, "Smallest decrease of V, as a share of ℓ (region only).", above=0)
+    growth: float | None = setting(None, "Weight of the share of D outside the region (region only).", at_least=0)
+    parameters: dict[str, Any] = setting({}, "Further arguments of a program of your own.")
 
 
 @dataclass
 class PointwiseConfig:
     """The program's condition at points off the closed loops; see PointwiseCondition."""
 
-    weight: float | None = option(
+    weight: float | None = setting(
         None, "Weight of the condition at points of [0, T] × D; null: 0, with the region program 5.", at_least=0
     )
-    points: int = option(512, "Points in each step.", at_least=2)
-    region: list[float] | None = option(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
-    floor: float | None = option(
+    points: int = setting(512, "Points in each step.", at_least=2)
+    region: list[float] | None = setting(None, "D, a bound of each |x_i − x*_i|; null: 1.5 times that of X₀.", above=0)
+    floor: float | None = setting(
         None,
         "ℓ₀ and φ₀ of it as shares of J̄/T and J̄; null: 0.01, of a stationary V 1e-4.",
         above=0,
     )
-    counterexamples: str | None = option(
+    counterexamples: str | None = setting(
         None, "A CSV file of further points, a row t, x_1, …, x_n each, as certify --refine writes it."
     )
 
@@ -78,58 +78,58 @@ class PointwiseConfig:
 class SystemConfig:
     """The dynamics ẋ = f(x) + g(x)u."""
 
-    name: str = option(
+    name: str = setting(
         MISSING,
         "A registered system, or module:Class of your own.",
         choices=SYSTEMS,
         user_class=True,
     )
-    parameters: dict[str, Any] = option({}, "Arguments of its constructor, in SI units.")
+    parameters: dict[str, Any] = setting({}, "Arguments of its constructor, in SI units.")
 
 
 @dataclass
 class CostConfig:
     """ℓ = xᵀQx + uᵀR(x)u and φ = xᵀQ_T x; a flat list is a diagonal (one number: repeated), rows are a matrix."""
 
-    name: str = option("quadratic", "quadratic, or module:Class of your own.", choices=COSTS, user_class=True)
-    Q: Any = option(None, "State weight, symmetric positive semidefinite.")
-    R: Any = option(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
-    Q_T: Any = option(None, "Terminal weight, symmetric positive semidefinite.")
-    periodic: list[str] = option([], "Names of angles δ for which 2(1 − cos δ) replaces δ².")
-    huber: float | None = option(
+    name: str = setting("quadratic", "quadratic, or module:Class of your own.", choices=COSTS, user_class=True)
+    Q: Any = setting(None, "State weight, symmetric positive semidefinite.")
+    R: Any = setting(None, "Control weight, symmetric positive definite, or inverse_mass for BᵀM(q)⁻¹B.")
+    Q_T: Any = setting(None, "Terminal weight, symmetric positive semidefinite.")
+    periodic: list[str] = setting([], "Names of angles δ for which 2(1 − cos δ) replaces δ².")
+    huber: float | None = setting(
         None, "δ: 2δ²(√(1 + q/δ²) − 1) replaces q, and likewise φ, for less growth far away.", above=0
     )
-    obstacles: list[dict[str, Any]] = option([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
-    parameters: dict[str, Any] = option({}, "Arguments of the constructor of a cost of your own.")
+    obstacles: list[dict[str, Any]] = setting([], "Bumps, each as {center: {state: …}, radius: …, weight: …}.")
+    parameters: dict[str, Any] = setting({}, "Arguments of the constructor of a cost of your own.")
 
 
 @dataclass
 class ControlsConfig:
     """U, the admissible controls: all, those between limits, or a set of the user's own."""
 
-    lower: Any = option(None, "Least controls: a number, or one for each; null: no limit.")
-    upper: Any = option(None, "Greatest controls, likewise.")
-    name: str = option(
+    lower: Any = setting(None, "Least controls: a number, or one for each; null: no limit.")
+    upper: Any = setting(None, "Greatest controls, likewise.")
+    name: str = setting(
         "unbounded", "A registered control set, or module:Class of your own.", choices=CONTROL_SETS,
         user_class=True,
     )  # fmt: skip
-    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
+    parameters: dict[str, Any] = setting({}, "Arguments of its constructor.")
 
 
 @dataclass
 class ConstraintsConfig:
     """h(x) ≤ 0, the states that closed loops may enter: limits of states, balls, or a class of the user's own."""
 
-    lower: dict[str, float] = option({}, "Least values of states, by name.")
-    upper: dict[str, float] = option({}, "Greatest values, likewise.")
-    outside: list[dict[str, Any]] = option([], "Balls to stay out of, each as {center: {state: …}, radius: …}.")
-    inside: list[dict[str, Any]] = option([], "Balls to stay in, likewise.")
-    name: str = option(
+    lower: dict[str, float] = setting({}, "Least values of states, by name.")
+    upper: dict[str, float] = setting({}, "Greatest values, likewise.")
+    outside: list[dict[str, Any]] = setting([], "Balls to stay out of, each as {center: {state: …}, radius: …}.")
+    inside: list[dict[str, Any]] = setting([], "Balls to stay in, likewise.")
+    name: str = setting(
         "listed", "listed: those above; or module:Class of your own, besides.", choices=CONSTRAINTS,
         user_class=True,
     )  # fmt: skip
-    parameters: dict[str, Any] = option({}, "Arguments of its constructor.")
-    margin: float | None = option(
+    parameters: dict[str, Any] = setting({}, "Arguments of its constructor.")
+    margin: float | None = setting(
         None,
         "Margin of h within which training adds a penalty; null: 0.02, or 0.002 if u acts on h directly and "
         "network.penalty is true.",
@@ -141,131 +141,133 @@ class ConstraintsConfig:
 class DomainConfig:
     """Declared borders of f, g, q and φ, in addition to those found by a search; limits to keep are in constraints."""
 
-    lower: dict[str, float] = option({}, "Borders below, of states by name.")
-    upper: dict[str, float] = option({}, "Borders above, likewise.")
+    lower: dict[str, float] = setting({}, "Borders below, of states by name.")
+    upper: dict[str, float] = setting({}, "Borders above, likewise.")
 
 
 @dataclass
 class InitialStatesConfig:
     """X₀, the box of initial states; a single number is a bound for every state."""
 
-    lower: list[float] = option(MISSING, "Lower bounds, one for each state.")
-    upper: list[float] = option(MISSING, "Upper bounds, one for each state.")
+    lower: list[float] = setting(MISSING, "Lower bounds, one for each state.")
+    upper: list[float] = setting(MISSING, "Upper bounds, one for each state.")
 
 
 @dataclass
 class HorizonConfig:
     """N steps of Δt."""
 
-    steps: int = option(MISSING, "N, the number of time steps.", at_least=1)
-    dt: float = option(0.01, "Δt in seconds.", above=0)
-    stationary: bool = option(False, "A task without end: V(x), and the regulator's cost as φ.")
+    steps: int = setting(MISSING, "N, the number of time steps.", at_least=1)
+    dt: float = setting(0.01, "Δt in seconds.", above=0)
+    stationary: bool = setting(False, "A task without end: V(x), and the regulator's cost as φ.")
 
 
 @dataclass
 class NetworkConfig:
     """V(t, x). Fields with null use the network's default."""
 
-    name: str = option(
+    name: str = setting(
         "expansion",
         "A registered network, or module:Class of your own.",
         choices=NETWORKS,
         user_class=True,
     )
-    hidden: list[int] | None = option(None, "Widths of the hidden layers.", at_least=1)
-    activation: str | None = option(None, "A smooth activation.", choices=ACTIVATIONS)
-    ignored_states: list[str] = option([], "Names of states on which V does not depend.")
-    embed_angles: bool = option(False, "Join sin θ and cos θ of the system's angles to the inputs.")
-    epsilon: float | None = option(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
-    smooth: bool | None = option(None, "Smooth in time, for sound certificates (expansion).")
-    penalty: bool = option(False, "Add the known constraint penalty of one step to N.")
-    terminal: str = option("free", "exact: V(T, ·) = φ by construction.", choices=("free", "exact"))
-    state_scale: list[float] | None = option(
+    hidden: list[int] | None = setting(None, "Widths of the hidden layers.", at_least=1)
+    activation: str | None = setting(None, "A smooth activation.", choices=ACTIVATIONS)
+    ignored_states: list[str] = setting([], "Names of states on which V does not depend.")
+    embed_angles: bool = setting(False, "Join sin θ and cos θ of the system's angles to the inputs.")
+    epsilon: float | None = setting(None, "ε of the term ε‖x‖² (icnn, anchored).", above=0)
+    smooth: bool | None = setting(None, "Smooth in time, for sound certificates (expansion).")
+    penalty: bool = setting(False, "Add the known constraint penalty of one step to N.")
+    terminal: str = setting("free", "exact: V(T, ·) = φ by construction.", choices=("free", "exact"))
+    state_scale: list[float] | None = setting(
         None, "Expected |x − x*|; null: the extent of X₀, 1 where it has none.", above=0
     )
-    value_scale: float | None = option(None, "Expected V; null: φ at the state scale.", above=0)
+    value_scale: float | None = setting(None, "Expected V; null: φ at the state scale.", above=0)
 
 
 @dataclass
 class RolloutConfig:
     """How the closed loop is integrated and differentiated; see Rollout."""
 
-    policy: str = option("hjb", "The control law that V defines.", choices=POLICIES)
-    choose_policy: bool = option(
+    policy: str = setting("hjb", "The control law that V defines.", choices=POLICIES)
+    choose_policy: bool = setting(
         False, "Use lookahead instead, if the search for an initial V finds that it costs much less."
     )
-    method: str = option("euler", "The integrator.", choices=METHODS)
-    gradient: str = option("adjoint", "How the gradient is computed.", choices=GRADIENTS)
-    compile: str = option("auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH)
-    costate_limit: float | None = option(
+    method: str = setting("euler", "The integrator.", choices=METHODS)
+    gradient: str = setting("adjoint", "How the gradient is computed.", choices=GRADIENTS)
+    compile: str = setting(
+        "auto", "Run gradient discrete as machine code, where it can: auto, on; off.", choices=SWITCH
+    )
+    costate_limit: float | None = setting(
         None,
         "Largest length of a costate relative to its batch's median, with gradient discrete; null: no limit.",
         at_least=1,
     )
-    rtol: float = option(1e-6, "Relative tolerance of an adaptive method.", above=0)
-    atol: float = option(1e-8, "Absolute tolerance of an adaptive method.", above=0)
+    rtol: float = setting(1e-6, "Relative tolerance of an adaptive method.", above=0)
+    atol: float = setting(1e-8, "Absolute tolerance of an adaptive method.", above=0)
 
 
 @dataclass
 class TrainingConfig:
     """The optimisation."""
 
-    iterations: int = option(200, "Gradient steps.", at_least=1, below=10**12)
-    batch_size: int = option(64, "Initial states in each step, per process.", at_least=1)
-    optimizer: str = option(
+    iterations: int = setting(200, "Gradient steps.", at_least=1, below=10**12)
+    batch_size: int = setting(64, "Initial states in each step, per process.", at_least=1)
+    optimizer: str = setting(
         "adam",
         "adam, adamw with decoupled weight decay, or muon for the matrices of V and adamw for the rest.",
         choices=("adam", "adamw", "muon"),
     )
-    learning_rate: float = option(1e-2, "Greatest step size: at the start, or after the warmup.", above=0)
-    final_learning_rate: float = option(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
-    warmup: int = option(0, "Steps in which the learning rate rises to its greatest, linearly.", at_least=0)
-    beta1: float = option(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
-    beta2: float = option(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
-    weight_decay: float = option(0.0, "AdamW weight decay.", at_least=0)
-    precision: str = option("float64", "Floating-point type of everything.", choices=("float64", "float32"))
-    threads: int = option(
+    learning_rate: float = setting(1e-2, "Greatest step size: at the start, or after the warmup.", above=0)
+    final_learning_rate: float = setting(1e-4, "Step size at the end of a cosine schedule.", at_least=0)
+    warmup: int = setting(0, "Steps in which the learning rate rises to its greatest, linearly.", at_least=0)
+    beta1: float = setting(0.9, "Adam's averaging of the gradient.", at_least=0, below=1)
+    beta2: float = setting(0.99, "Adam's averaging of the squared gradient.", at_least=0, below=1)
+    weight_decay: float = setting(0.0, "AdamW weight decay.", at_least=0)
+    precision: str = setting("float64", "Floating-point type of everything.", choices=("float64", "float32"))
+    threads: int = setting(
         1,
         "CPU threads; in networks this small, more of them mostly wait for each other.",
         at_least=1,
         below=THREADS + 1,
     )
-    lost_share: float = option(
+    lost_share: float = setting(
         0.0,
         "Largest share of a batch drawn from lost states, whose closed loop costs more than V predicts.",
         at_least=0,
         below=1,
     )
-    least_gain: float = option(
+    least_gain: float = setting(
         0.0,
         "Early stopping if the validation loss falls by less than this in 40 steps; 0: take all iterations.",
         at_least=0,
     )
-    validate_every: int = option(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
+    validate_every: int = setting(10, "Steps between validations, each followed by a checkpoint.", at_least=1)
 
 
 @dataclass
 class EvaluationConfig:
     """Measurements on states that training does not use."""
 
-    validation_states: int = option(64, "Initial states in each validation.", at_least=1)
-    test_states: int = option(256, "Initial states of the evaluation at the end of training.", at_least=1)
-    optimum: bool = option(True, "Compare with the optimum, where there is an oracle.")
-    figures_every: int = option(5, "Validations between figures; the last one always draws.", at_least=1)
-    animate: bool = option(True, "Show closed loops in motion in TensorBoard, after the last step.")
-    certify_every: int = option(0, "Validations between statistical bounds; 0 for none.", at_least=0)
-    certified_states: int = option(1000, "Fresh states for each such bound.", at_least=1)
-    confidence: float = option(1 - 1e-6, "Confidence of each such bound by itself.", above=0, below=1)
+    validation_states: int = setting(64, "Initial states in each validation.", at_least=1)
+    test_states: int = setting(256, "Initial states of the evaluation at the end of training.", at_least=1)
+    optimum: bool = setting(True, "Compare with the optimum, where there is an oracle.")
+    figures_every: int = setting(5, "Validations between figures; the last one always draws.", at_least=1)
+    animate: bool = setting(True, "Show closed loops in motion in TensorBoard, after the last step.")
+    certify_every: int = setting(0, "Validations between statistical bounds; 0 for none.", at_least=0)
+    certified_states: int = setting(1000, "Fresh states for each such bound.", at_least=1)
+    confidence: float = setting(1 - 1e-6, "Confidence of each such bound by itself.", above=0, below=1)
 
 
 @dataclass
 class Config:
     """One experiment."""
 
-    experiment: str = option(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
-    logs: str = option("logs", "The folder of all runs.")
-    seed: int = option(0, "Seed of the weights and of every draw of states.", at_least=0, below=2**63)
-    seeds: int = option(1, "Runs trained side by side, with the seeds seed, seed + 1, …", at_least=1)
+    experiment: str = setting(MISSING, "Its name: runs go to <logs>/<experiment>/version_<k>.", folder=True)
+    logs: str = setting("logs", "The folder of all runs.")
+    seed: int = setting(0, "Seed of the weights and of every draw of states.", at_least=0, below=2**63)
+    seeds: int = setting(1, "Runs trained side by side, with the seeds seed, seed + 1, …", at_least=1)
     program: ProgramConfig = field(default_factory=ProgramConfig)
     pointwise: PointwiseConfig = field(default_factory=PointwiseConfig)
     system: SystemConfig = field(default_factory=SystemConfig)
@@ -275,25 +277,25 @@ class Config:
     domain: DomainConfig = field(default_factory=DomainConfig)
     initial_states: InitialStatesConfig = field(default_factory=InitialStatesConfig)
     horizon: HorizonConfig = field(default_factory=HorizonConfig)
-    target: Any = option(
+    target: Any = setting(
         None, "x*, the goal of the cost: a list, or {state: value} with the others solved for; null: the cost's own.",
         mapping=True,
     )  # fmt: skip
-    target_control: list[float] | None = option(
+    target_control: list[float] | None = setting(
         None, "u*, the control at rest; null: the control that holds x*, f(x*) + g(x*)u* = 0."
     )
-    family: dict[str, list[float]] = option(
+    family: dict[str, list[float]] = setting(
         {}, "Ranges of parameters in V: of the system, and target_STATE; each as [least, greatest]."
     )
-    noise: dict[str, float] = option(
+    noise: dict[str, float] = setting(
         {}, "σ of states that noise drives, each as STATE: σ in its unit per √s; see the page on noise.", at_least=0
     )
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    trainer: dict[str, Any] = option({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
-    loggers: list[str] = option(["tensorboard"], "Loggers of curves besides metrics.csv.", choices=LOGGERS)
-    callbacks: list[str] = option([], "Lightning callbacks of your own, each as module:Class.")
+    trainer: dict[str, Any] = setting({}, "Passed to lightning.Trainer: accelerator, devices, gradient_clip_val, …")
+    loggers: list[str] = setting(["tensorboard"], "Loggers of curves besides metrics.csv.", choices=LOGGERS)
+    callbacks: list[str] = setting([], "Lightning callbacks of your own, each as module:Class.")
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
 
 

@@ -40,7 +40,7 @@ class Names(Sequence[str]):
         return len(self._names)
 
 
-def option(
+def setting(
     default: Any,
     doc: str,
     *,

@@ -57,13 +57,13 @@ def make(name: str, trained: Path, folder: Path = ZOO) -> dict[str, Any]:
     kept, checkpoint = {**known, "config": config}, folder / f"{name}.ckpt"
     slim = {"state_dict": content["state_dict"], "global_step": content["global_step"], KEY: kept}
     write_checkpoint(slim, checkpoint)
-    afterwards = choose_law_after(checkpoint)
+    after_horizon = choose_law_after(checkpoint)
     record = {
         "command": shlex.join(["lyapnet", "train", "--config", *TASKS[name]]),
         "seed": config["seed"],
         **_origin(trained),
         **_measurements(load(checkpoint), checkpoint),
-        "afterwards": afterwards,
+        "afterwards": after_horizon,
         "seconds": round(time.monotonic() - began),
     }
     write_json(folder / f"{name}.json", record)
@@ -144,8 +144,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in given.names or TASKS:
         if given.after:
             path = given.out / f"{name}.json"
-            afterwards = choose_law_after(given.out / f"{name}.ckpt")
-            write_json(path, {**read_json(path, "make it first"), "afterwards": afterwards})
+            after_horizon = choose_law_after(given.out / f"{name}.ckpt")
+            write_json(path, {**read_json(path, "make it first"), "afterwards": after_horizon})
             continue
         with tempfile.TemporaryDirectory() as logs:
             record = make(name, given.trained or train(name, Path(logs)), given.out)

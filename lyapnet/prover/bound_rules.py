@@ -1,4 +1,4 @@
-"""Rules for bounds: what each operator of a graph does with Taylor forms."""
+"""Rules for bounds: the Taylor form that encloses the result of each operator of a graph."""
 
 import math
 import operator
@@ -23,7 +23,7 @@ aten = torch.ops.aten
 
 Rule = Callable[..., Any]
 RULES: dict[Any, Rule] = {**KINKS, **JUMPS, **CHOICES, **LINEAR_SYSTEMS}
-"""Operator ↦ its rule: the operator's arguments, some of them Taylor forms, ↦ a Taylor form, or a tensor."""
+"""Operator ↦ its rule: a function of its arguments, some of them Taylor forms, that returns a form or a tensor."""
 
 
 def rule(*operators: Any) -> Callable[[Rule], Rule]:
@@ -57,7 +57,7 @@ def _subtract(x: Any, y: Any, alpha: float = 1) -> TaylorForm:
 
 @rule(aten.mul.Tensor, aten.mul.Scalar)
 def _multiply(x: Any, y: Any) -> TaylorForm:
-    """x · y; a square where both are one value."""
+    """x · y; x² if both are the same form."""
     if x is y:
         return functions.square(x)
     if isinstance(x, TaylorForm) and isinstance(y, TaylorForm):
@@ -70,12 +70,12 @@ def _divide(x: Any, y: Any) -> TaylorForm:
     """x · (1/y)."""
     if isinstance(y, TaylorForm):
         return _multiply(x, functions.reciprocal(y))
-    return taylor.scale(x, 1 / _tensor(y)).rounded()
+    return taylor.scale(x, 1 / _tensor(y)).with_rounding()
 
 
 @rule(aten.mm.default, aten.bmm.default)
 def _matrix_product(x: Any, y: Any) -> TaylorForm:
-    """xy of matrices: by the rule of linear maps where one is constant, else entry by entry, Σ_j x_ij y_jk."""
+    """xy of matrices: a linear map if one is constant, else Σ_j x_ij y_jk, entry by entry."""
     if not isinstance(x, TaylorForm):
         return _transposed(_matrix_product(_transposed(y), x.mT))
     if not isinstance(y, TaylorForm) and y.ndim == 2:
@@ -92,7 +92,7 @@ def _matrix_vector_product(x: Any, y: Any) -> TaylorForm:
 
 @rule(aten._to_copy.default)
 def _to_copy(x: TaylorForm, **keywords: Any) -> TaylorForm:
-    """x: truths as numbers; the gate refuses any dtype but float64."""
+    """x, since truth values are numbers already; lyapnet.prover.bounds refuses all dtypes but float64."""
     return x
 
 
@@ -104,8 +104,8 @@ def _negate(x: TaylorForm) -> TaylorForm:
 
 @rule(aten.sum.default, aten.sum.dim_IntList)
 def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False, dtype: Any = None) -> TaylorForm:
-    """Σ x over some axes; remainders add."""
-    x, rank = x.rounded(x.shape.numel()), len(x.shape)
+    """Σ x over some axes: the terms add, and so do the remainders, since |Σ η_i| ≤ Σ r_i."""
+    x, rank = x.with_rounding(x.shape.numel()), len(x.shape)
     if not rank:
         return x
     axes = [axis % rank for axis in dim or range(rank)]
@@ -118,11 +118,14 @@ def _sum(x: TaylorForm, dim: Sequence[int] | None = None, keepdim: bool = False,
 
 @rule(ROUNDED)
 def _rounded(y: Any, at: Any, relative: float, absolute: float, largest: float) -> TaylorForm:
-    """y (1 + θ) + η; nothing is known where y may exceed the largest number."""
+    """y (1 + θ) + η with |θ| ≤ relative, |η| ≤ absolute: r grows by relative · |y| + absolute.
+
+    r is infinite where |y| may exceed the largest number of the other arithmetic.
+    """
     y = y if isinstance(y, TaylorForm) else taylor.constant_form(_tensor(y), at)
-    size = y.magnitude * (1 + 1e-9)  # for the rounding of these lines
+    size = y.magnitude * (1 + 1e-9)  # the factor covers the rounding of this line and the next
     radius = y.radius + (relative * size + absolute) * (1 + 1e-9)
-    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).rounded()
+    return y.with_parts(y.terms, torch.where(size <= largest, radius, torch.inf)).with_rounding()
 
 
 # Functions of one number
@@ -132,41 +135,41 @@ RULES.update({getattr(aten, name).default: function for name, function in functi
 
 @rule(aten.tanh.default)
 def _tanh(x: TaylorForm) -> TaylorForm:
-    """tanh x = 2σ(2x) − 1; with powers of two no rounding is added."""
+    """tanh x = 2σ(2x) − 1; the product 2x is exact."""
     double = x.with_parts(2 * x.terms, 2 * x.radius)
     return _subtract(_multiply(functions.sigmoid(double), 2.0), 1.0)
 
 
 @rule(aten.softplus.default)
 def _softplus(x: TaylorForm, beta: float = 1, threshold: float = 20) -> TaylorForm:
-    """log(1 + e^{βx})/β, and x where βx exceeds torch's threshold, which is off by at most e^{−threshold}/|β|."""
+    """log(1 + e^{βx})/β. Where βx exceeds the threshold, torch returns x, off by at most e^{−threshold}/|β|."""
     y = _multiply(x, beta) if beta != 1 else x
-    return _loosened_above(_divide(functions.softplus(y), beta), y, threshold, 1 / abs(beta))
+    return _widened_above(_divide(functions.softplus(y), beta), y, threshold, 1 / abs(beta))
 
 
 @rule(aten.softplus_backward.default)
 def _softplus_backward(gradient: Any, x: TaylorForm, beta: float, threshold: float) -> TaylorForm:
-    """gradient · σ(βx), and gradient · 1 above the threshold, which differ by at most e^{−threshold}."""
+    """gradient · σ(βx). Where βx exceeds the threshold, torch uses 1 for σ, which differs by at most e^{−threshold}."""
     y = _multiply(x, beta) if beta != 1 else x
-    return _multiply(gradient, _loosened_above(functions.sigmoid(y), y, threshold, 1.0))
+    return _multiply(gradient, _widened_above(functions.sigmoid(y), y, threshold, 1.0))
 
 
-def _loosened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
-    """The form with room for factor · e^{−threshold}, and its rounding, where y may exceed the threshold."""
+def _widened_above(smooth: TaylorForm, y: TaylorForm, threshold: float, factor: float) -> TaylorForm:
+    """The form with r + factor · e^{−threshold} (and its rounding) on boxes where y may exceed the threshold."""
     room = factor * (1.001 * torch.exp(-_tensor(threshold)) + taylor.TINY)
     return smooth.with_parts(smooth.terms, smooth.radius + torch.where(y.interval()[1] > threshold, room, 0.0))
 
 
-# Arrangements: entries copied, moved or left out, without arithmetic
+# Arrangements: operators that copy, move or leave out entries, without arithmetic
 
 
 def _arranging(function: Callable[..., Any]) -> Rule:
-    """The rule of an operator that only arranges entries: c, A_k and r are arranged alike."""
+    """The rule of an operator that only arranges entries: it arranges the terms and r in the same way."""
     return lambda *arguments, **keywords: _rearranged(function, *arguments, **keywords)
 
 
 def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) -> Any:
-    """The operator on c and on each A_k of its arguments, in one call, and on their r."""
+    """Apply the operator to all terms of the forms among its arguments, and to their r."""
     leaves, structure = tree_flatten((arguments, keywords), is_leaf=lambda leaf: isinstance(leaf, TaylorForm))
     forms = [leaf for leaf in leaves if isinstance(leaf, TaylorForm)]
 
@@ -186,7 +189,7 @@ def _rearranged(function: Callable[..., Any], *arguments: Any, **keywords: Any) 
 
 
 def _along(function: Callable[..., Any], new: int = 0) -> Rule:
-    """As _arranging, of an operator that takes an axis and may add one: without the detour through vmap."""
+    """Like _arranging, but faster: for an operator of one axis, which adds `new` axes."""
 
     def arrange(x: TaylorForm, dim: int = 0, *rest: Any) -> TaylorForm:
         axis = dim % (len(x.shape) + new)
@@ -201,7 +204,7 @@ def _expand(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
 
 
 def _view(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
-    if -1 in size:  # which torch does not know of no boxes
+    if -1 in size:  # torch cannot infer this length for 0 boxes
         others = -math.prod(size)
         size = [x.shape.numel() // others if length == -1 else length for length in size]
     counts = x.terms.shape[:2]
@@ -209,7 +212,7 @@ def _view(x: TaylorForm, size: Sequence[int]) -> TaylorForm:
 
 
 def _joining(function: Callable[..., Any]) -> Rule:
-    """As _arranging, of a list in which constants stand beside forms."""
+    """Like _arranging, for an operator of a list of forms and constants."""
 
     def join(items: Sequence[Any], dim: int = 0) -> TaylorForm:
         like = next(item for item in items if isinstance(item, TaylorForm))
@@ -241,31 +244,35 @@ ARRANGEMENTS: dict[Any, Rule] = {
 
 @rule(aten.index_add.default)
 def _index_add(x: Any, dim: int, index: Tensor, source: Any) -> TaylorForm:
-    """x with source_i added to its entry index_i: a sum of two arrangements."""
+    """x with source_i added to its entry index_i: x plus an arrangement of the source."""
     like = x if isinstance(x, TaylorForm) else source
     x, source = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, source))
-    moved = _rearranged(lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.rounded(len(index)))
+    moved = _rearranged(
+        lambda base, y: torch.zeros_like(base).index_add(dim, index, y), x, source.with_rounding(len(index))
+    )
     return taylor.add(x, moved)
 
 
 @rule(aten.index_put.default)
 def _index_put(x: Any, indices: list[Any], values: Any, accumulate: bool = False) -> TaylorForm:
-    """x with the values added to its entries at some indices, as the derivative of an indexing is written."""
+    """x with the values added to its entries at some indices; autograd uses it for the derivative of x[indices]."""
     if not accumulate:
-        raise UsageError("Expected values that are added to entries, got entries that are replaced; use torch.where.")
+        raise UsageError(
+            "Expected index_put to add to entries (accumulate=True), got one that replaces them; use torch.where."
+        )
     like = x if isinstance(x, TaylorForm) else values
     x, values = (y if isinstance(y, TaylorForm) else taylor.constant_form(y, like) for y in (x, values))
-    values = values.rounded(values.shape.numel())
+    values = values.with_rounding(values.shape.numel())
     moved = _rearranged(lambda base, y: torch.zeros_like(base).index_put(indices, y, accumulate=True), x, values)
     return taylor.add(x, moved)
 
 
-OF_TRUTHS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
-"""The operators whose rules hold for truths as results too: 1 · 0 is a conjunction, 1 + 1 is not a truth."""
+BOOLEAN_OPERATORS = {*JUMPS, *CHOICES, *ARRANGEMENTS, aten.mul.Tensor}
+"""Operators whose rules are also correct for boolean results: 1 · 0 is a conjunction, but 1 + 1 is no truth value."""
 
 
-def _of_shape(operation: Any) -> Rule:
-    """The rule of an operator that reads the shape of its argument alone: the result is constant."""
+def _shape_rule(operation: Any) -> Rule:
+    """The rule of an operator that depends on the shape of its argument alone: the result is a constant tensor."""
     return lambda x, *arguments, **keywords: operation(torch.zeros_like(x.radius[0]), *arguments, **keywords)
 
 
@@ -274,7 +281,7 @@ OF_SHAPE = {
     aten.new_zeros.default, aten.new_ones.default, aten.new_full.default, aten.fill.Scalar,
 }  # fmt: skip
 for _operation in OF_SHAPE:
-    rule(_operation)(_of_shape(_operation))
+    rule(_operation)(_shape_rule(_operation))
 
 
 RULES.update({operation: on_forms(composed, RULES) for operation, composed in COMPOSED.items()})

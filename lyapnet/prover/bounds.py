@@ -1,12 +1,14 @@
 """Bounds of a function on boxes: its operator graph, interpreted with Taylor forms.
 
-The function is the one that training and control use, traced at one point (t, x). What is done with each operator is in
-lyapnet.prover.bound_rules; an operator without a rule is refused by name. The arithmetic of forms, and what is covered
-of rounding, is in lyapnet.prover.taylor. Numbers that do not depend on the point (weights, W → softplus(W), a constant
-mass matrix) are computed once, by torch: bounds are those of the function with these numbers.
+The function is the one that training and control use, traced at one point (t, x). Each operator has a rule in
+lyapnet.prover.bound_rules that encloses its result; an operator without a rule is refused by name. The arithmetic of
+forms and its rounding errors are in lyapnet.prover.taylor. Numbers that do not depend on the point (weights,
+W → softplus(W), a constant mass matrix) are computed once, by torch; the bounds are those of the function with these
+numbers.
 
-Every operator passes one gate, _apply. What depends on the point stays in float64, or is a truth: torch would round it
-in float32, wrap it in integers, and read 1 + 1 as true; and its bounds have the shape that the trace recorded.
+All operators go through one function, _apply. It refuses a result that depends on the point and is neither float64 nor
+a truth value: the rules know nothing of the rounding of float32, of the wrap-around of integers, or of 1 + 1 = true. It
+also refuses bounds of another shape than the trace recorded.
 """
 
 import copy
@@ -27,30 +29,30 @@ from lyapnet.graphs.tracing import trace
 from lyapnet.prover import taylor
 from lyapnet.prover.bound_kernel.kernel import BoundKernel, kernel_of
 from lyapnet.prover.bound_kernel.program import Support, of_boxes
-from lyapnet.prover.bound_rules import ARRANGEMENTS, OF_TRUTHS, RULES
+from lyapnet.prover.bound_rules import ARRANGEMENTS, BOOLEAN_OPERATORS, RULES
 from lyapnet.prover.rounding import rounding
 from lyapnet.prover.simplification import with_known_truths, without_copies
 from lyapnet.prover.taylor import TaylorForm, box_form, wide_axes
 
-MANY = 4000  # boxes, whose bounds take torch as long as a kernel takes to compile
-HELD = 32  # points of the box at which a trace is held against its function
+MANY = 4000  # boxes; bounding them by torch takes as long as compiling a kernel
+TRACE_POINTS = 32  # points of the box at which the trace is compared with the function
 
 
 class BoundedFunction:
-    """(t, x) ↦ some numbers, with bounds of each on boxes of (t, x).
+    """A function (t, x) ↦ tensors, with bounds of each entry on boxes of (t, x).
 
     Args:
-        function: of t () and x (n,), with tensors of any shape as results; in float64, from torch operations; its
-            control flow does not depend on their values.
-        sample: a box of (t, x), (1 + n,) each: points of it are tried in the trace.
-        degree: of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
-        exact: bounds the function in real numbers, also where it stands for one that a program rounds.
+        function: a function of t () and x (n,) that returns tensors of any shape; float64 torch operations whose
+            control flow does not depend on values.
+        sample: a box (lower, upper) of (t, x), (1 + n,) each; the trace is checked at points of it.
+        degree: degree of the forms; 2 costs about (n + 3)/2 times the arithmetic of 1, and needs far fewer boxes.
+        exact: ignore mark_rounded (lyapnet.prover.rounding); the bounds then hold in real arithmetic only.
 
     Attributes:
-        graph: the function as its torch operations, at one (t, x).
+        graph: the torch operations of the function at one (t, x).
 
     Raises:
-        UsageError: the function cannot be traced; or it has an operator without a rule, which is named.
+        UsageError: the function cannot be traced, or has an operator without a rule; the message names it.
     """
 
     def __init__(
@@ -63,12 +65,12 @@ class BoundedFunction:
         lower, upper = sample
         self.degree = degree
         generator = torch.Generator().manual_seed(0)
-        share = torch.rand(HELD, len(lower), generator=generator, dtype=torch.float64).to(lower)
+        share = torch.rand(TRACE_POINTS, len(lower), generator=generator, dtype=torch.float64).to(lower)
         first, *others = [(point[0].clone(), point[1:].clone()) for point in lower + (upper - lower) * share]
         try:
             with rounding(counted=not exact):
                 graph = trace(function, first, others)
-            self.graph = copy.deepcopy(graph)  # with constants that no one else writes to
+            self.graph = copy.deepcopy(graph)  # a copy, so that nobody else changes its constants
         except LyapnetError as error:
             raise UsageError(str(error)) from error
         except (Exception, SystemExit) as error:
@@ -79,14 +81,14 @@ class BoundedFunction:
         self._nodes = list(with_known_truths(without_copies(self.graph.graph)).nodes)
         self._fold_constants()
         self._last_use = {source: node for node in self._nodes for source in node.all_input_nodes}
-        self._seen: Counter[Hashable] = Counter()  # boxes, by the axes along which they have a width; and forms
+        self._seen: Counter[Hashable] = Counter()  # number of boxes so far, by the key of their kernel
         self._kernels: dict[Hashable, BoundKernel | None] = {}
-        self.forms(lower[None], upper[None])  # an operator without a rule is found here
+        self.forms(lower[None], upper[None])  # finds an operator without a rule
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
         """The results on boxes of (t, x), (boxes, 1 + n) each, as Taylor forms in the coordinates of the box.
 
-        Once there are many boxes on the CPU, machine code takes over, if there is any.
+        After MANY boxes on the CPU, machine code is used if it can be compiled.
         """
         if lower.device.type == "cpu":
             wide = tuple(wide_axes(lower, upper).tolist())
@@ -97,7 +99,7 @@ class BoundedFunction:
         return self.image(box_form(lower, upper, self.degree))
 
     def kernel(self, lower: Corners, upper: Corners) -> BoundKernel | None:
-        """Machine code for boxes with a width along the same axes as these; None where there is none."""
+        """Machine code for boxes with a width along the same axes as these; None if it cannot be compiled."""
         wide = tuple(wide_axes(lower, upper).tolist())
         if wide not in self._kernels:
             self._kernels[wide] = self._kernel_of(of_boxes(lower.shape[-1], wide), len(wide))
@@ -107,11 +109,11 @@ class BoundedFunction:
         return kernel_of(self._nodes, self._constants, inputs, dimension, self.degree)
 
     def image(self, box: TaylorForm, supports: Sequence[Support] | None = None) -> list[TaylorForm]:
-        """The results of (t, x) in a form of shape (1 + n,), in the same ε; by interval arithmetic if it has none.
+        """The results if (t, x) is in a form of shape (1 + n,), as forms in the same ε.
 
         Args:
-            supports: the numbers of the terms that each entry of the form may have, rising, if that is known: for many
-                such forms on the CPU machine code takes over.
+            supports: for each entry of the form, the indices of the terms that may be nonzero, in increasing order.
+                With it, machine code is used after MANY such forms on the CPU.
         """
         if supports is not None and box.radius.device.type == "cpu":
             key = (box.dimension, *supports)
@@ -137,7 +139,7 @@ class BoundedFunction:
         raise AssertionError("a graph ends with its output")
 
     def on(self, device: torch.device) -> "BoundedFunction":
-        """The same bounds on another device, of boxes that lie there; what its constants are stays as it is."""
+        """The same function, for boxes on another device; its constants are copied there."""
         other = copy.copy(self)
         other._constants = {
             node: tree_map_only(Tensor, lambda value: value.to(device), value)
@@ -147,7 +149,7 @@ class BoundedFunction:
 
     @property
     def fingerprint(self) -> str:
-        """A hash of the function: its operations and every number in them."""
+        """A hash of the function: its operations and all their constants."""
         found = hashlib.sha256(str(self.graph.graph).encode())
         for node in self._nodes:
             if node.op == "get_attr":
@@ -157,12 +159,12 @@ class BoundedFunction:
         return found.hexdigest()
 
     def bounds(self, lower: Corners, upper: Corners) -> list[tuple[OnBoxes, OnBoxes]]:
-        """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where there are none."""
+        """(lower, upper) bounds of each result on each box, (boxes, *shape); infinite where no bound is known."""
         return [form.interval() for form in self.forms(lower, upper)]
 
     @property
     def operators(self) -> set[Any]:
-        """The operators that depend on the point; the others are folded to constants."""
+        """The operators whose results depend on the point; all others have been evaluated to constants."""
         return {node.target for node in self._nodes if node.op == "call_function" and node not in self._constants}
 
     def _fold_constants(self) -> None:
@@ -176,10 +178,10 @@ class BoundedFunction:
 
 
 def _apply(node: Node, values: dict[Node, Any]) -> Any:
-    """What the node's operator makes of its arguments, by its rule where one of them depends on the point.
+    """The result of a node: by the operator's rule if an argument depends on the point, else by torch.
 
     Raises:
-        UsageError: the operator has no rule; or its rule does not cover these arguments, or this result.
+        UsageError: the operator has no rule; or its rule does not cover these arguments or this result.
     """
     arguments, keywords = _values(node, values)
     rule = node.target
@@ -187,7 +189,7 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
         rule = RULES.get(node.target) or ARRANGEMENTS.get(node.target)
     if rule is None:
         raise UsageError(
-            f"Expected operators with a rule for bounds, got {node.target}; write it with others, or add it to the "
+            f"Expected operators with a rule for bounds, got {node.target}; use other operators, or add it to the "
             "table of operators (docs/operators.md)."
         )
     try:
@@ -200,22 +202,22 @@ def _apply(node: Node, values: dict[Node, Any]) -> Any:
             "write it with other operators."
         ) from error
     recorded = node.meta.get("val")
-    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # constant: of the shape of its argument alone
+    if isinstance(result, Tensor) and isinstance(recorded, Tensor):  # it depends on the shape of the arguments alone
         return result.to(torch.get_default_device(), recorded.dtype)
     for form, value in zip(*((y if isinstance(y, list | tuple) else [y]) for y in (result, recorded)), strict=True):
         if isinstance(form, TaylorForm):
-            truth = value.dtype == torch.bool and node.target in OF_TRUTHS and _compares_as_it_is(node, values)
+            truth = value.dtype == torch.bool and node.target in BOOLEAN_OPERATORS and _compares_unrounded(node, values)
             real = value.dtype == torch.float64 or truth
             if not real or form.shape != value.shape:
                 raise UsageError(
                     f"Expected operators with a rule for bounds, got {node.target} in {value.dtype} of shape "
-                    f"{tuple(value.shape)}; stay in x.dtype, to which truths convert, or write it with others."
+                    f"{tuple(value.shape)}; keep x.dtype, convert comparisons to it, or use other operators."
                 )
     return result
 
 
-def _compares_as_it_is(node: Node, values: dict[Node, Any]) -> bool:
-    """Whether torch rounds neither of two numbers before it compares them: one without axes takes the other's dtype."""
+def _compares_unrounded(node: Node, values: dict[Node, Any]) -> bool:
+    """Whether torch compares two numbers without rounding: it converts one without axes to the dtype of the other."""
     sources = node.all_input_nodes
     both = [values[source] if isinstance(values[source], Tensor) else source.meta["val"] for source in sources]
     return len(both) != 2 or torch.result_type(*both) in (torch.float64, torch.bool)

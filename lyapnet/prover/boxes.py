@@ -1,4 +1,4 @@
-"""Boxes of points (t, x): many at once, sorted, cut in two."""
+"""Batches of boxes of points (t, x), and the tree of cuts that made them."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -11,31 +11,31 @@ from lyapnet.base.types import Corner, Corners, PerBox
 
 
 class Boxes(NamedTuple):
-    """Boxes of (t, x), 1 + n axes each, time first, with a number for each by which they are sorted, and a name."""
+    """Boxes of (t, x), (boxes, 1 + n), time first; each has a key by which the search sorts and a node of a CutTree."""
 
     lower: Corners
     upper: Corners
     key: PerBox
-    node: Integer[Tensor, "boxes"]  # of the CutTree that it comes from
+    node: Integer[Tensor, "boxes"]  # number in the CutTree
 
     def __getitem__(self, chosen: Tensor) -> "Boxes":  # pyright: ignore[reportIncompatibleMethodOverride]
         return Boxes(*(y[chosen] for y in tuple(self)))
 
     def joined(self, other: "Boxes") -> "Boxes":
-        """Both."""
+        """These boxes followed by the others."""
         return Boxes(*(torch.cat(pair) for pair in zip(self, other, strict=True)))
 
     def to(self, device: torch.device) -> "Boxes":
-        """The boxes on a device."""
+        """Copy the boxes to a device."""
         return Boxes(*(part.to(device) for part in self))
 
     @property
     def center(self) -> Corners:
-        """The middle of each."""
+        """The middle of each box."""
         return (self.lower + self.upper) / 2
 
     def first(self, count: int) -> tuple["Boxes", "Boxes"]:
-        """(those of smallest key, the others)."""
+        """(the `count` boxes of smallest key, the others)."""
         if len(self.key) <= count:
             return self, self[torch.zeros(len(self.key), dtype=torch.bool)]
         chosen = torch.zeros(len(self.key), dtype=torch.bool)
@@ -43,7 +43,7 @@ class Boxes(NamedTuple):
         return self[chosen], self[~chosen]
 
     def split(self, size: int) -> list["Boxes"]:
-        """The boxes in groups of this size, the last perhaps smaller."""
+        """The boxes in groups of this size; the last may be smaller."""
         return [Boxes(*group) for group in zip(*(y.split(size) for y in self), strict=True)]
 
     @property
@@ -52,16 +52,21 @@ class Boxes(NamedTuple):
         return float(self.key.min()) if len(self.key) else float("inf")
 
     def volumes(self, lower: Corner, upper: Corner) -> PerBox:
-        """The share of each in the box (lower, upper); axes without width do not count."""
+        """The volume of each box as a share of the box (lower, upper); axes of width 0 do not count."""
         sides = torch.where(upper > lower, upper - lower, 1.0)
         return torch.where(upper > lower, (self.upper - self.lower) / sides, 1.0).prod(-1)
 
     def share(self, lower: Corner, upper: Corner) -> float:
-        """That of all of them in the box (lower, upper)."""
+        """The volume of all boxes together as a share of the box (lower, upper)."""
         return float(self.volumes(lower, upper).sum())
 
     def halves(self, axis: Tensor, cuts: Tensor | None = None) -> "Boxes":
-        """Each box cut in two in the middle of an axis of its own, by cuts of these numbers in a CutTree."""
+        """Cut each box in two, in the middle of one axis: first the lower halves, then the upper ones.
+
+        Args:
+            axis: the axis of each box.
+            cuts: the number of each cut in a CutTree, which gives the nodes of the halves.
+        """
         cut = torch.nn.functional.one_hot(axis, self.lower.shape[-1]).bool()
         lower, upper = torch.where(cut, self.center, self.lower), torch.where(cut, self.center, self.upper)
         first = self.node if cuts is None else 1 + 2 * cuts
@@ -69,7 +74,7 @@ class Boxes(NamedTuple):
 
 
 def roots(lower: Corners, upper: Corners, key: float = float("-inf")) -> Boxes:
-    """Boxes that no cut made."""
+    """Boxes that are not halves of others: node 0."""
     return Boxes(lower, upper, lower.new_full((len(lower),), key), torch.zeros(len(lower), dtype=torch.long))
 
 
@@ -79,7 +84,7 @@ def single(lower: Corner, upper: Corner, key: float = float("-inf")) -> Boxes:
 
 
 def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -> tuple[Corners, Corners]:
-    """A box in about so many alike, cut across some of its axes: those that have a width."""
+    """Divide a box into about `count` equal boxes, by cuts across those of the given axes that have a width."""
     lower, upper, wide = lower[None], upper[None], [axis for axis in axes if upper[axis] > lower[axis]]
     each = max(1, round(count ** (1 / max(1, len(wide)))))
     for axis in wide:
@@ -89,14 +94,14 @@ def pieces(lower: Corner, upper: Corner, axes: Sequence[int], count: int = 64) -
     return lower, upper
 
 
-DEEPEST = 2000  # cuts in a row that a proof may have; after 53 along an axis a box is as thin as rounding
+DEEPEST = 2000  # successive cuts of a box in a proof, at most; 53 along one axis reach the rounding of float64
 
 
 class CutTree:
-    """How one box was cut in two, again and again: cut k parts node n_k in the middle of axis a_k.
+    """A binary tree of boxes: cut k divides node n_k in the middle of axis a_k.
 
-    Node 0 is the box, 1 + 2k and 2 + 2k are the halves that cut k makes. Whatever the cuts are, the nodes that none of
-    them parts, the leaves, cover the box exactly: two halves share the very number at which they meet.
+    Node 0 is the whole box; nodes 1 + 2k and 2 + 2k are the halves that cut k makes. The leaves, nodes that no cut
+    divides, cover the box exactly for any list of cuts: two halves have the same float64 number as their common side.
     """
 
     def __init__(self, node: Tensor | None = None, axis: Tensor | None = None):
@@ -104,7 +109,7 @@ class CutTree:
         self.size = 0 if node is None else len(node)
 
     def cut(self, boxes: Boxes, axis: Tensor) -> Boxes:
-        """The halves of boxes, recorded."""
+        """Cut boxes in two, and record the cuts."""
         numbers = torch.arange(self.size, self.size + len(axis))
         self._cuts.append((boxes.node, axis.byte()))
         self.size += len(axis)
@@ -118,10 +123,10 @@ class CutTree:
         return torch.cat(nodes), torch.cat(axes)
 
     def leaves(self, lower: Corner, upper: Corner) -> Boxes:
-        """The leaves of the tree of this box, in any order.
+        """The leaves if node 0 is the box (lower, upper), in any order.
 
         Raises:
-            ValueError: it is no tree of cuts.
+            ValueError: the recorded cuts are no tree.
         """
         node, axis = self.cuts
         number = torch.full((2 * self.size + 1,), -1)
@@ -132,13 +137,13 @@ class CutTree:
             found.append(level[cut < 0])
             level = level[cut >= 0].halves(axis[cut[cut >= 0]].long(), cut[cut >= 0])
         leaves = Boxes(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-        if len(leaves.key) != self.size + 1:  # a node cut twice, one that no cut makes, or too many in a row
-            raise ValueError("Expected cuts that part a box and its halves, got others.")
+        if len(leaves.key) != self.size + 1:  # a node is cut twice or does not exist, or the tree is too deep
+            raise ValueError("Expected cuts of a box and its halves, got others.")
         return leaves
 
 
 def faces(lower: Corner, upper: Corner, axes: Iterable[int]) -> tuple[Corners, Corners]:
-    """The faces of a box perpendicular to some of its axes, as 2 · axes boxes without width there."""
+    """The faces of a box perpendicular to the given axes, as boxes of width 0 along that axis; two for each axis."""
     low, high = [], []
     for axis in axes:
         for side in (lower, upper):

@@ -1,7 +1,7 @@
 """Branch and bound over boxes of (t, x): one search, and two questions that it answers.
 
-What it finds is found by bounds that are sound up to what lyapnet.prover.taylor says of rounding; plain evaluations
-serve to guess well. The third question, where a condition is proved, is lyapnet.prover.proof.
+All results follow from bounds, which are rigorous as stated in lyapnet.prover.taylor; values at points only guide the
+search. The third question, where a condition holds, is in lyapnet.prover.proof.
 """
 
 import time
@@ -24,15 +24,15 @@ from lyapnet.prover.taylor import TaylorForm, wide_axes
 
 @dataclass(frozen=True)
 class Budget:
-    """When to stop undecided.
+    """Limits on the work of a search, after which it stops undecided.
 
     Args:
-        seconds, boxes: the work.
-        chunk: boxes that are bounded at once by each worker.
-        frontier: undecided boxes that are kept; beyond, those of highest key are given up.
-        workers: processes.
-        ray: the address of a cluster of which so many cores bound the boxes of a proof, in place of processes here.
-        device: where the boxes of a proof are bounded, "cpu" or "cuda"; a GPU by one process, in chunks that fill it.
+        seconds, boxes: time, and number of bounded boxes, at most.
+        chunk: number of boxes that each worker bounds at once.
+        frontier: number of undecided boxes in memory, at most; when there are more, those of highest key are given up.
+        workers: number of processes.
+        ray: address of a Ray cluster on which as many cores bound the boxes of a proof, instead of local processes.
+        device: "cpu" or "cuda", where the boxes of a proof are bounded; a GPU is used by one process, in large chunks.
     """
 
     seconds: float = 60.0
@@ -43,7 +43,7 @@ class Budget:
     device: str = "cpu"
     ray: str | None = None
     started: float = field(default_factory=time.monotonic)
-    stop: Stop = field(default_factory=Stop)  # asked by the user
+    stop: Stop = field(default_factory=Stop)  # set by the user's Ctrl-C or by SIGTERM
 
     def __post_init__(self) -> None:
         if min(self.chunk, self.frontier, self.workers) < 1:
@@ -55,125 +55,126 @@ class Budget:
             if self.workers > 1:
                 raise UsageError(f"Expected one worker on {self.device}, got {self.workers}; leave --workers out.")
             if self.ray is not None:
-                raise UsageError(f"Expected --device {self.device} or --ray, got both; cores of a cluster bound boxes.")
+                raise UsageError(f"Expected --device {self.device} or --ray, got both; leave one out.")
 
     @property
     def at_once(self) -> int:
-        """How many boxes are bounded at once."""
-        return self.chunk if self.device == "cpu" else max(self.chunk, ON_DEVICE)
+        """Number of boxes that are bounded at once."""
+        return self.chunk if self.device == "cpu" else max(self.chunk, GPU_CHUNK)
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the budget was opened."""
+        """Seconds since the budget was made."""
         return time.monotonic() - self.started
 
     def spent(self, boxes: int) -> bool:
-        """Whether no more work is to be begun."""
+        """Whether a search that has bounded this many boxes must stop."""
         return self.stop.asked or self.elapsed >= self.seconds or boxes >= self.boxes
 
     @property
     def left(self) -> float:
-        """Seconds that are left."""
+        """Remaining seconds."""
         return max(0.0, self.seconds - self.elapsed)
 
 
-AHEAD = 4  # chunks of each of several workers in a round, so that none waits for what is done between rounds
-ON_DEVICE = 65_536  # boxes that fill a GPU
+CHUNKS_PER_ROUND = 4  # for each of several workers, so that they seldom wait for the work between rounds
+GPU_CHUNK = 65_536  # boxes that occupy a GPU fully
 MARGIN = 1e-9
-"""How far "just below" and "just above" are, relative to the number itself.
+"""Distance of just_below and just_above from a number, relative to the number.
 
-Levels are compared as closed sets are: {W ≤ ρ} against boxes on which W reaches ρ, its boundary against a rim. The
-width is far above the rounding of the few float64 operations in between (1e-15), and far below what a figure shows.
+Sublevel sets {W ≤ ρ} are closed, so a level must be strictly below the least W of the boxes that it excludes. 1e-9 is
+far above the rounding of the few float64 operations in between (1e-15), and too small to see in a figure.
 """
 
 
 def just_below(value: float) -> float:
-    """A number below, by MARGIN."""
+    """The number, lowered by MARGIN."""
     return value - MARGIN * abs(value)
 
 
 def just_above(value: float) -> float:
-    """A number above, by MARGIN."""
+    """The number, raised by MARGIN."""
     return value + MARGIN * abs(value)
 
 
 class Question(ABC):
-    """What is asked of boxes, and what is known of the answer so far."""
+    """A question about a set of boxes, with the answer as far as it is known."""
 
     @abstractmethod
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        """(the boxes that must be cut, by the key under which their halves wait; the axis to cut each across).
+        """(the boxes that must be cut, with the key of their halves; the axis across which to cut each).
 
-        Calls may run in copies of this process, side by side: what they learn is lost but for what they return.
+        Calls may run in copies of this process, in parallel: only what they return is kept.
         """
 
     def look_at(self, boxes: Boxes) -> None:  # noqa: B027  (most questions learn from bounds alone)
-        """Learn from boxes that stay undecided; in the order of the search, one call at a time."""
+        """Learn from boxes that stay undecided; called in this process, in the order of the search."""
 
     @property
     def highest(self) -> float:
-        """The highest key of boxes that are still of interest."""
+        """Boxes of a higher key are dropped."""
         return float("inf")
 
     @property
     def settled(self) -> bool:
-        """Whether the answer is known, whatever is undecided."""
+        """Whether the answer is known although boxes are undecided."""
         return False
 
 
 @dataclass
 class Search:
-    """A search on the way: the boxes that wait, those of lowest key being next."""
+    """The state of a search: its undecided boxes, of which those of lowest key are next."""
 
     frontier: Boxes
     boxes: int = 0  # bounded so far
-    given_up: float = float("inf")  # the least key among boxes for which there was no room
+    given_up: float = float("inf")  # the least key of the boxes that were given up
     tree: CutTree = field(default_factory=CutTree)
 
     @property
     def least(self) -> float:
-        """The least key among boxes that are undecided; ∞ where none is."""
+        """The least key of the undecided boxes and of those given up; ∞ if there are none."""
         return min(self.frontier.least, self.given_up)
 
     def rounds(self, question: Question, budget: Budget, run: Callable[..., Iterable[Any]] = map) -> Iterator[None]:
-        """Bound some chunks for each worker, again and again, until all is decided, settled or the budget is spent.
+        """Bound boxes in rounds until all are decided, the question is settled or the budget is spent.
 
         Args:
-            run: maps a function over chunks, as `map` does or lyapnet.prover.workers.
+            run: maps a function over chunks of boxes, as `map` or lyapnet.prover.workers.bounding.
         """
         budget.stop.searching = True
         while len(self.frontier.key) and not question.settled and not budget.spent(self.boxes):
-            ahead = 1 if budget.workers == 1 else AHEAD * budget.workers
-            lowest, rest = self.frontier.first(budget.at_once * ahead)
+            chunks = 1 if budget.workers == 1 else CHUNKS_PER_ROUND * budget.workers
+            lowest, rest = self.frontier.first(budget.at_once * chunks)
             self.boxes += len(lowest.key)
             for undecided, axis in run(question.undecided, lowest.split(budget.at_once)):
                 question.look_at(undecided)
                 rest = rest.joined(self.tree.cut(undecided, axis))
-            self.frontier, beyond = rest[rest.key <= question.highest].first(budget.frontier)
-            self.given_up = min(self.given_up, beyond.least)
+            self.frontier, dropped = rest[rest.key <= question.highest].first(budget.frontier)
+            self.given_up = min(self.given_up, dropped.least)
             yield
 
 
 def searched(question: Question, frontier: Boxes, budget: Budget) -> Search:
-    """The search of a question, as far as the budget takes it."""
+    """Search for the answer of a question until the budget is spent; the state of the search at the end."""
     search = Search(frontier)
     for _ in search.rounds(question, budget):
         pass
     return search
 
 
-PROBES = 12  # boxes of a chunk that are cut along every axis
+PROBES = 12  # boxes of a chunk on which a cut across every axis is tried
 
 
 def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen: Tensor, result: int = 0) -> Tensor:
-    """For each chosen box, the axis along which a cut lowers the excess of one result most, the first by default.
+    """For each chosen box, the axis whose cut lowers the excess of one result most.
 
-    A linear part is bounded exactly on any box: only the excess of the other part prevents the proof of a true
-    inequality. The excess is about Σ_k m_k w_k² for widths w; m is measured on a few boxes.
+    The linear part of a form is bounded exactly on any box; only the excess can prevent the proof of a true inequality.
+    The excess is about Σ_k m_k w_k² for the widths w of a box; m is measured on a few boxes.
 
     Args:
-        form: that result on the boxes.
-        chosen: (boxes,) truths.
+        form: the result on the boxes.
+        chosen: which boxes are cut, (boxes,) booleans.
+        result: the position of the result among those of `bounded`.
     """
     widths, excess = boxes.upper - boxes.lower, form.excess.nan_to_num(nan=1e100, posinf=1e100)
     some = torch.nonzero(chosen).flatten()[:: max(1, int(chosen.sum()) // PROBES)]
@@ -185,7 +186,7 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
     halved = bounded.forms(lower[: len(probes.key)], upper[: len(probes.key)])[result].excess
     drop = excess[some, None] - halved.nan_to_num(nan=1e100, posinf=1e100).reshape(len(some), -1)
     m = (drop.clamp_min(0) / (widths[some] ** 2).clamp_min(1e-300)).mean(0)
-    # the linear part and the widths decide where the excess does not
+    # small terms decide between axes of equal excess: the linear part, then the widths
     tie = 1e-12 * widths
     tie[:, wide_axes(boxes.lower, boxes.upper)] += 1e-3 * form.coefficients.abs().T.nan_to_num()
     return torch.where(widths > 0, m * widths**2 + tie, -1.0)[chosen].argmax(-1)
@@ -196,7 +197,7 @@ def axis_to_cut(bounded: BoundedFunction, form: TaylorForm, boxes: Boxes, chosen
 
 @dataclass
 class LeastValue(Question):
-    """A lower bound of min f on boxes, on the part with where(t, x) ≤ level."""
+    """A lower bound of min f over the points of boxes with where(t, x) ≤ level."""
 
     function: Value
     where: Value
@@ -205,8 +206,8 @@ class LeastValue(Question):
     enough: float
     unit: float
     tolerance: float
-    best: float = float("inf")  # the least value of f that was seen
-    found: float = float("inf")  # the least bound among boxes that need no more cutting
+    best: float = float("inf")  # the least value of f at a point, so far
+    found: float = float("inf")  # the least lower bound on a box that is not cut any more
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         f, w = self.bounded.forms(boxes.lower, boxes.upper)
@@ -221,13 +222,13 @@ class LeastValue(Question):
         self.found = min(self.found, _least(f_low[possible & done]))
         boxes, chosen = boxes._replace(key=f_low), possible & ~done
         axis, known = axis_to_cut(self.bounded, f, boxes, chosen), (f_high - f_low <= room)[chosen]
-        if bool(known.any()):  # of these it is open whether they count
+        if bool(known.any()):  # f is known well enough there: cut to decide whether w ≤ level
             axis = torch.where(known, axis_to_cut(self.bounded, w, boxes, chosen, 1), axis)
         return boxes[chosen], axis
 
 
 def _least(values: PerBox) -> float:
-    """The least of some numbers that is not nan; ∞ where there is none."""
+    """The least number that is not nan; ∞ if there is none."""
     return min([float("inf"), *values.sort().values[:1].tolist()])
 
 
@@ -243,13 +244,14 @@ def minimum(
     tolerance: float = 1e-3,
     bounded: BoundedFunction | None = None,
 ) -> float:
-    """A lower bound of min f over boxes, on the part with where(t, x) ≤ level; ∞ where it is empty.
+    """A lower bound of min f over the points of boxes with where(t, x) ≤ level; ∞ if there are none.
 
-    Boxes are cut until the bound comes within tolerance · max(|min|, unit) of a value of f or reaches what is enough,
-    or the budget is spent.
+    Each point lies in a box that was bounded from below, or in one that is still undecided, whose key is a lower bound.
+    Boxes are cut until the bound is within tolerance · max(|min|, unit) of a value of f, or at least `enough`, or the
+    budget is spent.
 
     Args:
-        bounded: of (f, where), if it is at hand: a trace takes longer than a few boxes.
+        bounded: (f, where) with bounds, if it exists already; a trace takes longer than bounding a few boxes.
     """
     where = where or function
     if bounded is None:
@@ -264,7 +266,7 @@ def minimum(
 
 @dataclass
 class ShareBelow(Question):
-    """A lower bound of the share by volume of a box on which V ≤ level."""
+    """A lower bound of the share of a box, by volume, on which V ≤ level: the boxes with an upper bound ≤ level."""
 
     bounded: BoundedFunction  # of V
     lower: Corner
@@ -283,7 +285,7 @@ class ShareBelow(Question):
 
 
 def share_below(V: Value, lower: Corner, upper: Corner, level: float, budget: Budget) -> float:
-    """A lower bound of the share by volume of a box on which V ≤ level; axes without width do not count."""
+    """A lower bound of the share of a box, by volume, on which V ≤ level; axes of width 0 do not count."""
     bounded = BoundedFunction(lambda t, x: (V(t, x),), (lower, upper))
     question = ShareBelow(bounded, lower, upper, level)
     searched(question, single(lower, upper), budget)

@@ -1,7 +1,7 @@
-"""Rules for functions with kinks and branches: where a box does not decide, both sides are taken.
+"""Rules for functions with kinks and branches: if a branch is undecided on a box, the result encloses both branches.
 
-The truth of a comparison is a number, 1 or 0, and ½ ± ½ on a box that does not decide it. Forms are closed sets with
-room for rounding: of two boxes that touch where a comparison turns, at least one is undecided.
+A truth value is a number: 1, 0, or the interval [0, 1] on a box that does not decide it. Forms are closed sets with
+room for rounding, so that of two adjacent boxes with different truth values at their common face one is undecided.
 """
 
 import copy
@@ -27,17 +27,17 @@ aten = torch.ops.aten
 def kinked(
     x: TaylorForm, function: Callable[[Tensor], Tensor], slope: Callable[[Tensor], Tensor], kinks: Sequence[float]
 ) -> TaylorForm:
-    """f(x) for piecewise linear f: f(x) − ax takes its extremes at the ends of an interval or at kinks."""
+    """f(x) for piecewise linear f: f(x) − ax has its extremes at the ends of the interval or at kinks."""
     return linearised(x, function, slope, lambda a, lo, hi: [torch.full_like(a, kink) for kink in kinks])
 
 
 def relu(x: TaylorForm) -> TaylorForm:
-    """max(x, 0): a = u/(u − l) and 0 ≤ max(x, 0) − ax ≤ −al where l < 0 < u."""
+    """max(x, 0); if l < 0 < u, the slope is a = u/(u − l), and 0 ≤ max(x, 0) − ax ≤ −al on [l, u]."""
     return kinked(x, torch.relu, lambda v: (v > 0).to(v), [0.0])
 
 
 def leaky_relu(x: TaylorForm, negative_slope: float = 0.01) -> TaylorForm:
-    """x above 0, and a multiple of x below."""
+    """x for x > 0, and negative_slope · x for x ≤ 0."""
     return kinked(
         x,
         lambda v: torch.where(v > 0, v, negative_slope * v),
@@ -47,21 +47,21 @@ def leaky_relu(x: TaylorForm, negative_slope: float = 0.01) -> TaylorForm:
 
 
 def absolute(x: TaylorForm) -> TaylorForm:
-    """|x|."""
+    """|x|, with its kink at 0."""
     return kinked(x, torch.abs, torch.sign, [0.0])
 
 
 def clamp(x: TaylorForm, low: float | None = None, high: float | None = None) -> TaylorForm:
-    """min(max(x, low), high) of two numbers."""
+    """min(max(x, low), high) with constant limits, which are the kinks."""
     kinks = [float(kink) for kink in (low, high) if kink is not None]
     return kinked(x, lambda v: v.clamp(low, high), lambda v: (v == v.clamp(low, high)).to(v), kinks)
 
 
 def maximum(x: Any, y: Any) -> TaylorForm:
-    """max(x, y) = y + max(x − y, 0): what x and y have in common cancels."""
+    """max(x, y) = y + max(x − y, 0): common terms of x and y cancel in x − y."""
     x, y = _forms(x, y)
     if not x.dimension:
-        return _of_intervals(torch.maximum, x, y)
+        return _monotone_of_intervals(torch.maximum, x, y)
     return taylor.add(y, relu(taylor.add(x, taylor.negate(y))))
 
 
@@ -69,32 +69,32 @@ def minimum(x: Any, y: Any) -> TaylorForm:
     """min(x, y) = x − max(x − y, 0)."""
     x, y = _forms(x, y)
     if not x.dimension:
-        return _of_intervals(torch.minimum, x, y)
+        return _monotone_of_intervals(torch.minimum, x, y)
     return taylor.add(x, taylor.negate(relu(taylor.add(x, taylor.negate(y)))))
 
 
-def _of_intervals(rising: Callable[[Tensor, Tensor], Tensor], x: TaylorForm, y: TaylorForm) -> TaylorForm:
-    """A function that rises with both of its arguments, of intervals: it is at its ends at theirs."""
+def _monotone_of_intervals(function: Callable[[Tensor, Tensor], Tensor], x: TaylorForm, y: TaylorForm) -> TaylorForm:
+    """A function of intervals that does not fall in either argument: its extremes are at the lower and upper ends."""
     x, y = taylor.aligned(x, y)
     (x_low, x_high), (y_low, y_high) = x.interval(), y.interval()
-    return between(rising(x_low, y_low), rising(x_high, y_high), x).rounded(2)
+    return between(function(x_low, y_low), function(x_high, y_high), x).with_rounding(2)
 
 
 def clamp_between(x: Any, low: Any = None, high: Any = None) -> TaylorForm:
-    """min(max(x, low), high), of which each may depend on the point; a constant infinity is no limit."""
+    """min(max(x, low), high), where each may depend on the point; a constant infinite limit is left out."""
     y = x if low is None or _is_constant(low, -math.inf) else maximum(x, low)
     y = y if high is None or _is_constant(high, math.inf) else minimum(y, high)
     if isinstance(low, Tensor) and isinstance(high, Tensor) and bool((low.isfinite() & high.isfinite()).all()):
-        return _no_wider(y, low, high)
+        return _within_limits(y, low, high)
     return y
 
 
-def _no_wider(y: TaylorForm, low: Tensor, high: Tensor) -> TaylorForm:
-    """A form, but [low, high] on boxes where it is wider than that, or nothing is known."""
+def _within_limits(y: TaylorForm, low: Tensor, high: Tensor) -> TaylorForm:
+    """The form y, replaced by [low, high] on boxes where its bounds are wider than that or unknown."""
     least, most = y.interval()
     low, high = (side.to(y.radius).expand_as(y.radius) for side in (torch.minimum(low, high), high))
     wide = ~(most - least <= high - low)
-    room = 4 * taylor.EPSILON * (low.abs() + high.abs()) + taylor.TINY  # for the rounding of centre and radius
+    room = 4 * taylor.EPSILON * (low.abs() + high.abs()) + taylor.TINY  # for the rounding of c and r
     constant = between(low - room, high + room, y)
     return y.with_parts(torch.where(wide, constant.terms, y.terms), torch.where(wide, constant.radius, y.radius))
 
@@ -107,26 +107,26 @@ def _is_constant(y: Any, value: float) -> bool:
 
 
 def between(low: OnBoxes, high: OnBoxes, like: TaylorForm) -> TaylorForm:
-    """Any number from low to high, beside the forms of `like`."""
+    """The interval [low, high] as c = (low + high)/2 and r = (high − low)/2, with the boxes and the ε of `like`."""
     center = (low + high) / 2
     coefficients = torch.zeros(len(like.terms) - 1, *center.shape, dtype=center.dtype)
     return like.with_parts(torch.cat([center[None], coefficients]), (high - low) / 2)
 
 
 def sign(x: TaylorForm) -> TaylorForm:
-    """−1, 0 or 1; it grows with x."""
+    """−1, 0 or 1, which does not fall with x: from the sign of the lower bound to that of the upper one."""
     low, high = x.interval()
     return between(low.sign(), high.sign(), x)
 
 
 def positive(x: TaylorForm) -> TaylorForm:
-    """Whether x > 0."""
+    """Whether x > 0: certain if the lower bound is positive, possible if the upper one is."""
     low, high = x.interval()
     return between((low > 0).to(low), (high > 0).to(low), x)
 
 
 def negation(x: TaylorForm) -> TaylorForm:
-    """Whether x = 0: what is not true."""
+    """Whether x = 0, that is, x is not true."""
     certain, possible = _truth(x)
     return between((~possible).to(x.radius), (~certain).to(x.radius), x)
 
@@ -156,19 +156,20 @@ def at_least(x: Any, y: Any) -> TaylorForm:
 
 
 def equal(x: Any, y: Any) -> TaylorForm:
-    """Whether x = y: neither is greater. No box with a width decides that they are."""
+    """Whether x = y: neither x > y nor y > x. It is never certain, because of the room for rounding."""
     return conjunction(at_least(x, y), at_least(y, x))
 
 
 def where(truth: Any, x: Any, y: Any) -> TaylorForm:
-    """x or y. On an undecided box, their hull: with X(ε) and Y(ε) the affine parts, both lie within
+    """x where the truth is certain, y where it is impossible. On an undecided box one form encloses both:
 
-    ½ Σ_k |X_k − Y_k| + max(r, r')   of   ½ (X + Y)(ε).
+    with polynomials X(ε) and Y(ε), x and y lie within ½ Σ_k |X_k − Y_k| + max(r, r') of ½ (X + Y)(ε), since
+    X − ½ (X + Y) = ½ (X − Y), and |ε| ≤ 1 in each term.
     """
     truth, x, y = taylor.aligned(*_forms(truth, x, y))
     certain, possible = _truth(truth)
     apart = (x.terms - y.terms).abs().sum(0) / 2
-    both = x.with_parts((x.terms + y.terms) / 2, apart + torch.maximum(x.radius, y.radius)).rounded(len(x.terms))
+    both = x.with_parts((x.terms + y.terms) / 2, apart + torch.maximum(x.radius, y.radius)).with_rounding(len(x.terms))
     return x.with_parts(
         torch.where(certain, x.terms, torch.where(possible, both.terms, y.terms)),
         torch.where(certain, x.radius, torch.where(possible, both.radius, y.radius)),
@@ -176,13 +177,13 @@ def where(truth: Any, x: Any, y: Any) -> TaylorForm:
 
 
 def _truth(x: TaylorForm) -> tuple[Tensor, Tensor]:
-    """(x ≠ 0 at every point, x ≠ 0 at some point perhaps), for any number x."""
+    """(whether x ≠ 0 is certain at all points of the box, whether it is possible at some point)."""
     low, high = x.interval()
     return (low > 0) | (high < 0), ~(x.magnitude == 0)
 
 
 def _forms(*values: Any) -> list[TaylorForm]:
-    """Constants as forms, beside forms."""
+    """The values as forms; at least one is a form, and the others are constants."""
     like = next(value for value in values if isinstance(value, TaylorForm))
     return [
         value if isinstance(value, TaylorForm) else constant_form(torch.as_tensor(value, dtype=torch.float64), like)
@@ -199,7 +200,7 @@ def threshold_backward(gradient: Any, x: Any, threshold: float) -> TaylorForm:
 
 
 def leaky_relu_backward(gradient: Any, x: Any, negative_slope: float, self_is_result: bool) -> TaylorForm:
-    """The gradient where x > 0, else a multiple of it."""
+    """The gradient where x > 0, else negative_slope times the gradient."""
     gradient, x = _forms(gradient, x)
     return where(positive(x), gradient, taylor.scale(gradient, torch.as_tensor(negative_slope, dtype=torch.float64)))
 
@@ -217,7 +218,7 @@ KINKS: dict[Any, Callable[..., TaylorForm]] = {
     aten.maximum.default: maximum,
     aten.minimum.default: minimum,
 }
-"""Operator ↦ its rule, for the operators that bend."""
+"""Operator ↦ its rule, for operators with kinks."""
 
 JUMPS: dict[Any, Callable[..., TaylorForm]] = {
     **dict.fromkeys((aten.sign.default, aten.sgn.default), sign),
@@ -233,35 +234,36 @@ JUMPS: dict[Any, Callable[..., TaylorForm]] = {
     aten.threshold_backward.default: threshold_backward,
     aten.leaky_relu_backward.default: leaky_relu_backward,
 }
-"""Operator ↦ its rule, for the operators that jump."""
+"""Operator ↦ its rule, for operators that jump."""
 
 CHOICES: dict[Any, Callable[..., TaylorForm]] = {
     aten.where.self: where,
     **dict.fromkeys((aten.masked_fill.Scalar, aten.masked_fill.Tensor), lambda x, mask, value: where(mask, value, x)),
 }
-"""Operator ↦ its rule, for the operators that choose: they jump where their truth does, unless the choices agree."""
+"""Operator ↦ its rule, for operators that choose between two values: they jump with the truth if the values differ."""
 
 
-# What a graph decides
+# The comparisons in a graph
 
-DECIDES = {  # slope that jumps ↦ (x, threshold) of the comparison x > threshold in it, from its arguments
+COMPARISONS = {  # derivative that jumps ↦ (its arguments ↦ (x, threshold) of the comparison x > threshold in it)
     aten.threshold_backward.default: lambda gradient, x, threshold: (x, threshold),
     aten.leaky_relu_backward.default: lambda gradient, x, negative_slope, self_is_result: (x, 0.0),
 }
 
 
 def decisions(graph: GraphModule) -> GraphModule | None:
-    """(t, x) ↦ every truth and every sign that occurs in a graph, as numbers; None where there is none.
+    """(t, x) ↦ all truth values and signs in a graph, as numbers; None if there are none.
 
-    Where all of them are constant, the graph is continuous: what else it does is, or choose by them.
+    On a set where all of them are constant, the graph is continuous: its other operators are continuous, or choose by
+    these values.
     """
     nodes, found = copy.deepcopy(graph.graph), list[Node]()
     for node in list(nodes.nodes):
         if node.op == "call_function" and node.target in JUMPS:
             truth = node
-            if node.target in DECIDES:
+            if node.target in COMPARISONS:
                 with nodes.inserting_after(node):
-                    truth = nodes.call_function(aten.gt.Scalar, DECIDES[node.target](*node.args))
+                    truth = nodes.call_function(aten.gt.Scalar, COMPARISONS[node.target](*node.args))
             with nodes.inserting_after(truth):
                 found.append(nodes.call_function(aten._to_copy.default, (truth,), {"dtype": torch.float64}))
     if not found:

@@ -1,4 +1,4 @@
-"""Rules for bounds of operators that are others put together: written once, for forms and for programs of forms."""
+"""Bounds of operators that are compositions of others: one rule each, for the interpreter and for machine code."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
@@ -14,11 +14,11 @@ Rule = Callable[..., Any]
 
 
 class Operators:
-    """The rules of a reader as functions by the names of operators, as in `operators.mul(x, y)`.
+    """The rules for bounds as functions with the names of torch's operators, as in `operators.mul(x, y)`.
 
     Args:
-        rules: by torch's operators; of several overloads with a rule the default one is meant, else that of tensors.
-        first: what the reader's rules take before an operator's own arguments.
+        rules: operator ↦ rule. If several overloads have a rule, the default overload is used, else that of tensors.
+        first: arguments that all rules take before those of the operator: the program of machine code, or nothing.
     """
 
     def __init__(self, rules: Mapping[Any, Rule], *first: Any):
@@ -38,7 +38,7 @@ def on_forms(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
 
 
 def in_programs(rule: Rule, rules: Mapping[Any, Rule]) -> Rule:
-    """A composed rule for machine code, whose rules take the program first."""
+    """A composed rule for machine code; its first argument is the program."""
     return wraps(rule)(lambda program, *arguments, **keywords: rule(Operators(rules, program), *arguments, **keywords))
 
 
@@ -48,7 +48,7 @@ def _subtract_from(operators: Operators, x: Any, y: Any, alpha: float = 1) -> An
 
 
 def _power(operators: Operators, x: Any, exponent: float) -> Any:
-    """xᵖ for whole p, by squares of the halved power, and for p = ½; negative p by the reciprocal; x⁰ = 1."""
+    """xᵖ for p = ½ and whole p: (x^⌊p/2⌋)² or, for odd p, (x^⌊p/2⌋)² x; 1/x⁻ᵖ for negative p; x⁰ = 1."""
     if exponent == 0:
         return torch.ones(x.shape, dtype=torch.float64)
     if exponent < 0:
@@ -94,19 +94,19 @@ def _silu(operators: Operators, x: Any) -> Any:
 
 
 def _silu_backward(operators: Operators, gradient: Any, x: Any) -> Any:
-    """gradient · σ(1 + x(1 − σ))."""
+    """gradient · σ(x)(1 + x(1 − σ(x)))."""
     s = operators.sigmoid(x)
     inner = operators.add(operators.mul(x, operators.sub(1.0, s)), 1.0)
     return operators.mul(gradient, operators.mul(s, inner))
 
 
 def _sigmoid_backward(operators: Operators, gradient: Any, s: Any) -> Any:
-    """gradient · s(1 − s)."""
+    """gradient · s(1 − s), where s = σ(x) is the result."""
     return operators.mul(gradient, operators.sub(s, operators.mul(s, s)))
 
 
 def _tanh_backward(operators: Operators, gradient: Any, y: Any) -> Any:
-    """gradient · (1 − y²)."""
+    """gradient · (1 − y²), where y = tanh x is the result."""
     return operators.mul(gradient, operators.sub(1.0, operators.mul(y, y)))
 
 
@@ -122,4 +122,4 @@ COMPOSED: dict[Any, Rule] = {
     aten.sigmoid_backward.default: _sigmoid_backward,
     aten.tanh_backward.default: _tanh_backward,
 }
-"""Operator ↦ a rule of `Operators` and the operator's arguments."""
+"""Operator ↦ its rule, a function of `Operators` and the arguments of the operator."""

@@ -15,19 +15,20 @@ from lyapnet.value.calculus import ValueFunction, gradients, time_derivative
 
 
 class DecreaseCondition(nn.Module):
-    """c(t, x) = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| + α ℓ(x, u) − δ with u = policy(t, x): V falls where c ≤ 0, up
-    to δ, whatever else, of at most w_i, pushes each ẋ_i.
+    """c(t, x) = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| + α ℓ(x, u) − δ with u = policy(t, x).
+
+    Where c ≤ 0, V̇ ≤ δ − α ℓ for every disturbance d of ẋ with |d_i| ≤ w_i, since V_xᵀd ≤ Σ_i w_i |∂V/∂x_i|.
 
     Args:
         closed_loop: the system, its cost, and a control law that V defines.
-        alpha: α in (0, 1], the share of the running cost that V pays for.
-        delta: δ ≥ 0, in cost per second; with δ > 0 there is room around the goal, where all else vanishes.
-        constraints: h; c ≤ 0 is asked for where h(x) ≤ 0 alone.
-        disturbance: w ≥ 0, (n,), in the units of ẋ; none if None.
+        alpha: α in (0, 1], the share of the running cost by which V must fall.
+        delta: δ ≥ 0, in cost per second. Near the goal all other terms tend to 0; δ > 0 leaves room for bounds.
+        constraints: h; c ≤ 0 is required only where h(x) ≤ 0.
+        disturbance: w ≥ 0, (n,), in the units of ẋ; None means no disturbance.
     """
 
-    proves: ClassVar[str] = "above"  # what a kept proof of it is called
-    partial: ClassVar[bool] = False  # whether each level that is proved is a claim, not only the one that is wanted
+    proves: ClassVar[str] = "above"  # the name of its proof in a file of kept proofs
+    partial: ClassVar[bool] = False  # whether a proof up to a lower level than the wanted one is useful
     disturbance: State | None
 
     def __init__(
@@ -42,16 +43,18 @@ class DecreaseCondition(nn.Module):
         if not 0 < alpha <= 1:
             raise UsageError(f"Expected 0 < alpha ≤ 1, got {alpha}; V can pay for no more than the whole running cost.")
         if not 0 <= delta < float("inf"):
-            raise UsageError(f"Expected delta ≥ 0, got {delta}; give it in cost per second.")
+            raise UsageError(f"Expected delta ≥ 0, got {delta}; give a rate of cost, in cost per second.")
         if closed_loop.V is None:
-            raise UsageError("Expected a control law that a V defines, got another one; there is nothing to certify.")
+            raise UsageError(
+                "Expected a control law that a V defines, got one without V; certify a law from a value function."
+            )
         self.closed_loop, self.V, self.alpha, self.delta = closed_loop, closed_loop.V, alpha, delta
         self.constraints = constraints
         self.register_buffer("disturbance", disturbance)
 
     @property
     def facts(self) -> dict[str, Any]:
-        """By what numbers it can be built again for the same closed loop; plain data."""
+        """The numbers that define the condition for a given closed loop, as plain data."""
         w = None if self.disturbance is None else self.disturbance.tolist()
         return {"alpha": self.alpha, "delta": self.delta, "disturbance": w}
 
@@ -59,7 +62,7 @@ class DecreaseCondition(nn.Module):
         return self.parts(t, x)[0]
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
-        """(c, W, Ẇ), where Ẇ = V_t + V_xᵀ(f + g u) − δ is below 0 where c is, unless the cost is negative."""
+        """(c, W, Ẇ) with Ẇ = V_t + V_xᵀ(f + g u) + Σ_i w_i |∂V/∂x_i| − δ = c − α ℓ; so c ≤ 0 implies Ẇ ≤ 0 if ℓ ≥ 0."""
         loop, u = self.closed_loop, self.closed_loop.policy(t, x)
         fall = time_derivative(self.V, loop.system, t, x, u)
         if self.disturbance is not None:
@@ -67,7 +70,7 @@ class DecreaseCondition(nn.Module):
         return fall + self.alpha * loop.cost.running(x, u) - self.delta, self.height(t, x), fall - self.delta
 
     def worst_push(self, slope: State) -> PerState:
-        """Σ_i w_i |∂V/∂x_i|, by which pushes lift V̇ at most."""
+        """Σ_i w_i |∂V/∂x_i|, the most that a disturbance adds to V̇."""
         assert self.disturbance is not None
         return (self.disturbance * slope.abs()).sum(-1)
 
@@ -78,18 +81,17 @@ class DecreaseCondition(nn.Module):
         return self.constraints.worst(x) > 0
 
     def height(self, t: Time, x: State) -> PerState:
-        """W(t, x) = V(t, x) − δt: where Ẇ ≤ 0, sublevel sets of W hold what starts in them."""
+        """W(t, x) = V(t, x) − δt; trajectories stay in a sublevel set of W on which Ẇ ≤ 0."""
         return self.V(t, x) - self.delta * t
 
 
 class OwnOperations(ValueFunction):
-    """V as the torch operations that it runs at one (t, x): its gradient is theirs, by torch's derivative of each.
+    """V as the torch operations that it performs at one (t, x); its gradient is the derivative of these operations.
 
-    They are traced once: a V that changes with the calls is what it was then. On batches, where nothing is proved, it
-    is the declared V itself.
+    The operations are traced once, when this object is made. On batches, which proofs do not use, it is the declared V.
 
-    What V says of its gradient has no say here: an autograd.Function with another backward pass, hooks, `detach` and
-    `no_grad` leave no trace among the operations of V itself, and `value_and_state_gradient` is not asked.
+    The gradient that V declares has no effect here: the trace of V's value contains no custom backward pass of an
+    autograd.Function, no hooks, no `detach` and no `no_grad`, and `value_and_state_gradient` of V is not called.
     """
 
     def __init__(self, V: ValueFunction, domain: tuple[Corner, Corner]):
@@ -105,7 +107,7 @@ class OwnOperations(ValueFunction):
 
 
 class OwnConstraints(Constraints):
-    """Constraints as the torch operations that they run at one x, traced once; on batches, the declared ones."""
+    """Constraints as the torch operations that they perform at one x, traced once; on batches, the declared ones."""
 
     def __init__(self, constraints: Constraints, domain: tuple[Corner, Corner]):
         super().__init__()
@@ -118,19 +120,20 @@ class OwnConstraints(Constraints):
 
 
 def own_operations(V: ValueFunction, domain: tuple[Corner, Corner]) -> OwnOperations:
-    """V as its operations, traced unless it is so already."""
+    """V as its traced operations; V itself if it is traced already."""
     return V if isinstance(V, OwnOperations) else OwnOperations(V, domain)
 
 
 def own_constraints(constraints: Constraints, domain: tuple[Corner, Corner]) -> OwnConstraints:
-    """Constraints as their operations, traced unless they are so already."""
+    """Constraints as their traced operations; the constraints themselves if they are traced already."""
     return constraints if isinstance(constraints, OwnConstraints) else OwnConstraints(constraints, domain)
 
 
 def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int = 2) -> BoundedFunction:
-    """(c, W, Ẇ), and h where there are constraints, with bounds on boxes; V̇ is that of V's own operations.
+    """(c, W, Ẇ), and h if there are constraints, with bounds on boxes.
 
-    So c ≤ 0 proves that V falls, whatever gradient V declares; the control law is the one that runs.
+    V̇ is the derivative of V's traced operations, so that c ≤ 0 proves that V falls even if V declares a wrong gradient.
+    The control law is the one that runs, with the declared gradient.
     """
     declared = condition.V
     try:
@@ -142,13 +145,13 @@ def bounded_condition(condition: DecreaseCondition, domain: tuple[Corner, Corner
 
 
 def require_own_gradient(V: ValueFunction, domain: tuple[Corner, Corner], points: int = 500) -> None:
-    """Refuse a V that declares another gradient than that of its own operations: training and control would use it.
+    """Refuse a V whose declared gradient, which training and control use, is not the derivative of its operations.
 
-    The difference of the two is bounded, rounding included, at random points of the domain. What differs nowhere but
-    in a small part of the domain can escape; a proof does not rest on this check, but on bounded_condition.
+    The difference of the two is bounded, including rounding, at random points of the domain. A difference in a small
+    part of the domain can be missed. Proofs do not depend on this check: bounded_condition uses the derivative.
 
     Raises:
-        UsageError: the bounds at a point exclude 0.
+        UsageError: at a point, the bounds of the difference exclude 0.
     """
     own = own_operations(V, domain)
     V = own.declared

@@ -1,4 +1,4 @@
-"""Counterexamples: points (t, x) at which a condition fails, by samples and by ascent."""
+"""Counterexamples: points (t, x) at which a condition fails, found by sampling and gradient ascent."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from lyapnet.prover.condition import DecreaseCondition
 
 
 class Counterexample(NamedTuple):
-    """A point at which the condition fails, in plain arithmetic and by a lower bound of its value."""
+    """A point at which the condition fails: its value c is positive, and so is the lower bound of c there."""
 
     t: float
     x: list[float]
@@ -28,10 +28,10 @@ def find_counterexample(
     level: float,
     generator: torch.Generator | None = None,
 ) -> Counterexample | None:
-    """A point with c > 0 and W ≤ level, of the lowest W found: among samples, and by ascent of c from the worst 64.
+    """The point with c > 0 and W ≤ level of lowest W, among samples and the paths of ascent from the worst 64 of them.
 
     Args:
-        bounded: (c, W, Ẇ).
+        bounded: (c, W, Ẇ) with bounds, which confirm the point.
     """
     points = _likely_violations(condition, lower, upper, level, generator)
     return lowest_violation(condition, bounded, points, level)
@@ -40,7 +40,7 @@ def find_counterexample(
 def lowest_violation(
     condition: DecreaseCondition, bounded: BoundedFunction, points: Points, level: float
 ) -> Counterexample | None:
-    """Among points at which c > 0 and W ≤ level, by bounds too, the one of lowest W."""
+    """The point of lowest W among the given ones with W ≤ level and c > 0, confirmed by a lower bound of c; or None."""
     c, W = _values(condition, points)
     candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
     candidates = candidates[W[candidates].argsort()][:256]
@@ -61,7 +61,7 @@ def violations(
     count: int,
     generator: torch.Generator | None = None,
 ) -> Points:
-    """The worst points (t, x) found with c > 0 and W ≤ level, in plain arithmetic; at most `count`."""
+    """At most `count` points (t, x) with c > 0 and W ≤ level, those of greatest c; not confirmed by bounds."""
     points = _likely_violations(condition, *domain, level, generator)
     c, W = _values(condition, points)
     worst = torch.where(level >= W, c, -torch.inf).topk(min(count, len(points)))
@@ -77,7 +77,7 @@ def _likely_violations(
     samples: int = 20_000,
     steps: int = 40,
 ) -> Points:
-    """Samples of the box, and the points that ascent passes from the worst 64 of them with W ≤ level."""
+    """Samples of the box, and all points of the paths of ascent from the worst 64 samples with W ≤ level."""
     points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
     c, W = _values(condition, points)
     start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
@@ -87,7 +87,7 @@ def _likely_violations(
 def _ascend(
     condition: DecreaseCondition, points: Points, lower: Corner, upper: Corner, steps: int
 ) -> Float[Tensor, "passed axes"]:
-    """Points on the way up c, by the signs of its gradient in units of the box, with shrinking steps."""
+    """All points of paths along which c rises: steps of decreasing length along the signs of the gradient of c."""
     path = [points]
     for step in range(steps):
         with torch.enable_grad():
@@ -100,7 +100,7 @@ def _ascend(
 
 
 def _values(condition: DecreaseCondition, points: Points) -> tuple[PerState, PerState]:
-    """(c, W); c is −∞ where a constraint excludes the state, so that no counterexample lies there."""
+    """(c, W), where c is −∞ at states that a constraint excludes, so that they are no counterexamples."""
     with torch.no_grad():
         t, x = points[:, 0], points[:, 1:]
         c = condition(t, x)

@@ -1,16 +1,17 @@
-"""Proofs in files, finished or not: how the domain was cut, from which they go on, and which others can check.
+"""Files of proofs, finished or not: a search can continue from them, and other people can check them.
 
-A file holds a proof by the name of what it proves (`DecreaseCondition.proves`), or the two of a two-sided claim: what
-it is about, as plain data, how the domain was cut (5 bytes a cut), which leaves are closed and which wait, and what has
-lowered the level; before all that stands its SHA-256. What is read is believed only as far as this goes:
+A file holds one proof, or the two proofs of a two-sided claim, under their names (`DecreaseCondition.proves`). A proof
+consists of plain data: what it is about, how the domain was cut (5 bytes a cut), which leaves are closed (decided),
+which wait (undecided), and the counterexample that lowered the level. A SHA-256 digest precedes the data. The data are
+verified as follows when they are read:
 
-* A flipped bit, a truncated file or one of an earlier format fails the digest or the first line.
-* The leaves are made from the cuts, so that they cover the domain exactly; closed and waiting ones must be all of them.
+* A changed bit, a truncated file and a file of an earlier format are detected by the digest or the first line.
+* The leaves are computed from the cuts, so they cover the domain exactly; each must be either closed or waiting.
 * The level is computed from the counterexample, which is evaluated again.
-* A finished proof is not believed: its leaves are bounded again.
+* The leaves of a finished proof are bounded again.
 
-Someone who edits a file and its digest can still call closed what waits in an unfinished proof. Resuming trusts the
-digest there; `lyapnet certify check` does not, since it bounds every leaf and believes neither of the two lists.
+Someone who edits an unfinished proof and its digest can still list a waiting leaf as closed. Resuming relies on the
+digest; `lyapnet certify check` does not use the two lists, but bounds every leaf.
 """
 
 import hashlib
@@ -38,16 +39,15 @@ from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.prover.operators import files
 
 SOURCES = (Path(__file__).parent,)
-"""The folder of what a proof is made by: the search, the bounds and their kernel.
+"""The folder whose code a proof depends on: the search, the bounds and their kernel.
 
-f, g, ℓ, V, u and the calculus that assembles c from them need no place here: their outcome is in the fingerprint of the
-traced function, operation by operation and number by number. The file of the tracing is hashed beside the folder: it
-joins equal operations of what is bounded.
+f, g, ℓ, V, u and the code that assembles c from them are not listed: the fingerprint of the traced function contains
+all their operations and numbers. The file of the tracing is hashed too, because it merges equal operations.
 """
 
 
 def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
-    """A hash of every source file in some folders, with their names, the compilation, torch and own operators."""
+    """A hash of the code in the folders and of the tracing, compiler flags, torch's version and own operators."""
     found = hashlib.sha256(repr((FLAGS, str(torch.__version__), *files())).encode())
     found.update(Path(tracing.__file__).read_bytes())
     for folder in folders:
@@ -58,17 +58,17 @@ def hash_of_sources(folders: Sequence[Path] = SOURCES) -> str:
     return found.hexdigest()
 
 
-class Standing(NamedTuple):
-    """Where a proof stands."""
+class ProofState(NamedTuple):
+    """The state of a proof."""
 
     search: Search
-    level: float  # under which the rest is proved
-    worst: Counterexample | None  # what has lowered the level
+    level: float  # the level up to which it is being proved
+    worst: Counterexample | None  # the one that lowered the level
     seconds: float = 0.0
 
     @property
     def proved(self) -> float:
-        """The level up to which c ≤ 0 is known."""
+        """The level up to which c ≤ 0 is proved: undecided boxes have W ≥ search.least."""
         return min(self.level, just_below(self.search.least))
 
 
@@ -79,18 +79,19 @@ def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner,
 
 
 FORMAT = b"lyapnet proof 3\n"
-PROVED = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
-TOGETHER = {"above", "below"}
-"""What stands in one file where it is proved of the same V: the two sides of a two-sided claim."""
+DESCRIPTIONS = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
+"""Name of a proof ↦ what it proves, in words."""
+TWO_SIDED = {"above", "below"}
+"""The two proofs of a two-sided claim, which share a file."""
 
 
 @dataclass
 class KeptProof:
-    """The file of a proof of one function on one box up to one level, by the rules of this version.
+    """The file of a proof of one condition on one box up to one level, by this version's code.
 
     Args:
-        about: what is proved; plain data.
-        wanted: the level up to which it is tried.
+        about: what is proved, as plain data; see the function `about`.
+        wanted: the level up to which the condition is to be proved.
     """
 
     path: Path
@@ -102,11 +103,11 @@ class KeptProof:
 
     @property
     def identity(self) -> list[Any]:
-        """The condition, the level, and the prover's sources: another version might not prove its closed boxes."""
+        """The condition, the wanted level and a hash of the code: other code might not prove the closed boxes."""
         return [self.about, self.wanted, hash_of_sources()]
 
-    def write(self, proof: Standing) -> None:
-        """Keep a proof, all or nothing."""
+    def write(self, proof: ProofState) -> None:
+        """Write the state of a proof; the file is replaced as a whole or not at all."""
         search, worst = proof.search, proof.worst
         node, axis = search.tree.cuts
         closed = torch.ones(2 * len(node) + 1, dtype=torch.bool)
@@ -120,17 +121,17 @@ class KeptProof:
         self._proofs[self.about["proves"]] = content
         write_proofs(self.path, self._proofs)
 
-    def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> Standing | None:
-        """The proof that the file keeps; None where there is none yet.
+    def read(self, domain: tuple[Corner, Corner], level: Callable[[Counterexample | None], float]) -> ProofState | None:
+        """The state of the proof in the file; None if there is none yet.
 
         Args:
-            level: of a proof with this counterexample; it may refuse it by a ValueError.
+            level: counterexample ↦ level of the proof; it raises ValueError if the counterexample is none.
 
         Raises:
             UsageError: the file holds something else.
         """
         name = self.about["proves"]
-        if name not in self._proofs and {name, *self._proofs} <= {name} | TOGETHER:
+        if name not in self._proofs and {name, *self._proofs} <= {name} | TWO_SIDED:
             return None
         content = part_of(self._proofs, name, self.path, "take a new file")
         with refusing(self.path):
@@ -145,23 +146,23 @@ class KeptProof:
             place = torch.full((2 * tree.size + 1,), -1)
             place[leaves.node] = torch.arange(len(leaves.key))
             if len(named) != len(leaves.key) or not named.sort().values.equal(leaves.node.sort().values):
-                raise ValueError("closed boxes and waiting ones are not all")
+                raise ValueError("closed and waiting leaves are not all leaves")
             found = content["worst"]
             worst = None if found is None else Counterexample(**found)
             reached = level(worst)
             waiting = leaves[place[frontier]]._replace(key=key.double())
             if len(key) != len(frontier) or not bool((key <= reached).all()):
-                raise ValueError("a waiting box has no place in the order")
-            finished = not len(frontier)  # then all is bounded once more
+                raise ValueError("a waiting leaf has a key above the level")
+            finished = not len(frontier)  # all leaves of a finished proof are bounded again
             given_up = float("inf") if finished else content["given_up"]
             search = Search(leaves if finished else waiting, content["boxes"], given_up, tree)
-            return Standing(search, reached, worst, content["seconds"])
+            return ProofState(search, reached, worst, content["seconds"])
 
-    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> Standing:
-        """The leaves of a proof of the same, none of them decided, and the level that it claims.
+    def claim(self, domain: tuple[Corner, Corner], partial: bool = False) -> ProofState:
+        """The claim of a kept proof: all leaves, undecided, and the level that it says is proved.
 
         Args:
-            partial: whether what an unfinished proof has reached is a claim, too.
+            partial: accept an unfinished proof too, with the level that it has reached.
 
         Raises:
             UsageError: the file holds another proof, an unfinished one, or none.
@@ -174,7 +175,7 @@ class KeptProof:
                     "name its checkpoint."
                 )
             leaves, waiting = CutTree(content["node"], content["axis"]).leaves(*domain), len(content["frontier"])
-            claimed = Standing(Search(leaves), float(content["proved"]), None)
+            claimed = ProofState(Search(leaves), float(content["proved"]), None)
         if waiting and not partial:
             raise UsageError(
                 f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
@@ -184,22 +185,22 @@ class KeptProof:
 
 
 def part_of(proofs: dict[str, Any], name: str, path: Path, remedy: str = "name another") -> dict[str, Any]:
-    """The proof of that name among those of a file.
+    """The proof of that name among the proofs of a file.
 
     Raises:
-        UsageError: there is none; says what there is.
+        UsageError: there is none; the message lists those that exist.
     """
     with refusing(path):
         if name not in proofs:
             raise UsageError(
-                f"Expected the proof of {PROVED[name]} in {str(path)!r}, got that of "
-                f"{' and of '.join(PROVED[each] for each in sorted(proofs))}; {remedy}."
+                f"Expected the proof of {DESCRIPTIONS[name]} in {str(path)!r}, got that of "
+                f"{' and of '.join(DESCRIPTIONS[each] for each in sorted(proofs))}; {remedy}."
             )
         return proofs[name]
 
 
 def write_proofs(path: Path, proofs: dict[str, Any]) -> None:
-    """Write proofs by their names, all or nothing."""
+    """Write proofs by their names; the file is replaced as a whole or not at all."""
     buffer = io.BytesIO()
     torch.save(proofs, buffer)
     payload = buffer.getvalue()
@@ -207,10 +208,10 @@ def write_proofs(path: Path, proofs: dict[str, Any]) -> None:
 
 
 def read_proofs(path: Path) -> dict[str, Any]:
-    """The proofs that a file holds, by their names, as they were written.
+    """The proofs in a file by their names; the digest is verified.
 
     Raises:
-        UsageError: there is no such file; or it is another, of an earlier version, or changed since.
+        UsageError: there is no such file, it has another format, or it was changed since it was written.
     """
     with refusing(path):
         content = read_file(path)
@@ -218,20 +219,20 @@ def read_proofs(path: Path) -> dict[str, Any]:
         head, payload = content[:start], content[start:]
         if head != FORMAT + hashlib.sha256(payload).digest():
             if not content.startswith(FORMAT):
-                raise ValueError("another first line")
+                raise ValueError("the first line is not that of this format")
             raise UsageError(
                 f"Expected the proof that was written, got {str(path)!r}, which was changed or damaged since; name a "
                 "copy of it, or another."
             )
         proofs = plain_data_of(io.BytesIO(payload))
-        if not proofs or not proofs.keys() <= PROVED.keys():
-            raise ValueError("no proofs by their names")
+        if not proofs or not proofs.keys() <= DESCRIPTIONS.keys():
+            raise ValueError("the file holds no proofs by their names")
         return proofs
 
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Whatever fails while a file is read is a UsageError that names the file; a UsageError says so itself."""
+    """A context that turns every exception into a UsageError that names the file; a UsageError passes unchanged."""
     try:
         yield
     except UsageError:

@@ -1,4 +1,4 @@
-"""Rules for linear systems with a few unknowns whose matrix depends on the point."""
+"""Rules for small linear systems whose matrix depends on the point."""
 
 from typing import Any
 
@@ -15,9 +15,9 @@ aten = torch.ops.aten
 def solve(A: TaylorForm, B: TaylorForm) -> TaylorForm:
     """A⁻¹B for A of shape (n, n) and B of shape (n, k).
 
-    With K close to the inverse of A in the middle of the box, KA stays close to the identity, and KA y = KB is solved
-    by Gauss-Jordan elimination without exchanging rows. Any K is sound: A y = B implies KA y = KB, and pivots that
-    avoid 0 show that KA, hence A, is regular. Where one does not, nothing is known.
+    Let K be the computed inverse of A at the middle of the box. KA is then close to the identity, and KA y = KB is
+    solved by Gauss-Jordan elimination without pivoting, in Taylor forms. The result encloses A⁻¹B for any K: A y = B
+    implies KA y = KB, and if no pivot contains 0, KA is regular, hence A is. If a pivot contains 0, no bound is known.
     """
     K = torch.linalg.inv_ex(A.center).inverse
     system = _from_left(K, A.with_parts(torch.cat([A.terms, B.terms], -1), torch.cat([A.radius, B.radius], -1)))
@@ -32,8 +32,8 @@ def solve(A: TaylorForm, B: TaylorForm) -> TaylorForm:
 
 
 def _from_left(K: Tensor, x: TaylorForm) -> TaylorForm:
-    """K x with a matrix K for each box, (boxes, n, n)."""
-    x = x.rounded(2 * K.shape[-1])  # as in taylor.matrix_product
+    """K x with a constant matrix K for each box, (boxes, n, n): the terms by K, the remainder by |K|."""
+    x = x.with_rounding(2 * K.shape[-1])  # as in taylor.matrix_product
     return x.with_parts(K @ x.terms, K.abs() @ x.radius + taylor.TINY)
 
 
@@ -42,9 +42,9 @@ def _columns(x: TaylorForm, columns: slice) -> TaylorForm:
 
 
 def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) -> list[Any]:
-    """A⁻¹B; of what torch gives with it nothing is known, neither factors nor whether it found A singular."""
+    """A⁻¹B; the other results of torch (LU factors, pivots, the code for a singular A) have no bounds."""
     if not left:
-        raise UsageError("Expected linear systems A y = b, got y A = b; transpose it.")
+        raise UsageError("Expected a linear system A y = b, got y A = b; transpose it.")
     A, B = _forms(A, B)
     if len(B.shape) == 1:
         solution = solve(A, B.with_parts(B.terms[..., None], B.radius[..., None]))
@@ -55,7 +55,7 @@ def solve_rule(A: Any, B: Any, left: bool = True, check_errors: bool = False) ->
 
 
 def inverse_rule(A: TaylorForm, check_errors: bool = False) -> list[Any]:
-    """A⁻¹; whether torch finds A singular is not known."""
+    """A⁻¹; the code for a singular A has no bounds."""
     identity = taylor.constant_form(torch.eye(A.shape[0]).to(A.radius), A)
     return [solve(A, identity), None]
 

@@ -1,7 +1,7 @@
-"""A new operator in one declaration: its row in the table of operators, and its bounds.
+"""Registration of an operator: its row in the table of operators, and its bounds.
 
-The row (lyapnet.graphs.operators) serves numbers, C, JavaScript and CasADi. Bounds are given here, not in the row: what
-a kept proof depends on is this folder, and the file that registers an operator joins it (`files`).
+The row (lyapnet.graphs.operators) serves numbers, C, JavaScript and CasADi. Bounds are registered here, not in the row,
+because a kept proof depends on the code of this folder and on the files that register bounds (`files`).
 """
 
 import os
@@ -27,24 +27,25 @@ from lyapnet.prover.taylor import TaylorForm, monomials
 
 Bound = Elementary | Callable[..., Any]
 
-BOXES, POINTS = 40, 40  # on which bounds are held against values
-CLOSE = 1e-7  # how far a derivative may be from torch's, relative to its size, or to 1 where it is smaller
+BOXES, POINTS = 40, 40  # numbers of boxes, and of points in each, at which bounds are compared with values
+TOLERANCE = 1e-7  # largest difference of a derivative from torch's, relative to max(1, |derivative|)
 
 KINDS: dict[str, dict[Any, Any]] = {"smooth": {}, "kink": KINKS, "jump": JUMPS}
 _files = list[bytes]()
 
 
 def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", "kink", "jump"] = "smooth") -> None:
-    """Put an operator of torch into the table, for all that reads traces; its derivative is torch's own.
+    """Add an operator of torch to the table of operators; its derivative is torch's own.
 
     Args:
-        row: a new one, or one of the table that has no bounds yet.
-        bound: an Elementary function of one number; or (operators, *operands) ↦ the same in other operators, as
-            `operators.mul(x, operators.sigmoid(x))`, of which there is machine code too. None: certificates refuse it.
-        kind: whether the derivative exists everywhere, or jumps at kinks, or the function itself jumps.
+        row: a new row, or one of the table that has no bounds yet.
+        bound: an Elementary function of one number; or a composition (operators, *operands) ↦ result, such as
+            `operators.mul(x, operators.sigmoid(x))`, which machine code can use too. With None, certificates refuse the
+            operator.
+        kind: "smooth" if the derivative exists everywhere, "kink" if it jumps, "jump" if the function itself jumps.
 
     Raises:
-        UsageError: the table has it already, or torch does not; or a value was found that lies outside its bounds.
+        UsageError: the table has the row already, or torch lacks the operator; or a value lies outside its bounds.
     """
     if kind not in KINDS:
         raise UsageError(f"Expected kind as one of {', '.join(KINDS)}, got {kind!r}; choose one.")
@@ -58,23 +59,24 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         raise UsageError(f"Expected an operator without bounds, got {row.name}.")
     if bound is None:
         return
-    with ExitStack() as undo:  # a rule that nobody has checked does not stay, after Ctrl-C neither
+    with ExitStack() as undo:  # removes the rule unless its check succeeds, after Ctrl-C too
         undo.callback(forget, row, is_new)
         try:
-            _put_beside(row, bound, kind)
+            _add_bounds(row, bound, kind)
             wrong = next(complaints(row), None)
         except Exception as error:
             raise UsageError(
-                f"Expected bounds of {row.name}, got {one_line(error)} as they were tried; mend it."
+                f"Expected bounds of {row.name}, got {one_line(error)} while they were checked; mend them."
             ) from error
         if wrong is not None:
-            raise UsageError(f"Expected bounds of {row.name} that hold its values, got {wrong}.")
-        _files.extend(_content(file) for file in dict.fromkeys([caller, *_files_of(bound)]))  # always in this order
+            raise UsageError(f"Expected bounds that enclose the values of {row.name}, got {wrong}; mend them.")
+        # dict.fromkeys has a fixed order, on which the hash of a proof's code depends
+        _files.extend(_content(file) for file in dict.fromkeys([caller, *_files_of(bound)]))
         undo.pop_all()
 
 
-def _put_beside(row: Operator, bound: Bound, kind: str) -> None:
-    """Give bounds to all overloads of a row."""
+def _add_bounds(row: Operator, bound: Bound, kind: str) -> None:
+    """Add rules for bounds of all overloads of a row."""
     for overload in row.overloads:
         composed = not isinstance(bound, Elementary)
         rule = on_forms(bound, RULES) if composed else bound
@@ -85,7 +87,7 @@ def _put_beside(row: Operator, bound: Bound, kind: str) -> None:
 
 
 def _files_of(bound: Bound) -> Iterator[Path]:
-    """The files in which the functions of a bound are written."""
+    """The files that define the functions of a bound."""
     parts = vars(bound).values() if isinstance(bound, Elementary) else [bound]
     for part in [*parts, *(getattr(bound, "derivatives", None) or ())]:
         code = getattr(part, "__code__", None)
@@ -94,12 +96,12 @@ def _files_of(bound: Bound) -> Iterator[Path]:
 
 
 def _content(file: Path) -> bytes:
-    """The content of a file; of what was typed, something else in each process."""
+    """The content of a file; for code typed at a prompt, random bytes, so that no other process has the same hash."""
     return file.read_bytes() if file.is_file() else os.urandom(16)
 
 
 def forget(row: Operator, is_new: bool = True) -> None:
-    """Undo the registration of a row, or of its bounds alone."""
+    """Undo the registration of a new row, or that of bounds of an old one."""
     if is_new:
         table.remove(row)
     for overload in row.overloads:
@@ -108,17 +110,17 @@ def forget(row: Operator, is_new: bool = True) -> None:
 
 
 def files() -> list[bytes]:
-    """The content of each file that has registered bounds; of what was typed, something else in each process."""
+    """The content of each file that has registered bounds; random bytes for code typed at a prompt."""
     return _files
 
 
 def has_bounds(row: Operator) -> bool:
-    """Whether there is a rule for bounds of the operator on tensors."""
+    """Whether the operator has a rule for bounds."""
     return row.overloads[0] in RULES
 
 
 def complaints(row: Operator) -> Iterator[str]:
-    """What is wrong with the bounds of a row: on random boxes of its domain, and in the parts of an Elementary."""
+    """Errors in the bounds of a row: values outside on random boxes of its domain, and wrong parts of an Elementary."""
     rule = RULES[row.overloads[0]]
     if isinstance(rule, Elementary):
         yield from _wrong_parts(row, rule)
@@ -126,7 +128,7 @@ def complaints(row: Operator) -> Iterator[str]:
     lower, upper, points = _boxes(1 + row.operands)
     values = row(*row.at(points[..., 1:])).double()
     if not values.isfinite().all():
-        yield f"a domain {row.domain} in which it is not finite"
+        yield f"values that are not finite in the domain {row.domain}"
         return
     for degree in (1, 2, 3):
         try:
@@ -137,23 +139,23 @@ def complaints(row: Operator) -> Iterator[str]:
         kernel = bounded.kernel(lower, upper)
         for form, *_ in [bounded.forms(lower, upper), *([] if kernel is None else [kernel.forms(lower, upper)])]:
             if not form.radius.isfinite().any():
-                yield f"none in forms of degree {degree}"
-            room = form.radius * (1 + 1e-9) + 1e-13 * form.magnitude  # for the rounding of these lines
-            inside = (values - _at(form, points, lower, upper)).abs() <= room  # not where one of them is no number
+                yield f"no finite bounds in forms of degree {degree}"
+            room = form.radius * (1 + 1e-9) + 1e-13 * form.magnitude  # for the rounding of this check
+            inside = (values - _at(form, points, lower, upper)).abs() <= room  # false if one of them is nan
             outside = int((~inside).sum())
             if outside:
                 yield f"{outside} of {values.numel()} values outside, in forms of degree {degree}"
 
 
 def _at(form: TaylorForm, points: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """The polynomials of forms of boxes at points in them, (points, boxes)."""
+    """The polynomials of forms at points of their boxes, (points, boxes)."""
     epsilon = ((points - (lower + upper) / 2) / ((upper - lower) / 2)).clamp(-1, 1)
     powers = [epsilon[..., list(axes)].prod(-1) for axes in monomials(form.dimension, form.degree)]
     return torch.stack([term * power for term, power in zip(form.terms, powers, strict=True)]).sum(0)
 
 
 def _boxes(axes: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Boxes in the unit cube, wide and narrow ones, and points of them, some on their sides."""
+    """(lower, upper, points) of wide and narrow boxes in the unit cube; some points lie on their sides."""
     generator = torch.Generator().manual_seed(0)
     middle, width = torch.rand(2, BOXES, axes, generator=generator, dtype=torch.float64)
     width = width * 10.0 ** -torch.arange(BOXES).remainder(4)[:, None]
@@ -162,30 +164,30 @@ def _boxes(axes: int) -> tuple[Tensor, Tensor, Tensor]:
     return lower, upper, lower + (upper - lower) * share
 
 
-def _wrong_parts(row: Operator, of: Elementary) -> Iterator[str]:
-    """The parts of an Elementary that are not what torch differentiates the function to."""
+def _wrong_parts(row: Operator, bound: Elementary) -> Iterator[str]:
+    """Errors in the parts of an Elementary: a function or derivative that differs from torch's, a range too narrow."""
     (x,) = row.at(torch.linspace(0, 1, 201, dtype=torch.float64)[:, None])
-    if not _are_close(of.function(x), row(x)):
-        yield "another function"
-    chain = [of.function, of.derivative]
-    if of.derivatives is not None:
-        chain += [of.derivatives.second, of.derivatives.third]
+    if not _are_close(bound.function(x), row(x)):
+        yield "another function than the operator"
+    chain = [bound.function, bound.derivative]
+    if bound.derivatives is not None:
+        chain += [bound.derivatives.second, bound.derivatives.third]
     for order in range(1, len(chain)):
         if not _are_close(chain[order](x), _slope(chain[order - 1], x)):
-            yield f"another derivative of order {order}"
-    if of.derivatives is None:
+            yield f"another derivative of order {order} than torch"
+    if bound.derivatives is None:
         return
-    ranges = of.derivatives.third_range, of.derivatives.fourth_range
-    for values, range_of in zip((of.derivatives.third(x), _slope(of.derivatives.third, x)), ranges, strict=True):
-        if not all(_holds(range_of, x, values, steps) for steps in (2, 20, 200)):
-            yield f"a range of a derivative of order {3 + ranges.index(range_of)} that does not hold it"
+    ranges = bound.derivatives.third_range, bound.derivatives.fourth_range
+    for values, range_of in zip((bound.derivatives.third(x), _slope(bound.derivatives.third, x)), ranges, strict=True):
+        if not all(_encloses(range_of, x, values, steps) for steps in (2, 20, 200)):
+            yield f"a range of the derivative of order {3 + ranges.index(range_of)} that does not contain its values"
 
 
-def _holds(range_of: Callable[..., tuple[Tensor, Tensor]], x: Tensor, values: Tensor, steps: int) -> bool:
-    """Whether values at rising points lie in the range on each interval of so many steps."""
+def _encloses(range_of: Callable[..., tuple[Tensor, Tensor]], x: Tensor, values: Tensor, steps: int) -> bool:
+    """Whether values at increasing points lie in the range on each interval of `steps` steps between them."""
     low, high = range_of(x[:-steps], x[steps:])
     inside = values.unfold(0, steps + 1, 1)
-    room = CLOSE * (1 + inside.abs())
+    room = TOLERANCE * (1 + inside.abs())
     return bool(((low[:, None] - room <= inside) & (inside <= high[:, None] + room)).all())
 
 
@@ -196,4 +198,4 @@ def _slope(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:
 
 
 def _are_close(found: Tensor, expected: Tensor) -> bool:
-    return bool(((found - expected).abs() <= CLOSE * (1 + expected.abs())).all())
+    return bool(((found - expected).abs() <= TOLERANCE * (1 + expected.abs())).all())

@@ -1,4 +1,4 @@
-"""Where a condition c ≤ 0 holds: on sublevel sets of W = V − δt, proved on boxes."""
+"""Proves a condition c ≤ 0 on sublevel sets of W = V − δt, by bounds on boxes."""
 
 import dataclasses
 from collections.abc import Callable
@@ -17,26 +17,26 @@ from lyapnet.prover.boxes import Boxes, single
 from lyapnet.prover.branch_and_bound import MARGIN, Budget, Question, Search, axis_to_cut
 from lyapnet.prover.condition import DecreaseCondition, bounded_condition
 from lyapnet.prover.counterexamples import Counterexample, find_counterexample, lowest_violation
-from lyapnet.prover.kept_proofs import KeptProof, Standing, about, hash_of_sources
+from lyapnet.prover.kept_proofs import KeptProof, ProofState, about, hash_of_sources
 from lyapnet.prover.verdict import Verdict
 from lyapnet.prover.workers import bounding
 
 
 @dataclass(frozen=True)
 class Proof:
-    """c ≤ 0 at every (t, x) of a box with W(t, x) = V(t, x) − δt ≤ `level`; −∞ where nothing is proved.
+    """The result: c ≤ 0 at every (t, x) of a box with W(t, x) = V(t, x) − δt ≤ `level`; −∞ if nothing is proved.
 
-    What remains undecided lies above that level.
+    Undecided boxes lie above that level.
     """
 
     level: float
-    wanted: float  # the level up to which it was tried
-    counterexample: Counterexample | None  # the one of lowest W that was found
+    wanted: float  # the level up to which c ≤ 0 was to be proved
+    counterexample: Counterexample | None  # the one of lowest W among those found
     boxes: int
     seconds: float
-    remaining_volume: float  # share of the box
-    undecided: Points  # centres (t, x) of boxes that remain
-    fingerprint: str  # of (c, W) as it was traced: what the proof is about
+    remaining_volume: float  # volume of the undecided boxes, as a share of the box
+    undecided: Points  # centres (t, x) of undecided boxes, at most MAX_CENTRES
+    fingerprint: str  # hash of the traced function that was bounded
 
     @property
     def verdict(self) -> Verdict:
@@ -47,7 +47,7 @@ class Proof:
 
 
 class Progress(NamedTuple):
-    """How far a proof is; or what is done before its first box, and after its last one."""
+    """The progress of a proof, or the stage of the work before its first box or after its last one."""
 
     boxes: int  # bounded so far
     remaining: float  # share of the domain that is undecided
@@ -56,17 +56,15 @@ class Progress(NamedTuple):
 
 
 def tell(report: Callable[[Progress], None] | None, budget: Budget, stage: str) -> None:
-    """Tell a report what is done while no boxes of a proof are bounded."""
+    """Report a stage of the work during which no boxes of a proof are bounded."""
     if report is not None:
         report(Progress(0, 1.0, budget.elapsed, stage))
 
 
 CPU = torch.device("cpu")
-BELOW = (
-    1e-2  # of a counterexample's W, by which the level stays below it; else ever smaller boxes would follow its edge
-)
-KEEP_EVERY = 30.0  # seconds
-KEPT = 1000  # undecided boxes whose centres a proof names
+LEVEL_DROP = 1e-2  # the level is 1 % below W of a counterexample: boxes that approach it would become ever smaller
+SAVE_INTERVAL = 30.0  # seconds between two writes of the file that keeps a proof
+MAX_CENTRES = 1000  # undecided boxes whose centres are in the result, at most
 
 
 def prove(
@@ -83,17 +81,22 @@ def prove(
 ) -> Proof:
     """Prove c ≤ 0 and Ẇ ≤ 0 on {W ≤ wanted}, or on as high a sublevel set as the budget and the counterexamples allow.
 
-    Counterexamples are sought first, by samples and ascent, then boxes of lowest W are bounded: dropped where both hold
-    on all of them, or W > level, or some h > 0, and else cut in two. A counterexample among centres lowers the level.
+    First, sampling and ascent look for counterexamples. Then boxes are bounded, those of lowest W first. A box is
+    dropped if the bounds show on all of it that c ≤ 0 and Ẇ ≤ 0, or that W > level, or that some h > 0; otherwise it is
+    cut in two. A counterexample at the centre of a box lowers the level. The proof covers the domain because the boxes
+    do, and holds up to the lowest W of the boxes that stay undecided.
 
     Args:
-        condition, degree: in float64, and of the forms that bound it.
+        condition: the condition, in float64.
         domain: (lower, upper) of (t, x).
-        stop_at_counterexample: give up the level that is wanted rather than look for a lower one.
-        report: is told how far it is, after every few thousand boxes.
-        keep: a file in which the proof is kept, and from which it goes on; a finished one is bounded once more.
-        replay: bound each leaf of the kept proof once, in place of a search. Nothing in the file is believed: were its
-            cuts or level wrong, a leaf would stay undecided. 1 % may be cut again, as rounding differs by machine.
+        wanted: the level up to which c ≤ 0 is to be proved.
+        stop_at_counterexample: stop at the first counterexample, instead of proving a lower level.
+        report: called with the progress after every few thousand boxes.
+        keep: a file that keeps the proof, and from which it continues; a finished proof is bounded again.
+        replay: bound each leaf of the kept proof once, instead of searching. Nothing in the file is assumed to be true:
+            with wrong cuts or a wrong level, a leaf would stay undecided. 1 % of the leaves may be cut again, because
+            rounding differs between machines.
+        degree: degree of the Taylor forms.
 
     Raises:
         UsageError: the file keeps the proof of something else.
@@ -108,107 +111,108 @@ def prove(
         leaves, question.level = len(begun.search.frontier.key), min(wanted, begun.level)
         budget = dataclasses.replace(budget, boxes=leaves + leaves // 100 + 100)
     else:
-        begun = (kept.read((lower, upper), question.again) if kept else None) or question.begin(lower, upper, generator)
+        begun = kept.read((lower, upper), question.level_below) if kept else None
+        begun = begun or question.begin(lower, upper, generator)
     search, earlier, saved = begun.search, begun.seconds, budget.elapsed
 
-    def standing() -> Standing:
-        return Standing(search, question.level, question.worst, earlier + budget.elapsed)
+    def state() -> ProofState:
+        return ProofState(search, question.level, question.worst, earlier + budget.elapsed)
 
-    again = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
-    with bounding(question, budget.workers, budget.ray, again) as run:
+    make_question = partial(bounded_again, condition, (lower, upper), degree, proved_by(bounded))
+    with bounding(question, budget.workers, budget.ray, make_question) as run:
         for _ in search.rounds(question, budget, run):
-            if kept is not None and budget.elapsed > saved + KEEP_EVERY:
-                kept.write(standing())
+            if kept is not None and budget.elapsed > saved + SAVE_INTERVAL:
+                kept.write(state())
                 saved = budget.elapsed
             if report is not None:
                 report(Progress(search.boxes, search.frontier.share(lower, upper), earlier + budget.elapsed))
-    end = standing()
+    end = state()
     if kept is not None:
         kept.write(end)
     return Proof(
         -torch.inf if question.settled else end.proved, wanted, end.worst, search.boxes, end.seconds,
-        search.frontier.share(lower, upper), search.frontier.center[:KEPT], bounded.fingerprint,
+        search.frontier.share(lower, upper), search.frontier.center[:MAX_CENTRES], bounded.fingerprint,
     )  # fmt: skip
 
 
 def proved_by(bounded: BoundedFunction) -> tuple[str, str, str]:
-    """What is bounded, by which sources of lyapnet, and by which torch."""
+    """(hash of the bounded function, hash of the code that bounds it, version of torch)."""
     return bounded.fingerprint, hash_of_sources(), str(torch.__version__)
 
 
 def bounded_again(
     condition: DecreaseCondition, domain: tuple[Corner, Corner], degree: int, by: tuple[str, str, str]
 ) -> "WhereItHolds":
-    """The same question on another machine, where the condition is traced anew.
+    """The question on another machine, where the condition is traced again.
 
     Raises:
-        UsageError: something else was traced there, or is bounded by other code.
+        UsageError: the traced function or the code that bounds it differs there.
     """
     bounded = bounded_condition(condition, domain, degree)
     if proved_by(bounded) != by:
         raise UsageError(
             "Expected the same condition, lyapnet and torch on each machine of the cluster, got others; install the "
-            "same versions, and the same code of yours, there."
+            "same versions, and your own code, on all machines."
         )
     return WhereItHolds(condition, bounded, torch.inf, True)
 
 
 @dataclass
 class WhereItHolds(Question):
-    """Up to which level of W the condition c ≤ 0 holds; boxes are sorted by their lower bound of W."""
+    """The question up to which level of W the condition c ≤ 0 holds; the key of a box is its lower bound of W."""
 
     condition: DecreaseCondition
-    bounded: BoundedFunction  # of (c, W, Ẇ)
-    level: float  # it can only fall
+    bounded: BoundedFunction  # (c, W, Ẇ) and, with constraints, h
+    level: float  # it can only become lower
     stop_at_counterexample: bool
     device: torch.device = CPU  # on which boxes are bounded
     worst: Counterexample | None = None
 
     def __post_init__(self) -> None:
-        self.there = self.bounded.on(self.device)
+        self.on_device = self.bounded.on(self.device)
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        if self.device == CPU:  # where such a context would only cost
+        if self.device == CPU:  # without the context of the default device, which slows torch down
             return self._undecided(boxes)
         with self.device:
             boxes, axis = self._undecided(boxes.to(self.device))
         return boxes.to(CPU), axis.to(CPU)
 
     def _undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
-        c, W, rise, *h = self.there.forms(boxes.lower, boxes.upper)
+        c, W, rise, *h = self.on_device.forms(boxes.lower, boxes.upper)
         (_, c_high), (W_low, _), (_, rise_high) = c.interval(), W.interval(), rise.interval()
         boxes = boxes._replace(key=torch.maximum(W_low, boxes.key))
         chosen = ~((c_high <= 0) & (rise_high <= 0)) & (boxes.key <= self.level)
         for constraints in h:
             chosen &= ~(constraints.interval()[0] > 0).any(-1)
-        return boxes[chosen], axis_to_cut(self.there, c, boxes, chosen)
+        return boxes[chosen], axis_to_cut(self.on_device, c, boxes, chosen)
 
     def look_at(self, boxes: Boxes) -> None:
-        if len(boxes.key):  # code of others need not know batches of none
-            self.lower_to(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
+        if len(boxes.key):  # own systems and costs need not accept empty batches
+            self.lower_level(lowest_violation(self.condition, self.bounded, boxes.center, self.level))
 
-    def lower_to(self, found: Counterexample | None) -> None:
-        """Go on under a counterexample, if there is one."""
+    def lower_level(self, found: Counterexample | None) -> None:
+        """Lower the level below a counterexample, if one was found."""
         if found is not None:
-            self.worst, self.level = found, found.height - BELOW * abs(found.height)
+            self.worst, self.level = found, found.height - LEVEL_DROP * abs(found.height)
 
-    def begin(self, lower: Corner, upper: Corner, generator: torch.Generator | None) -> Standing:
-        """The whole box, under the lowest counterexample that is found without bounds."""
-        self.lower_to(find_counterexample(self.condition, self.bounded, lower, upper, self.level, generator))
-        return Standing(Search(single(lower, upper)), self.level, self.worst)
+    def begin(self, lower: Corner, upper: Corner, generator: torch.Generator | None) -> ProofState:
+        """The state at the start: the whole box, and the level below the lowest counterexample that sampling finds."""
+        self.lower_level(find_counterexample(self.condition, self.bounded, lower, upper, self.level, generator))
+        return ProofState(Search(single(lower, upper)), self.level, self.worst)
 
-    def again(self, worst: Counterexample | None) -> float:
-        """The level under a counterexample of an earlier search, which is evaluated again.
+    def level_below(self, worst: Counterexample | None) -> float:
+        """The level below the counterexample of a kept proof, which is evaluated again.
 
         Raises:
-            ValueError: it is none.
+            ValueError: the condition holds at that point.
         """
         if worst is not None:
             point = torch.tensor([[worst.t, *worst.x]], dtype=torch.float64)
             found = lowest_violation(self.condition, self.bounded, point, float("inf"))
             if found is None or not abs(found.height - worst.height) <= MARGIN * abs(found.height):
                 raise ValueError("the condition does not fail there")
-        self.lower_to(worst)
+        self.lower_level(worst)
         return self.level
 
     @property

@@ -1,7 +1,7 @@
-"""Rounding of an arithmetic that is not torch's, as an operator of graphs: the identity, which bounds widen.
+"""Rounding in another program's arithmetic, as an operator of graphs: the identity for values, an error for bounds.
 
-Functions that stand for what another program computes mark their results as rounded. Numbers and derivatives are those
-of the exact function; the bounds of lyapnet.prover.bounds hold for every function whose results are rounded as marked.
+A function that imitates another program marks its results by mark_rounded. Values and derivatives are those of the
+exact function; the bounds of lyapnet.prover.bounds hold for every function whose results have the marked errors.
 """
 
 from contextlib import AbstractContextManager
@@ -13,18 +13,17 @@ from lyapnet.base.operators import BOUNDS, are_operators, as_operators
 
 
 def rounding(counted: bool) -> AbstractContextManager[None]:
-    """Whether `rounded` leaves an operator in what is traced within; outside it leaves none."""
+    """A context in which mark_rounded leaves an operator in traced graphs if `counted`; else it returns y."""
     return as_operators(BOUNDS, counted)
 
 
-def rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
-    """y; to bounds any y (1 + θ) + η with |θ| ≤ relative and |η| ≤ absolute, and anything where |y| may exceed
-    `largest`.
+def mark_rounded(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -> Tensor:
+    """y; for bounds, any y (1 + θ) + η with |θ| ≤ relative and |η| ≤ absolute; any number if |y| may exceed `largest`.
 
-    θ and η may be others at each point, and in each use of the result.
+    θ and η may differ at each point and in each use of the result.
 
     Args:
-        y: in float64; a constant too.
+        y: in float64; it may be constant.
         at: the point, on which the errors may depend.
     """
     return torch.ops.lyapnet.rounded(y, at, relative, absolute, largest) if are_operators(BOUNDS) else y
@@ -41,7 +40,7 @@ def _(y: Tensor, at: Tensor, relative: float, absolute: float, largest: float) -
 
 
 @_rounded.register_vmap
-def _(info, axes, y, at, relative, absolute, largest):  # of the states of a batch
+def _(info, axes, y, at, relative, absolute, largest):
     return y.clone(), axes[0]
 
 

@@ -1,4 +1,4 @@
-"""Operator graphs made ready for bounds: the same function, written so that less is lost."""
+"""Operator graphs rewritten for bounds: the same function, with tighter bounds."""
 
 from operator import attrgetter
 from typing import Any
@@ -15,10 +15,10 @@ COPIES = {aten.alias.default, aten.clone.default, aten.expand.default, aten.view
 
 
 def without_copies(graph: Graph) -> Graph:
-    """The graph without nodes that hand on what they get, and without what is then computed twice."""
+    """The graph without nodes that return their argument, and without repeated computations."""
     constants: dict[Any, Node] = {}
     for node in list(graph.nodes):
-        if node.op == "get_attr":  # which CSE leaves apart
+        if node.op == "get_attr":  # without_repetitions does not merge constants
             node.replace_all_uses_with(constants.setdefault(_content(graph, node), node))
         elif node.target in COPIES and _shape(node) == _shape(node.args[0]):
             node.replace_all_uses_with(node.args[0])
@@ -29,10 +29,10 @@ def without_copies(graph: Graph) -> Graph:
 
 
 def with_known_truths(graph: Graph) -> Graph:
-    """where(c, x, y) with c = 1 inside x and c = 0 inside y, for truths c of one number: the same function.
+    """The graph with c = 1 inside x and c = 0 inside y for each where(c, x, y) with a scalar c: the same function.
 
-    Code that is differentiated guards each branch, as in where(c, p/where(c, d, 1), y). Where c is undecided, the guard
-    would be the hull of d and 1, however small the box.
+    Differentiable code guards its branches, as in where(c, p/where(c, d, 1), y). On a box that does not decide c, the
+    inner result would enclose both d and 1, however small the box is.
     """
     for node in list(graph.nodes):
         if node.target is aten.where.self and isinstance(node.args[0], Node) and _shape(node.args[0]) == ():
@@ -46,7 +46,7 @@ def with_known_truths(graph: Graph) -> Graph:
 
 
 def _assuming(graph: Graph, truth: Node, value: bool, result: Any, before: Node) -> Any:
-    """A copy of what leads from a truth to a result, in which the truth has a known value."""
+    """The result, from copies of the nodes between a truth and it, in which the truth has a known value."""
     copies: dict[Node, Any] = {}
     with graph.inserting_before(before):
         for node in _between(truth, result):
@@ -57,7 +57,7 @@ def _assuming(graph: Graph, truth: Node, value: bool, result: Any, before: Node)
 
 
 def _between(start: Node, end: Any) -> list[Node]:
-    """The nodes that depend on the start and on which the end depends, in order."""
+    """The nodes that depend on the start and on which the end depends, in the order of the graph."""
     if not isinstance(end, Node):
         return []
     below, above = {start}, {end}
@@ -72,16 +72,16 @@ def _between(start: Node, end: Any) -> list[Node]:
 
 
 def _content(graph: Graph, node: Node) -> Any:
-    """What tells a constant apart: its numbers, to the last bit, or its name where it is no tensor of a module."""
+    """A key that equal constants share: dtype, shape and bits of a tensor; else the name."""
     value = attrgetter(str(node.target))(graph.owning_module) if graph.owning_module is not None else None
     if not isinstance(value, Tensor):
         return str(node.target)
     try:
         return value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes()
-    except (TypeError, RuntimeError):  # of numbers that NumPy does not know
+    except (TypeError, RuntimeError):  # a dtype that NumPy lacks
         return str(node.target)
 
 
 def _shape(node: Any) -> Any:
-    """The shape of the node's value; the node itself where that was not recorded."""
+    """The shape of the node's value; if it was not recorded, the node itself, which equals no other."""
     return node.meta["val"].shape if isinstance(node.meta.get("val"), Tensor) else node

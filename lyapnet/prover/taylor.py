@@ -1,22 +1,25 @@
 """Arithmetic of Taylor forms on batches of boxes: sets of values as polynomials with a rigorous remainder.
 
-Rounding. Forms enclose the values of real arithmetic on the given float64 numbers. Every operation here adds to its
-remainder a bound of its own rounding errors: a multiple of ε = 2⁻⁵² times the magnitudes that entered it, at least
-twice what the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any order. One thing is taken on
-trust: that the elementary functions of torch, and of the C library where lyapnet.prover.bound_kernel uses them, err by
-at most 8 ε (1.2 ε is the most that was seen of torch's, against mpmath).
+Rounding. A form encloses the values that exact real arithmetic gives for the float64 numbers of a function. Each
+operation adds a bound of its own rounding errors to the remainder: a multiple of ε = 2⁻⁵² times the magnitudes of its
+operands. This is at least twice the error that the standard model |fl(a ∘ b) − a ∘ b| ≤ ½ε|a ∘ b| gives for sums in any
+order. One assumption remains: the elementary functions of torch, and those of the C library that
+lyapnet.prover.bound_kernel uses, have a relative error of at most 8 ε. The largest error of torch's functions that was
+measured against mpmath is 1.2 ε.
 
-Underflow. Below 2⁻¹⁰²² ≈ 2.2e-308 the model fails: a result errs by up to that number besides, if a processor replaces
-subnormal numbers by zero, and by less if not. So there is one rule: whatever is rounded errs by a multiple of ε times
-its size, plus TINY = 1e-300. This is room for 4e7 operations on an entry, more than any has.
+Underflow. The model fails for results below 2⁻¹⁰²² ≈ 2.2e-308. If the processor replaces subnormal numbers by zero,
+such a result has an additional error of up to 2⁻¹⁰²², otherwise a smaller one. So there is one rule: the error of a
+rounded result is at most a multiple of ε times its size, plus TINY = 1e-300. This leaves room for 4e7 operations on an
+entry, more than any entry has.
 
-- The remainder of each result takes TINY, after all its products. An error that is multiplied afterwards takes part: a
-  remainder does by itself, and a coefficient counts as larger by FLOOR = TINY/ε where its rounding is bounded.
-- A product of three factors is formed so that nothing between underflows when the result does not: A·(A/m) with
-  A ≤ 2m, not A²/m; ((M·w)·w)·w, not M·w³; ε·(a·b), not (ε·a)·b.
-- Overflow gives an infinity or a nan, in terms or in the remainder, and `interval` gives infinite bounds for either.
+- TINY is added to the remainder of each result, after all products. An underflow error that is multiplied later grows
+  with the factor. A remainder already contains its error; for a coefficient, the bound of rounding replaces the size
+  |A| by |A| + FLOOR with FLOOR = TINY/ε, since ε · FLOOR = TINY.
+- Products of three factors are ordered so that no intermediate result underflows unless the final one does: A·(A/m)
+  with A ≤ 2m, not A²/m; ((M·w)·w)·w, not M·w³; ε·(a·b), not (ε·a)·b.
+- Overflow gives an infinity or a nan, in terms or in the remainder; `interval` then returns infinite bounds.
 
-Numbers below 1e-300 are thus bounded, but not told from zero; and where derivatives underflow, bounds are wide.
+So bounds of numbers below 1e-300 are correct but contain zero, and bounds are wide where derivatives underflow.
 
 Sources: de Figueiredo, Stolfi, "Affine arithmetic: concepts and applications", Numerical Algorithms 2004, for the first
 degree; Neumaier, "Taylor forms: use and limits", Reliable Computing 2003, for higher ones. The remainder here is one
@@ -42,15 +45,15 @@ class TaylorForm:
     """The set {c + Σ_k A_k ε_k + Σ_{j≤k} B_jk ε_j ε_k + Σ_{i≤j≤k} C_ijk ε_i ε_j ε_k + η : |ε_k| ≤ 1, |η| ≤ r} for each
     box and entry.
 
-    ε_1 … ε_d run over the box and are shared by all its forms; η is anything, another one in each form and entry. A
-    form of first degree has no B and no C: what is of second order in the size of the box is in r. With B, r is of
-    third order, and with C of fourth; and what cancels in a sum of products (as V_xᵀf + q does against
-    ¼ V_xᵀ g R⁻¹ gᵀ V_x) cancels in the bounds too. With d = 0 forms are intervals, and what is computed with them is
-    interval arithmetic.
+    ε_1 … ε_d are the coordinates of a point in the box, scaled to [−1, 1]; all forms of the box share them. η is an
+    unknown number, independent in each form and entry. A form of first degree has no B and no C: r bounds all terms of
+    second order in the size of the box. With B, r is of third order; with C, of fourth. So terms that cancel in a sum
+    of products (as V_xᵀf + q and ¼ V_xᵀ g R⁻¹ gᵀ V_x do) cancel in the bounds too. With d = 0 forms are intervals, and
+    their arithmetic is interval arithmetic.
 
     Args:
-        terms: c, A, B and C in the order of `monomials`, as many as the degree asks for; (terms, boxes, *shape).
-        radius: r ≥ 0, (boxes, *shape); infinite or nan where nothing is known.
+        terms: c, A, B and C in the order of `monomials`, up to the degree; (terms, boxes, *shape).
+        radius: r ≥ 0, (boxes, *shape); infinite or nan where no bound is known.
         dimension: d.
     """
 
@@ -80,7 +83,7 @@ class TaylorForm:
 
     @property
     def degree(self) -> int:
-        """That of the polynomial; an interval counts as one of first degree."""
+        """The degree of the polynomial; 1 for an interval."""
         return next(k for k in (1, 2, 3) if len(monomials(self.dimension, k)) == len(self.terms))
 
     def of_degree(self, k: int) -> Terms:
@@ -90,26 +93,30 @@ class TaylorForm:
 
     @cached_property
     def spread(self) -> OnBoxes:
-        """Σ |A| + Σ |B| + Σ |C|."""
+        """Σ |A| + Σ |B| + Σ |C|: the polynomial is nowhere farther from c, since |ε_k| ≤ 1."""
         return _absolute_sum(self.terms[1:])
 
     @cached_property
     def magnitude(self) -> OnBoxes:
-        """|c| + Σ_k |A_k| + r: no value of the set is larger."""
+        """|c| + Σ |A| + Σ |B| + Σ |C| + r, an upper bound of |y| for all y of the set."""
         return self.center.abs() + self.spread + self.radius
 
     def interval(self) -> tuple[OnBoxes, OnBoxes]:
-        """(lower, upper) bounds of the set, rounded outwards; infinite where nothing is known."""
+        """(lower, upper) bounds of the set: c minus and plus the reach of the polynomial and r, with room for rounding.
+
+        Both are infinite where one of them is not finite.
+        """
         slack = self.radius + 4 * len(self.terms) * EPSILON * self.magnitude + TINY
         lower, upper = self.center - self._reach(-1) - slack, self.center + self._reach(1) + slack
         known = lower.isfinite() & upper.isfinite()
         return lower.where(known, -torch.inf), upper.where(known, torch.inf)
 
     def _reach(self, sign: int) -> OnBoxes:
-        """An upper bound of ±(Σ A_k ε_k + Σ B_jk ε_j ε_k + Σ C_ijk ε_i ε_j ε_k), exact for a diagonal B without C.
+        """An upper bound of ±(Σ A_k ε_k + Σ B_jk ε_j ε_k + Σ C_ijk ε_i ε_j ε_k), exact if B is diagonal and C = 0.
 
-        With |ε_j ε_k| ≤ ½ (ε_j² + ε_k²) it splits into d parabolas A_k ε + m_k ε², m_k = ±B_kk + ½ Σ_{j≠k} |B_jk|, and
-        Σ |C|.
+        Since |ε_j ε_k| ≤ ½ (ε_j² + ε_k²), it is at most the sum of the maxima of d parabolas |A_k| ε + m_k ε² over
+        0 ≤ ε ≤ 1, with m_k = ±B_kk + ½ Σ_{j≠k} |B_jk|, plus Σ |C|. A parabola has its maximum −A_k²/(4 m_k) at its
+        vertex if that lies in the box, and |A_k| + m_k at the end if not.
         """
         if not len(self.products):
             return self.spread
@@ -121,26 +128,26 @@ class TaylorForm:
                 m[j] += B.abs() / 2
                 m[k] += B.abs() / 2
         A = self.coefficients.abs()
-        inner = -2 * m > A  # the vertex lies within the box
+        inner = -2 * m > A  # the vertex lies in the box
         parabolas = torch.where(inner, A * (A / torch.where(inner, -4 * m, 1.0)), A + m).sum(0)
         return parabolas + _absolute_sum(self.of_degree(3)) if self.degree == 3 else parabolas
 
     @property
     def excess(self) -> OnBoxes:
-        """What the bounds have beyond those of the linear part, to either side on average."""
+        """Half the width of the bounds, minus half the width Σ |A| of those of the linear part."""
         lower, upper = self.interval()
         return (upper - lower) / 2 - _absolute_sum(self.coefficients)
 
-    def rounded(self, operations: int = 1) -> "TaylorForm":
-        """The form with room for so many rounded operations on each of its entries, in sequence or in one sum."""
+    def with_rounding(self, operations: int = 1) -> "TaylorForm":
+        """The form with a larger r: room for this many rounded operations on each entry, in sequence or in one sum."""
         return self.with_parts(self.terms, self.radius + (2 * operations * EPSILON) * self.magnitude + TINY)
 
     def with_parts(self, terms: Terms, radius: OnBoxes) -> "TaylorForm":
-        """Another form of the same box."""
+        """A form with other terms and another remainder in the same ε."""
         return TaylorForm(terms, radius, self.dimension)
 
     def as_rank(self, rank: int) -> "TaylorForm":
-        """The same value with leading axes of length 1, as broadcasting reads it."""
+        """The same value with leading axes of length 1, as broadcasting adds them."""
         ones = (1,) * (rank - len(self.shape))
         boxes = self.radius.shape[:1]
         terms = self.terms.reshape(*self.terms.shape[:1], *boxes, *ones, *self.shape)
@@ -155,7 +162,10 @@ def monomials(dimension: int, degree: int) -> list[tuple[int, ...]]:
 
 @cache
 def _places(dimension: int, degree: int, device: torch.device) -> list[tuple[int, Tensor]]:
-    """(i, where the products of monomial i with the first few of degree 1 and more stand), but for constants."""
+    """For each monomial i of degree ≥ 1: (i, the positions of its products with monomials 1, 2, … in `monomials`).
+
+    Products above the degree are left out; they are those with the last monomials.
+    """
     every = monomials(dimension, degree)
     number = {axes: k for k, axes in enumerate(every)}
     places = []
@@ -167,33 +177,33 @@ def _places(dimension: int, degree: int, device: torch.device) -> list[tuple[int
 
 
 def box_form(lower: Corners, upper: Corners, degree: int = 1) -> TaylorForm:
-    """The boxes {lower ≤ y ≤ upper} themselves, one number an axis: y_k = middle_k + ½ width_k · ε_k.
+    """The coordinates of points in the boxes {lower ≤ y ≤ upper}: y_k = middle_k + ½ width_k · ε_k.
 
     Args:
-        lower, upper: in float64. An axis along which no box has a width has no ε.
-        degree: of this form and of all that are computed from it, 1, 2 or 3.
+        lower, upper: in float64. An axis along which all boxes have width 0 has no ε.
+        degree: 1, 2 or 3; the degree of this form and of all forms computed from it.
     """
     center, half = (lower + upper) / 2, (upper - lower) / 2
     wide = wide_axes(lower, upper)
     d = len(wide)
     coefficients = (half.T[..., None] * torch.eye(lower.shape[-1], dtype=half.dtype)[:, None])[wide]
     higher = center.new_zeros(len(monomials(d, degree)) - 1 - d, *center.shape)
-    return TaylorForm(torch.cat([center[None], coefficients, higher]), torch.zeros_like(center), d).rounded(2)
+    return TaylorForm(torch.cat([center[None], coefficients, higher]), torch.zeros_like(center), d).with_rounding(2)
 
 
 def wide_axes(lower: Corners, upper: Corners) -> Tensor:
-    """The axes along which any of the boxes has a width; the first for points, which would be intervals without one."""
+    """The axes along which some box has a width > 0; axis 0 if all are points, since forms without ε are intervals."""
     wide = torch.nonzero((upper > lower).any(0)).flatten()
     return wide if len(wide) else torch.zeros(1, dtype=torch.long)
 
 
 def interval_form(lower: Corners, upper: Corners) -> TaylorForm:
-    """The boxes as intervals, which forget that they are functions of the same point: no ε, all remainder."""
-    return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).rounded(2)
+    """The boxes as intervals: no ε, only remainders, so that dependence on the same point is lost."""
+    return TaylorForm(((lower + upper) / 2)[None], (upper - lower) / 2, 0).with_rounding(2)
 
 
 def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
-    """A value that is the same everywhere, beside the forms of `like`."""
+    """A value that does not depend on the point, as a form with the boxes and the ε of `like`."""
     boxes = len(like.radius)
     center = value.to(like.radius.dtype).expand(boxes, *value.shape)
     coefficients = torch.zeros(len(like.terms) - 1, *center.shape, dtype=center.dtype)
@@ -201,7 +211,7 @@ def constant_form(value: Tensor, like: TaylorForm) -> TaylorForm:
 
 
 def aligned(*forms: TaylorForm) -> list[TaylorForm]:
-    """The forms with as many axes each, as broadcasting reads them."""
+    """The forms with the same number of axes each, as broadcasting requires."""
     rank = max(len(form.shape) for form in forms)
     return [form.as_rank(rank) for form in forms]
 
@@ -210,33 +220,33 @@ def aligned(*forms: TaylorForm) -> list[TaylorForm]:
 
 
 def add(x: TaylorForm, y: TaylorForm) -> TaylorForm:
-    """x + y: coefficients add, with their signs, and so do remainders."""
+    """x + y: the terms add, and the remainders add, since |η + η'| ≤ r + r'."""
     x, y = aligned(x, y)
-    return x.with_parts(x.terms + y.terms, x.radius + y.radius).rounded()
+    return x.with_parts(x.terms + y.terms, x.radius + y.radius).with_rounding()
 
 
 def shift(x: TaylorForm, offset: Tensor) -> TaylorForm:
-    """x + offset."""
+    """x + offset: the offset is added to c."""
     x = x.as_rank(max(len(x.shape), offset.ndim))
     center = x.center + offset
     terms = torch.cat([center[None], x.terms[1:].expand(-1, *center.shape)])
-    return x.with_parts(terms, x.radius.expand_as(center)).rounded()
+    return x.with_parts(terms, x.radius.expand_as(center)).with_rounding()
 
 
 def scale(x: TaylorForm, factor: Tensor) -> TaylorForm:
-    """factor · x, entry by entry; the remainder takes |factor|."""
+    """factor · x, entry by entry; the remainder is multiplied by |factor|."""
     x = x.as_rank(max(len(x.shape), factor.ndim))
-    return x.with_parts(x.terms * factor, x.radius * factor.abs()).rounded()
+    return x.with_parts(x.terms * factor, x.radius * factor.abs()).with_rounding()
 
 
 def negate(x: TaylorForm) -> TaylorForm:
-    """−x, exactly."""
+    """−x, without rounding; the remainder stays."""
     return x.with_parts(-x.terms, x.radius)
 
 
 def matrix_product(x: TaylorForm, weight: Tensor) -> TaylorForm:
-    """x @ W: c and A_k take W, the remainder |W|, since |Σ_i η_i W_ij| ≤ Σ_i r_i |W_ij|."""
-    x = x.rounded(2 * len(weight))  # γ_k Σ_i |x_i||W_ij| bounds the error of each sum, of c, A and r alike
+    """x @ W: the terms are multiplied by W, the remainder by |W|, since |Σ_i η_i W_ij| ≤ Σ_i r_i |W_ij|."""
+    x = x.with_rounding(2 * len(weight))  # the error of a sum of k products is at most kε Σ_i |x_i||W_ij|
     return x.with_parts(x.terms @ weight, x.radius @ weight.abs() + TINY)
 
 
@@ -248,9 +258,10 @@ def multiply(x: TaylorForm, y: TaylorForm) -> TaylorForm:
 
         xy = cc' + (cL' + c'L) + (cQ' + c'Q + LL') + (LQ' + QL' + QQ') + (c + L + Q)η' + (c' + L' + Q')η + ηη'.
 
-    The last four go into the remainder, by Σ|A| and Σ|B| of each; in forms of third degree LQ' + QL' does not, but what
-    C makes with all but constants. In forms of first degree LL' does as well: since ε_k² ∈ [0, 1], it lies within
-    ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k. Intervals have the products of their ends.
+    The last four summands go into the remainder, bounded by |L| ≤ Σ|A|, |Q| ≤ Σ|B| and |η| ≤ r. In forms of third
+    degree LQ' + QL' stays among the terms, and the products of degree 4 and higher go into the remainder. In forms of
+    first degree LL' has no terms of its own: since ε_k² ∈ [0, 1], it lies within
+    ½ Σ_k |A_k A'_k| + Σ_{j<k} |A_j A'_k + A_k A'_j| of ½ Σ_k A_k A'_k. Intervals are multiplied by interval_product.
     """
     x, y = aligned(x, y)
     if not x.dimension:
@@ -258,41 +269,41 @@ def multiply(x: TaylorForm, y: TaylorForm) -> TaylorForm:
     remainder = (x.center.abs() + x.spread) * y.radius + (y.center.abs() + y.spread) * x.radius + x.radius * y.radius
     rounding = (len(x.terms) ** 2 + 8) * EPSILON * (x.magnitude * y.magnitude) + TINY
     if x.degree == 1:
-        terms, beyond = _linear_product(x, y)
+        terms, higher = _linear_product(x, y)
     else:
-        terms, beyond = _product(x, y)
-    return x.with_parts(terms, beyond + remainder + rounding)
+        terms, higher = _product(x, y)
+    return x.with_parts(terms, higher + remainder + rounding)
 
 
 def _linear_product(x: TaylorForm, y: TaylorForm) -> tuple[Terms, OnBoxes]:
-    """(the terms, a bound of what LL' has beyond them) of forms of first degree."""
+    """(the terms of the product, a bound of the rest of LL') for forms of first degree, as in `multiply`."""
     A, E = x.coefficients, y.coefficients
-    middle, around = torch.zeros_like(x.center * y.center), torch.zeros_like(x.radius * y.radius)
+    middle, rest = torch.zeros_like(x.center * y.center), torch.zeros_like(x.radius * y.radius)
     for j, k in combinations_with_replacement(range(x.dimension), 2):
         if j == k:
-            middle, around = middle + A[k] * E[k] / 2, around + (A[k] * E[k]).abs() / 2
+            middle, rest = middle + A[k] * E[k] / 2, rest + (A[k] * E[k]).abs() / 2
         else:
-            around = around + (A[j] * E[k] + A[k] * E[j]).abs()
-    return torch.cat([(x.center * y.center + middle)[None], x.center * E + y.center * A]), around
+            rest = rest + (A[j] * E[k] + A[k] * E[j]).abs()
+    return torch.cat([(x.center * y.center + middle)[None], x.center * E + y.center * A]), rest
 
 
 def _product(x: TaylorForm, y: TaylorForm) -> tuple[Terms, OnBoxes]:
-    """(the terms up to the degree of the forms, a bound of those beyond) of the product of two polynomials."""
+    """(the terms up to the degree of the forms, a bound of those above it) of the product of two polynomials."""
     terms = x.center * y.terms
     terms[1:] += y.center * x.terms[1:]
     for i, at in _places(x.dimension, x.degree, terms.device):
         terms.index_add_(0, at, x.terms[i] * y.terms[1 : 1 + len(at)])
     sizes = [[_absolute_sum(z.of_degree(k)) for k in range(1, x.degree + 1)] for z in (x, y)]
-    beyond = [a * b for j, a in enumerate(sizes[0], 1) for k, b in enumerate(sizes[1], 1) if j + k > x.degree]
-    return terms, torch.stack(beyond).sum(0)
+    higher = [a * b for j, a in enumerate(sizes[0], 1) for k, b in enumerate(sizes[1], 1) if j + k > x.degree]
+    return terms, torch.stack(higher).sum(0)
 
 
 def interval_product(x: TaylorForm, y: TaylorForm) -> TaylorForm:
-    """x · y of intervals, from the products of their ends."""
+    """x · y of intervals [a, b] and [c, d]: between the least and the greatest of ac, ad, bc and bd."""
     (a, b), (c, d) = x.interval(), y.interval()
-    ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, which stays: nothing is known
+    ends = torch.stack([a * c, a * d, b * c, b * d])  # 0 · ∞ is nan, and so are then both bounds: none is known
     low, high = ends.amin(0), ends.amax(0)
-    product = x.with_parts(((low + high) / 2)[None], (high - low) / 2).rounded(4)
+    product = x.with_parts(((low + high) / 2)[None], (high - low) / 2).with_rounding(4)
     known = torch.isfinite(low) & torch.isfinite(high)
     return x.with_parts(torch.where(known, product.terms, 0.0), torch.where(known, product.radius, torch.inf))
 

@@ -1,4 +1,4 @@
-"""Processes, or cores of a cluster, that bound boxes side by side: threads of one process wait for each other."""
+"""Bounds boxes in parallel, by processes or on a cluster; Python's threads would wait for each other."""
 
 import multiprocessing
 import os
@@ -24,14 +24,14 @@ from lyapnet.prover.boxes import Boxes
 
 Bounding = Callable[[Boxes], tuple[Boxes, Tensor]]
 
-PATIENCE = 120  # seconds, in which cores of a cluster are free and have begun
+START_TIMEOUT = 120  # seconds until all workers of a cluster have started
 
-_own: list[Any] = []  # of a worker: the question that it was begun with
+_own: list[Any] = []  # in a worker process: the question that it answers
 
 
 @contextmanager
 def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]:
-    """So many copies of this process that have a question; None where there is one, or none can be made."""
+    """A pool of worker processes that have a question; None for one worker, or if processes cannot be forked."""
     if workers == 1 or "fork" not in multiprocessing.get_all_start_methods():
         yield None
         return
@@ -40,54 +40,60 @@ def _copies(question: Any, workers: int) -> Iterator[ProcessPoolExecutor | None]
         try:
             yield pool
         except BrokenProcessPool as error:
-            raise UsageError("Expected workers that live on, got one killed; choose fewer --workers.") from error
+            raise UsageError(
+                "Expected all workers to finish, got one that was killed; choose fewer --workers."
+            ) from error
 
 
 @contextmanager
 def bounding(
     question: Any, workers: int, ray: str | None = None, make_question: Callable[[], Any] | None = None
 ) -> Iterator[Callable[[Bounding, Iterable[Boxes]], Iterable[Any]]]:
-    """A `map` of question.undecided over chunks of boxes, by so many processes, copies of this one.
+    """A parallel `map` of question.undecided over chunks of boxes.
 
-    They see the question as it was at the beginning, and its `level` as it is. One worker is this process itself, and
-    so it is where processes cannot be copied.
+    The workers are copies of this process, made at the beginning. They see the question as it was then, except for its
+    `level`, which is always current. One worker is this process itself, as on systems that cannot fork processes.
 
     Args:
-        ray: the address of a cluster of which so many cores bound boxes, in place of this machine.
-        make_question: makes it there.
+        ray: address of a Ray cluster whose cores bound the boxes, instead of this machine.
+        make_question: makes the question on a machine of the cluster.
 
     Raises:
-        UsageError: a worker was killed, of too little memory perhaps, or there is no such cluster.
+        UsageError: a worker was killed, perhaps for lack of memory, or the cluster does not answer.
     """
     if ray is not None:
-        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as ask:
-            yield partial(_shared_out, ask, question)
+        with connected(ray) as cluster, _on_cluster(cluster, make_question, workers) as run:
+            yield partial(_undecided_in_parallel, run, question)
         return
     with _copies(question, workers) as pool:
-        yield map if pool is None else partial(_shared_out, partial(pool.map, _undecided), question)
+        yield map if pool is None else partial(_undecided_in_parallel, partial(pool.map, _undecided), question)
 
 
 @contextmanager
 def _on_cluster(cluster: Any, make_question: Any, workers: int) -> Iterator[Callable[[Iterable[Any]], Iterable[Any]]]:
-    """A `map` of _undecided by cores of a cluster, whose machines find modules where this one does."""
+    """A `map` of _undecided on a cluster; its machines import modules from the same paths as this one."""
     cores = int(cluster.cluster_resources().get("CPU", 0))
     if workers > cores:
         raise UsageError(f"Expected at most the {cores} cores of the cluster, got --workers {workers}; ask for fewer.")
     places = {"PYTHONPATH": os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])}
     worker = cluster.remote(num_cpus=1, runtime_env={"env_vars": places})(ClusterWorker)
-    them = [worker.remote() for _ in range(workers)]
+    actors = [worker.remote() for _ in range(workers)]
     try:
-        cluster.get([each.begin.remote(make_question, torch.get_default_dtype()) for each in them], timeout=PATIENCE)
-        pool = cluster.util.ActorPool(them)
-        yield lambda asked: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), asked))
+        cluster.get(
+            [each.begin.remote(make_question, torch.get_default_dtype()) for each in actors], timeout=START_TIMEOUT
+        )
+        pool = cluster.util.ActorPool(actors)
+        yield lambda arguments: map(_own_copy, pool.map(lambda each, what: each.undecided.remote(what), arguments))
     except cluster.exceptions.GetTimeoutError as error:
         raise UsageError(
-            f"Expected {workers} free cores of the cluster within {PATIENCE} s, got fewer; ask for fewer --workers."
+            f"Expected {workers} free cores of the cluster within {START_TIMEOUT} s, got fewer; choose fewer --workers."
         ) from error
     except cluster.exceptions.RayError as error:
         if isinstance(cause := getattr(error, "cause", None), LyapnetError):
             raise cause from None
-        raise UsageError(f"Expected workers of the cluster that live on, got {one_line(error)}") from error
+        raise UsageError(
+            f"Expected the workers of the cluster to finish, got {one_line(error)}; see its logs."
+        ) from error
 
 
 class ClusterWorker:
@@ -98,34 +104,34 @@ class ClusterWorker:
         torch.set_default_dtype(default)
         _own[:] = [make_question()]
 
-    def undecided(self, asked: tuple[Any, ...]) -> tuple[Any, ...]:
-        return _undecided(_own_copy(asked))
+    def undecided(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return _undecided(_own_copy(arguments))
 
 
 def _own_copy(data: Any) -> Any:
-    """Arrays that may be written to, of those that a cluster shares."""
+    """Copy arrays, because those that Ray passes are read-only."""
     return tree_map_only(np.ndarray, np.copy, data)
 
 
 @contextmanager
 def answering(question: Any, workers: int) -> Iterator[Callable[[list[tuple[Any, ...]]], Iterable[Any]]]:
-    """question.of(*asked) for each of a list of arguments, by so many processes, copies of this one; as `bounding`.
+    """A parallel `map` of question.of over tuples of arguments, by local workers as in `bounding`.
 
     Raises:
-        UsageError: a worker was killed, of too little memory perhaps.
+        UsageError: a worker was killed, perhaps for lack of memory.
     """
     with _copies(question, workers) as pool:
         if pool is None:
-            yield lambda asked: (question.of(*each) for each in asked)
+            yield lambda arguments: (question.of(*each) for each in arguments)
         else:
-            yield lambda asked: map(_as_tensors, pool.map(_answer, map(_as_arrays, asked)))
+            yield lambda arguments: map(_as_tensors, pool.map(_answer, map(_as_arrays, arguments)))
 
 
-def _answer(asked: Any) -> Any:
-    """The answer of a worker's question, as arrays."""
+def _answer(arguments: Any) -> Any:
+    """In a worker: question.of, from arrays to arrays."""
     (question,) = _own
     with torch.no_grad():
-        return _as_arrays(question.of(*_as_tensors(asked)))
+        return _as_arrays(question.of(*_as_tensors(arguments)))
 
 
 def _as_arrays(data: Any) -> Any:
@@ -136,16 +142,17 @@ def _as_tensors(data: Any) -> Any:
     return tree_map_only(np.ndarray, torch.from_numpy, data)
 
 
-def _shared_out(
-    ask: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
+def _undecided_in_parallel(
+    run: Callable[[Iterable[Any]], Iterable[Any]], question: Any, _: Bounding, chunks: Iterable[Boxes]
 ) -> Iterator[tuple[Boxes, Tensor]]:
-    asked = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
-    for *parts, axis in ask(asked):
+    """question.undecided of each chunk, by `run`, a map of _undecided over tuples of the level and arrays of boxes."""
+    arguments = [(question.level, *(part.numpy() for part in chunk)) for chunk in chunks]
+    for *parts, axis in run(arguments):
         yield Boxes(*map(torch.from_numpy, parts)), torch.from_numpy(axis)
 
 
 def _begin(question: Any) -> None:
-    """Become a worker: one thread, and nothing to do with signals, which are for the process that asks; end with it."""
+    """Become a worker: one thread; leave signals to the parent process, and end with it."""
     torch.set_num_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -160,9 +167,9 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _undecided(asked: tuple[Any, ...]) -> tuple[Any, ...]:
-    """What is undecided of boxes, as arrays."""
-    (question,), (level, *parts) = _own, asked
+def _undecided(arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+    """In a worker: question.undecided, from arrays to arrays."""
+    (question,), (level, *parts) = _own, arguments
     question.level = level
     boxes, axis = question.undecided(Boxes(*map(torch.from_numpy, parts)))
     return (*(part.numpy() for part in boxes), axis.numpy())

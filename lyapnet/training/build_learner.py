@@ -23,7 +23,7 @@ from lyapnet.loop.rollout import Rollout
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.training.learner import Learner
-from lyapnet.value.linearisation import rounded
+from lyapnet.value.linearisation import smooth_kinks
 
 
 def build_problem_to_train(config: Config, parts: Parts) -> Problem:
@@ -32,7 +32,7 @@ def build_problem_to_train(config: Config, parts: Parts) -> Problem:
     Raises:
         UsageError: as build_problem.
     """
-    return rounded(build_problem(config, parts)).relaxed()
+    return smooth_kinks(build_problem(config, parts)).relaxed()
 
 
 def build_learner(config: Config, problem: Problem, parts: Parts | None = None, label: str = "") -> Learner:

@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Checkpoint
 from lyapnet.base.errors import Interrupted
 from lyapnet.training.learner import mean_over_processes
 from lyapnet.training.modules import labelled
-from lyapnet.training.runs import Run
+from lyapnet.training.runs import TrainingRun
 
 
 class KeptStart(Callback):
@@ -77,7 +77,7 @@ class Checkpoints(Checkpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         step = trainer.global_step
-        if not Run(self.last.parents[1]).exists:  # writing would create the removed folder again
+        if not TrainingRun(self.last.parents[1]).exists:  # writing would create the removed folder again
             raise FileNotFoundError(self.last.parents[1])
         if step % self.every == 0 or step == trainer.max_epochs:
             self._save_best(trainer, pl_module)

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 
 from lyapnet.base.errors import CompilationError, UntraceableError
 from lyapnet.graphs.number_kernel.assembly import is_built
-from lyapnet.training.stages import Stages
+from lyapnet.training.stage_messages import StageMessages
 
 
 class Compilation(Callback):
@@ -21,7 +21,7 @@ class Compilation(Callback):
         record: called with the facts that the run is compiled and how many seconds it took.
     """
 
-    def __init__(self, stages: Stages, batch_size: int, record: Callable[..., None]):
+    def __init__(self, stages: StageMessages, batch_size: int, record: Callable[..., None]):
         self.stages, self.batch_size, self.record = stages, batch_size, record
         self._compiled_on: str | None = None  # type of the device, such as "cpu"
 

@@ -25,15 +25,15 @@ from lyapnet.training.build import build_data
 from lyapnet.training.candidates import Start
 from lyapnet.training.compilation import Compilation
 from lyapnet.training.curves import loggers_of_each
-from lyapnet.training.facts import jump_facts, kink_facts
 from lyapnet.training.loggers import drop_logs_after, log_result, without_writer_tracebacks
+from lyapnet.training.penalty_weight import find_penalty_weight
 from lyapnet.training.plan import Plan, plan_run, under_policy
 from lyapnet.training.recovery import Returns
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.runs import CONFIG, EVALUATION, Run
-from lyapnet.training.stages import PATIENCE, Stages, silent
+from lyapnet.training.runs import CONFIG, EVALUATION, TrainingRun
+from lyapnet.training.stage_messages import PATIENCE, StageMessages, silent
 from lyapnet.training.start import STEP_ERROR_REMEDY, has_place_for_start
 from lyapnet.training.start_cache import load_or_choose_start
+from lyapnet.training.task_facts import jump_facts, kink_facts
 from lyapnet.training.trainer import build_trainer
 from lyapnet.value.networks import WithPenalty
 
@@ -50,7 +50,7 @@ def train(
     finetune: str | Path | None = None,
     console: Console | None = None,
     parts: Parts | None = None,
-) -> Run:
+) -> TrainingRun:
     """Train one experiment, as `lyapnet train` does, and return its run, with `folder`, `best` and `evaluation`.
 
     Args:
@@ -157,8 +157,8 @@ def _needs_start(plan: Plan) -> bool:
 
 def _set_constraint_penalty(plan: Plan, console: Console, is_first_process: bool) -> None:
     """Choose the weight of the constraint penalty and report how many optima then keep the constraints."""
-    with Stages(console, "constraints") if is_first_process else nullcontext(silent) as report:
-        relaxation = find_relaxation(plan.module.members[0].problem, report)
+    with StageMessages(console, "constraints") if is_first_process else nullcontext(silent) as report:
+        relaxation = find_penalty_weight(plan.module.members[0].problem, report)
     assert plan.module.penalty is not None
     plan.module.penalty.weight.fill_(relaxation.weight)
     for member in plan.module.members:
@@ -175,7 +175,7 @@ def _choose_start(plan: Plan, trainer: L.Trainer, console: Console) -> Start | N
     if has_place_for_start(list(plan.module.members)):
         for compilation in (callback for callback in callbacks if isinstance(callback, Compilation)):
             compilation.before_start(trainer, plan.module)
-    with Stages(console, "start") if is_first_process else nullcontext(silent) as report:
+    with StageMessages(console, "start") if is_first_process else nullcontext(silent) as report:
         start = load_or_choose_start(
             list(plan.module.members), report, may_look_ahead=plan.config.rollout.choose_policy
         )
@@ -209,7 +209,7 @@ def _prepare_folder(plan: Plan) -> None:
         drop_logs_after(run, plan.step if plan.resume_from else None)
 
 
-def _record_resources(run: Run, seconds: float) -> None:
+def _record_resources(run: TrainingRun, seconds: float) -> None:
     """Add the seconds and the peak memory of this process to the run's record."""
     record = run.record()
     total = record["training_seconds"] + seconds
@@ -221,7 +221,7 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
     config, options = plan.config, plan.config.evaluation
     results = []
     runs, loggers = plan.run.members(config), loggers_of_each(trainer, plan.module)
-    with Stages(console, "evaluation", PATIENCE) as report:
+    with StageMessages(console, "evaluation", PATIENCE) as report:
         members = zip(configs_of_seeds(config), runs, loggers, plan.module.members, strict=True)
         for one, run, own, member in members:
             report(f"what follows T, for seed {one.seed}")

@@ -13,7 +13,7 @@ from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, W
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.config import Config, to_plain
 from lyapnet.training.metrics_file import METRICS, MetricsFile
-from lyapnet.training.runs import Run
+from lyapnet.training.runs import TrainingRun
 
 
 def require_libraries(names: Sequence[str]) -> None:
@@ -46,7 +46,7 @@ def without_writer_tracebacks() -> Iterator[None]:
         threading.excepthook = before
 
 
-def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Logger]:
+def loggers_of_run(config: Config, run: TrainingRun, resumed_at: int | None) -> list[Logger]:
     """The loggers of one seed's curves.
 
     Args:
@@ -59,7 +59,7 @@ def loggers_of_run(config: Config, run: Run, resumed_at: int | None) -> list[Log
     ]
 
 
-def drop_logs_after(run: Run, step: int | None) -> None:
+def drop_logs_after(run: TrainingRun, step: int | None) -> None:
     """Remove logs after a step from a run's folder, or all logs if the step is None; and hparams.yaml.
 
     TensorBoard keeps all event files of a resumed run; its next file says from which step earlier values are dropped.
@@ -90,7 +90,7 @@ def log_result(loggers: Sequence[Logger], config: Config, result: dict[str, Any]
             logger.experiment.finish()
 
 
-def _tensorboard(config: Config, run: Run, resumed_at: int | None) -> Logger:
+def _tensorboard(config: Config, run: TrainingRun, resumed_at: int | None) -> Logger:
     # Each process writes its first step into its event file. TensorBoard then drops this step and later ones from
     # earlier files. It treats the second file as a restart only if the first one has such a mark too.
     first = 0 if resumed_at is None else resumed_at + 1
@@ -100,26 +100,26 @@ def _tensorboard(config: Config, run: Run, resumed_at: int | None) -> Logger:
     return logger
 
 
-def _wandb(config: Config, run: Run, resumed_at: int | None) -> Logger:
+def _wandb(config: Config, run: TrainingRun, resumed_at: int | None) -> Logger:
     # a new record, even if this process already has records of other seeds or trainings
     options = {"project": config.experiment, "save_dir": run.folder, "reinit": "create_new"}
     return WandbLogger(name=_name(config, run, resumed_at), **options)
 
 
-def _mlflow(config: Config, run: Run, resumed_at: int | None) -> Logger:
+def _mlflow(config: Config, run: TrainingRun, resumed_at: int | None) -> Logger:
     logs, name = Path(config.logs).resolve(), _name(config, run, resumed_at)
     tracking_uri = os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{logs / 'mlflow.db'}")
     return MLFlowLogger(config.experiment, name, tracking_uri=tracking_uri, artifact_location=str(logs / "mlruns"))
 
 
-def _name(config: Config, run: Run, resumed_at: int | None) -> str:
+def _name(config: Config, run: TrainingRun, resumed_at: int | None) -> str:
     """The name of a run in loggers that make one record for each process."""
     folder = run.folder
     name = folder.name if config.seeds == 1 else f"{folder.parent.name}/{folder.name}"
     return name if resumed_at is None else f"{name} from step {resumed_at}"
 
 
-LOGGERS: dict[str, Callable[[Config, Run, int | None], Logger]] = {
+LOGGERS: dict[str, Callable[[Config, TrainingRun, int | None], Logger]] = {
     "tensorboard": _tensorboard, "wandb": _wandb, "mlflow": _mlflow,
 }  # fmt: skip
 LIBRARIES = {"wandb": "wandb", "mlflow": "mlflow"}

@@ -12,7 +12,7 @@ from lyapnet.base.random_streams import START, stream
 from lyapnet.base.types import Control, ControlPath, State
 from lyapnet.evaluation.oracles import Optima, optimal_cost
 from lyapnet.task.problem import Problem
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.expansions import (
     Expansion,
     Optimum,
@@ -43,7 +43,7 @@ NEIGHBOUR_ROUNDS = 3  # how often, at most
 NEIGHBOUR_IMPROVEMENT = 0.99  # cost ratio below which a neighbour's solution is used
 
 
-def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: Report = silent) -> Optimum:
+def optima_for(problem: Problem, expansions: Sequence[Expansion], x0: State, report: StageReport = silent) -> Optimum:
     """Optimal trajectories from a batch of states.
 
     1. The first FROM_SCRATCH states: the initial guesses are the greedy laws of the expansions and the control at rest,
@@ -115,7 +115,7 @@ def minima(problem: Problem, optimum: Optimum) -> Optimum:
 
 
 def _improve_by_oracle(
-    problem: Problem, optimum: Optimum, others: State, report: Report
+    problem: Problem, optimum: Optimum, others: State, report: StageReport
 ) -> tuple[Optimum, ControlPath | None]:
     """Replace optima by cheaper ones of the oracle: for the first BY_ORACLE states, and for all if many improve.
 
@@ -148,7 +148,7 @@ def _replace_improved(problem: Problem, optimum: Optimum, rows: Tensor, found: O
     return optimum, len(better)
 
 
-def _improve_from_neighbours(exact: Problem, optimum: Optimum, report: Report) -> Optimum:
+def _improve_from_neighbours(exact: Problem, optimum: Optimum, report: StageReport) -> Optimum:
     """Try each optimum from the states around it, and keep what is cheaper."""
     x0 = optimum.path.x[0]
     for k in range(NEIGHBOUR_ROUNDS if len(x0) > 1 else 0):

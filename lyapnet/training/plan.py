@@ -24,7 +24,7 @@ from lyapnet.training.build import build_callbacks, build_module
 from lyapnet.training.loggers import require_libraries
 from lyapnet.training.modules import TrainingModule
 from lyapnet.training.run_lock import RunLock
-from lyapnet.training.runs import CONFIG, LAST, Run, is_further_process, last_run, new_run
+from lyapnet.training.runs import CONFIG, LAST, TrainingRun, is_further_process, last_run, new_run
 from lyapnet.training.settling import end_of_training
 from lyapnet.training.trainer_options import check_trainer_options
 
@@ -42,7 +42,7 @@ class Plan:
     parts: Parts  # the user's objects
     module: TrainingModule
     callbacks: list[L.Callback]
-    run: Run
+    run: TrainingRun
     resume_from: Path | None = None  # checkpoint to resume
     step: int = 0  # step of this checkpoint
     end: float = math.inf  # last step of a training that has settled
@@ -97,7 +97,7 @@ def plan_run(
         _load_initial_weights(config, module, finetune)
         run, lock = new_run(config, finetune)
         return Plan(config, parts, module, callbacks, run, lock=lock)
-    run = last_run(config) if resume == LAST else Run(Path(resume).resolve().parent.parent)
+    run = last_run(config) if resume == LAST else TrainingRun(Path(resume).resolve().parent.parent)
     checkpoint = run.last if resume == LAST else Path(resume)
     if not run.exists:
         read_checkpoint(checkpoint)
@@ -144,7 +144,7 @@ def _warn_of_other_target(target: Any, problem: Problem, checkpoint: Path) -> No
         )  # fmt: skip
 
 
-def _read_to_resume(checkpoint: Path, run: Run) -> dict[str, Any]:
+def _read_to_resume(checkpoint: Path, run: TrainingRun) -> dict[str, Any]:
     """Read a checkpoint to resume; if the last one is unreadable, the error message names the best one."""
     try:
         return read_checkpoint(checkpoint)
@@ -154,7 +154,7 @@ def _read_to_resume(checkpoint: Path, run: Run) -> dict[str, Any]:
         raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
 
 
-def _restart(run: Run, config: Config, module: TrainingModule) -> None:
+def _restart(run: TrainingRun, config: Config, module: TrainingModule) -> None:
     """Start a run again that was stopped before its first checkpoint."""
     written = run.folder / CONFIG
     if written.exists():

@@ -20,7 +20,7 @@ from lyapnet.task.sets import ControlSet, Unbounded
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import nearest
 from lyapnet.training.optimizer import Muon
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import FLOOR, Optimum, Path, in_float64, penalty_of_one_step, sizes, without_penalty
 from lyapnet.value.policy import LookaheadPolicy
@@ -277,7 +277,7 @@ def relative_misfit(V: ValueFunction, examples: Examples) -> float:
         return float((own.maximum(least).log() - known.maximum(least).log()).square().mean().nan_to_num(torch.inf))
 
 
-def fit(learner: Learner, optimum: Optimum, examples: Examples, report: Report = silent) -> None:
+def fit(learner: Learner, optimum: Optimum, examples: Examples, report: StageReport = silent) -> None:
     """Fit V to examples from optimal trajectories, and then in rounds to the states that its own law visits too.
 
     The rounds end after MAX_ROUNDS, when the law costs at most SUFFICIENT_COST_RATIO times the optima, or after

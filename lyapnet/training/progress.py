@@ -11,7 +11,7 @@ from rich.table import Column
 
 from lyapnet.evaluation.states import StateTable
 from lyapnet.training.curves import members_of
-from lyapnet.training.stages import Stages
+from lyapnet.training.stage_messages import StageMessages
 
 # columns of a validation's line: name, key of the summary, format
 VALIDATED = (
@@ -32,7 +32,7 @@ class TrainingProgress(ProgressBar):
         stages: shows what is done before the first step, and the steps where there is no terminal.
     """
 
-    def __init__(self, stages: Stages):
+    def __init__(self, stages: StageMessages):
         super().__init__()
         self._stages, self._console, self._progress, self._task = stages, stages.console, None, None
         self._named = False  # whether the states of the validation means were described

@@ -18,11 +18,11 @@ from lyapnet.experiment.checkpoint import read_checkpoint
 from lyapnet.task.cost import spread
 from lyapnet.task.domain import as_written
 from lyapnet.training.curves import members_of
-from lyapnet.training.facts import stiffness
 from lyapnet.training.learner import Learner
 from lyapnet.training.loggers import drop_logs_after
 from lyapnet.training.plan import Plan
 from lyapnet.training.start import Start
+from lyapnet.training.task_facts import stiffness
 from lyapnet.value.expansions import in_float64
 from lyapnet.value.policy import HJBPolicy
 

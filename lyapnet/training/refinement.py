@@ -19,7 +19,7 @@ from lyapnet.experiment.assembly import Parts, build_program
 from lyapnet.experiment.config import Config, config_from_plain, load_config, to_plain, to_yaml
 from lyapnet.prover.counterexamples import violations
 from lyapnet.training.experiment import train
-from lyapnet.training.runs import CONFIG, LAST, Run, runs_of
+from lyapnet.training.runs import CONFIG, LAST, TrainingRun, runs_of
 
 POINTS_FILE = "points.csv"
 CALLBACKS_PREFIX = "callbacks="  # of an override that names callbacks
@@ -80,7 +80,7 @@ def _extent(certificate: Refinable) -> list[float]:
     return [bound if bound > 0 else 1.0 for bound in reach.tolist()]
 
 
-def _finished_run(folder: Path) -> Run | None:
+def _finished_run(folder: Path) -> TrainingRun | None:
     """The run of a round if it is finished, else None."""
     runs = runs_of(load_config(folder / CONFIG)) if (folder / CONFIG).exists() else []
     return runs[-1] if runs and runs[-1].finished else None
@@ -115,7 +115,7 @@ def _prepare(folder: Path, certificate: Refinable, overrides: Sequence[str], par
     write_atomically(folder / CONFIG, to_yaml(config_from_plain(config, overrides)).encode())
 
 
-def _train(folder: Path, checkpoint: Path, overrides: Sequence[str], console: Console, parts: Parts) -> Run:
+def _train(folder: Path, checkpoint: Path, overrides: Sequence[str], console: Console, parts: Parts) -> TrainingRun:
     """Start or continue the training of a round."""
     named, config = (
         [change for change in overrides if change.startswith(CALLBACKS_PREFIX)],

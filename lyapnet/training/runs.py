@@ -25,7 +25,7 @@ REPAIR = "restore it, or start a new run with --finetune"
 
 
 @dataclass(frozen=True)
-class Run:
+class TrainingRun:
     """The folder of one run: config.yaml, run.json, metrics.csv, evaluation.json, checkpoints/ and what loggers add."""
 
     folder: Path
@@ -50,10 +50,10 @@ class Run:
         """The checkpoint with the least validation loss."""
         return self.checkpoints / f"{BEST}.ckpt"
 
-    def members(self, config: Config) -> list["Run"]:
+    def members(self, config: Config) -> list["TrainingRun"]:
         """The runs with each seed's best checkpoint and curves: subfolders, if there are several seeds."""
         labels = [label_of(one) for one in configs_of_seeds(config)]
-        return [Run(self.folder / label) for label in labels] if config.seeds > 1 else [self]
+        return [TrainingRun(self.folder / label) for label in labels] if config.seeds > 1 else [self]
 
     @property
     def finetuned_from(self) -> Path | None:
@@ -105,7 +105,7 @@ def is_further_process() -> bool:
     return int(os.environ.get("LOCAL_RANK", "0")) > 0
 
 
-def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock | None]:
+def new_run(config: Config, finetuned_from: Path | None) -> tuple[TrainingRun, RunLock | None]:
     """Create the folder of a new run and lock it. It appears together with run.json, so that it can always be resumed.
 
     Raises:
@@ -120,7 +120,7 @@ def new_run(config: Config, finetuned_from: Path | None) -> tuple[Run, RunLock |
         try:
             draft.chmod(0o755)
             write_json(draft / RUN_RECORD, _provenance(config, finetuned_from))
-            run = Run(_rename_to_next_number(draft))
+            run = TrainingRun(_rename_to_next_number(draft))
         except BaseException:
             shutil.rmtree(draft, ignore_errors=True)
             raise
@@ -142,7 +142,7 @@ def _rename_to_next_number(draft: Path) -> Path:
                 raise
 
 
-def last_run(config: Config) -> Run:
+def last_run(config: Config) -> TrainingRun:
     """The newest run of an experiment.
 
     Raises:
@@ -155,9 +155,9 @@ def last_run(config: Config) -> Run:
     return runs[-1]
 
 
-def runs_of(config: Config) -> list[Run]:
+def runs_of(config: Config) -> list[TrainingRun]:
     """The runs of an experiment, oldest first."""
-    return [Run(path) for _, path in sorted(_versions(Path(config.logs) / config.experiment)) if path.is_dir()]
+    return [TrainingRun(path) for _, path in sorted(_versions(Path(config.logs) / config.experiment)) if path.is_dir()]
 
 
 def _provenance(config: Config, finetuned_from: Path | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lyapnet.experiment.config import Config
 from lyapnet.training.curves import members_of
 from lyapnet.training.learner import Learner, mean_over_processes
-from lyapnet.training.stages import Stages
+from lyapnet.training.stage_messages import StageMessages
 
 WINDOW = 40  # steps in which the validation loss has to fall
 COOLING = 40  # steps of the final decay of the learning rate
@@ -40,7 +40,7 @@ class Settling(Callback):
         stages: shows messages.
     """
 
-    def __init__(self, least_gain: float, warmup: int, stages: Stages):
+    def __init__(self, least_gain: float, warmup: int, stages: StageMessages):
         self.least_gain, self.warmup, self.stages = least_gain, warmup, stages
         self.losses: dict[str, list[tuple[int, float]]] = {}  # label ↦ (step, loss) of each validation
         self.cooling: dict[str, tuple[int, int]] = {}  # label ↦ first and last step of the final decay

@@ -18,7 +18,7 @@ from lyapnet.training.initial_networks import network_of, start_from, start_from
 from lyapnet.training.learner import Learner
 from lyapnet.training.optima import MAX_OPTIMA, count_optima, minima, optima_for, waves
 from lyapnet.training.pretraining import Examples, draw_examples, fit, fit_briefly, looks_ahead, misfit, relative_misfit
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.value.expansions import (
     TRIES,
     Expansion,
@@ -45,7 +45,7 @@ STEP_ERROR_REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 
 def choose_start(
     learners: Sequence[Learner],
-    report: Report = silent,
+    report: StageReport = silent,
     known: Callable[[Candidate], None] = lambda candidate: None,
     may_look_ahead: bool = False,
 ) -> Start | None:
@@ -262,7 +262,7 @@ def _cheapest(candidates: Sequence[Candidate]) -> Candidate:
 class _Trials:
     """Tries the candidates and collects their results."""
 
-    def __init__(self, learner: Learner, x0: State, report: Report, known: Callable[[Candidate], None]):
+    def __init__(self, learner: Learner, x0: State, report: StageReport, known: Callable[[Candidate], None]):
         self.learner, self.x0, self.report, self.known = learner, x0, report, known
         self.began, self.tried, self.left_out = time.perf_counter(), list[Candidate](), list[Candidate]()
         self.notes = dict[str, str]()
@@ -290,7 +290,7 @@ class _Trials:
 
 
 def expansions_of(
-    problem: Problem, report: Report = silent, note: Callable[[str, str], None] = lambda name, what: None
+    problem: Problem, report: StageReport = silent, note: Callable[[str, str], None] = lambda name, what: None
 ) -> Iterator[tuple[str, Expansion | Missing]]:
     """The known expansions of V by name, or the reasons why they do not exist; for controls in a box or unbounded.
 

@@ -20,7 +20,7 @@ from lyapnet.training import start as search
 from lyapnet.training.candidates import Candidate, Start
 from lyapnet.training.initial_networks import states_of_value
 from lyapnet.training.learner import Learner
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.training.start import choose_start, has_place_for_start
 from lyapnet.value.expansions import in_float64
 from lyapnet.value.linearisation import Missing
@@ -122,7 +122,7 @@ def _from_plain(plain: dict[str, Any]) -> Start:
 
 def load_or_choose_start(
     learners: Sequence[Learner],
-    report: Report = silent,
+    report: StageReport = silent,
     known: Callable[[Candidate], None] = lambda candidate: None,
     may_look_ahead: bool = False,
 ) -> Start | None:

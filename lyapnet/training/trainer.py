@@ -19,7 +19,7 @@ from lyapnet.training.plan import Plan
 from lyapnet.training.progress import TrainingProgress
 from lyapnet.training.recovery import RisingCost
 from lyapnet.training.settling import Settling
-from lyapnet.training.stages import PATIENCE, Stages
+from lyapnet.training.stage_messages import PATIENCE, StageMessages
 from lyapnet.training.trainer_options import trainer_options
 from lyapnet.training.validation_optimum import ValidationOptimum
 
@@ -50,7 +50,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
     options, every, members = config.evaluation, config.training.validate_every, plan.module.members
     best = {member.label: one.best for member, one in zip(members, run.members(config), strict=True)}
     certified = CertifiedShare(every * options.certify_every, options.certified_states, options.confidence)
-    stages = Stages(console, "training", PATIENCE)
+    stages = StageMessages(console, "training", PATIENCE)
     return [
         KeptStart(best),
         *_compilation(plan, stages),
@@ -69,7 +69,7 @@ def _callbacks(plan: Plan, console: Console) -> list[L.Callback]:
     ]
 
 
-def _compilation(plan: Plan, stages: Stages) -> list[Compilation]:
+def _compilation(plan: Plan, stages: StageMessages) -> list[Compilation]:
     """The callback that compiles the run, if allowed; a resumed run is compiled only if it was before."""
     options = plan.config.rollout
     is_resumed = plan.resume_from is not None

@@ -13,7 +13,7 @@ from lyapnet.base.errors import OracleError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner
-from lyapnet.training.stages import Stages
+from lyapnet.training.stage_messages import StageMessages
 
 COMPARED_STATES = 64  # first validation states of each member, whose optimum is computed
 
@@ -28,7 +28,7 @@ class ValidationOptimum(Callback):
         wanted: whether to compute the optimum if the checkpoint has none.
     """
 
-    def __init__(self, stages: Stages, wanted: bool = True):
+    def __init__(self, stages: StageMessages, wanted: bool = True):
         self.stages, self.wanted = stages, wanted
         self.cost: Tensor | None = None  # (members, b)
 

@@ -73,7 +73,7 @@ def riccati_or_reason(problem: Problem) -> Expansion | Missing:
 
 
 @torch.no_grad()
-def rounded(problem: Problem, share: float = TRAINED) -> Problem:
+def smooth_kinks(problem: Problem, share: float = TRAINED) -> Problem:
     """The problem with a smoothed cost, if q or φ has a kink at the goal that can be smoothed; else the problem itself.
 
     Towards a kink where closed loops end, V_xx grows without bound, so that methods with second derivatives fail.

@@ -12,8 +12,8 @@ from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.systems import Linear
 from lyapnet.training.build_learner import build_learner
-from lyapnet.training.facts import facts_of, unreached_modes
 from lyapnet.training.start import Candidate, Start
+from lyapnet.training.task_facts import facts_of, unreached_modes
 from tests.fits import shorten_fits
 
 TASK = {

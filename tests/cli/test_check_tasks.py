@@ -18,7 +18,7 @@ from lyapnet.cli import main
 from lyapnet.experiment.assembly import Parts, build_problem, parts_of
 from lyapnet.experiment.config import config_from_plain, load_config
 from lyapnet.training.build_learner import build_learner, build_problem_to_train
-from lyapnet.training.facts import facts_of, unreached_modes
+from lyapnet.training.task_facts import facts_of, unreached_modes
 from tests.fits import shorten_fits
 from tests.marks import sample
 

@@ -7,25 +7,25 @@ import pytest
 from omegaconf import MISSING
 
 from lyapnet.base.errors import UsageError
-from lyapnet.experiment.schema import check_values, checked, differences, option, read_yaml
+from lyapnet.experiment.schema import check_values, checked, differences, read_yaml, setting
 
 
 @dataclass
 class Engine:
     """A section."""
 
-    power: float = option(1.0, "Power in kW.", above=0)
-    fuels: list[str] = option(["petrol"], "What it burns.", choices=("petrol", "diesel"))
-    driver: str = option("nobody", "Who drives.", choices=("nobody",), user_class=True)
+    power: float = setting(1.0, "Power in kW.", above=0)
+    fuels: list[str] = setting(["petrol"], "What it burns.", choices=("petrol", "diesel"))
+    driver: str = setting("nobody", "Who drives.", choices=("nobody",), user_class=True)
 
 
 @dataclass
 class Car:
     """A schema."""
 
-    name: str = option(MISSING, "Its name.")
-    doors: int = option(4, "Number of doors.", at_least=1, below=9)
-    extras: dict[str, Any] = option({}, "Anything.")
+    name: str = setting(MISSING, "Its name.")
+    doors: int = setting(4, "Number of doors.", at_least=1, below=9)
+    extras: dict[str, Any] = setting({}, "Anything.")
     engine: Engine = field(default_factory=Engine)
 
 

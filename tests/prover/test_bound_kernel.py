@@ -1,4 +1,4 @@
-"""Bounds by machine code: those of the interpreter, operator by operator, and where there is none, the interpreter."""
+"""Bounds by machine code agree with those of the interpreter, which is used where there is no machine code."""
 
 import mpmath
 import pytest
@@ -21,7 +21,7 @@ from tests.prover.test_rules import CASES, WRITTEN_OUT, graph_of, random_boxes, 
 aten = torch.ops.aten
 pytestmark = pytest.mark.skipif(not compilation.has_compiler(), reason="needs a C++ compiler")
 WITHOUT_A_RULE = {aten._linalg_solve_ex.default, aten.linalg_inv_ex.default, aten.index_put.default}
-"""The last where several numbers are added to one."""
+"""index_put has none if several numbers are added to one entry."""
 
 
 def both(function, lower, upper, degree):
@@ -33,22 +33,22 @@ def both(function, lower, upper, degree):
 
 
 def differences(forms, others):
-    """How far the bounds of some forms lie (outside, inside) of others' at most, as shares of the numbers' size."""
+    """The largest distances of bounds (outside, inside) those of other forms, relative to the size of the values."""
     outside = inside = 0.0
     for form, other in zip(forms, others, strict=True):
         assert form.terms.shape == other.terms.shape
-        size = other.magnitude.clamp_min(1e-3)  # what enters is of size 1, and may cancel
+        size = other.magnitude.clamp_min(1e-3)  # the arguments have size 1, and may cancel
         for sign, side, true in zip((-1, 1), form.interval(), other.interval(), strict=True):
             assert torch.equal(side.isfinite(), true.isfinite())
-            beyond = (sign * (side - true) / size)[true.isfinite()]
-            outside, inside = max(outside, float(beyond.max())), max(inside, -float(beyond.min()))
+            distance = (sign * (side - true) / size)[true.isfinite()]
+            outside, inside = max(outside, float(distance.max())), max(inside, -float(distance.min()))
     return outside, inside
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("operation", sample(CASES, 8), ids=str)
 def test_bounds_are_those_of_the_interpreter(operation, degree):
-    """But for rounding, which counts fewer operations."""
+    """Except for rounding: machine code counts fewer operations."""
     found = both(graph_of(CASES[operation], 0), *random_boxes(120, 0), degree)
     assert (found is None) == (operation in WITHOUT_A_RULE)
     if found is not None:
@@ -70,7 +70,7 @@ def test_bounds_of_whole_functions_are_those_of_the_interpreter(name, degree):
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_functions_of_one_number_do_not_disturb_each_other(degree):
-    """The range and the powers of an argument are shared, but of those that are not defined on all of it."""
+    """They share the range of their argument, and some its powers, even if one of them is undefined on a part of it."""
 
     def function(t, x):
         y = x[0] + t * x[1]
@@ -124,8 +124,8 @@ def test_a_wrong_formula_is_caught(right, wrong, operation, degree, tmp_path, mo
     assert max(outside, inside) > 1e-9
 
 
-def test_elementary_functions_err_by_less_than_is_taken_on_trust():
-    """Against 50 digits; 8 ε are taken on trust."""
+def test_elementary_functions_err_by_less_than_bounds_assume():
+    """Compared with 50 digits; the bounds assume 8 ε."""
     generator = torch.Generator().manual_seed(0)
     wide = 1400 * torch.rand(3000, generator=generator) - 700
     small = 10.0 ** (-20 * torch.rand(3000, generator=generator))
@@ -139,7 +139,7 @@ def test_elementary_functions_err_by_less_than_is_taken_on_trust():
 
 
 def test_many_boxes_are_bounded_by_machine_code(monkeypatch):
-    """And few by the interpreter, as are those along whose axes there were none yet."""
+    """Few boxes are bounded by the interpreter; boxes with a width along other axes are counted separately."""
     function, (lower, upper) = graph_of(CASES[aten.sin.default], 0), random_boxes(60, 0)
     bounded = BoundedFunction(function, (lower.amin(0), upper.amax(0)))
     monkeypatch.setattr(bounds, "MANY", 100)
@@ -154,7 +154,7 @@ def test_many_boxes_are_bounded_by_machine_code(monkeypatch):
 
 @pytest.fixture
 def another_library(tmp_path, monkeypatch):
-    """None yet, in a cache that is empty."""
+    """An empty cache, in which no library is compiled yet."""
     monkeypatch.setenv("LYAPNET_CACHE", str(tmp_path))
     for each in (machine_code.library, machine_code.has_library):
         each.cache_clear()

@@ -63,7 +63,7 @@ def test_values_lie_within_bounds(name, degree):
     [*((name, 1) for name in SMOOTH), *((name, 3) for name in SMOOTH if name not in ("power", "sin"))],
 )
 def test_functions_without_their_remainder_are_caught(name, degree, monkeypatch):
-    """In third degree a power has none, as it is multiplied out, and that of sin is less than what Σ|C| has in hand."""
+    """In third degree a power has none, as it is multiplied out, and that of sin is smaller than the slack of Σ|C|."""
     monkeypatch.setattr(functions, "linearised", without_remainder(functions.linearised))
     function = several(FUNCTIONS[name])
     assert violations(BoundedFunction(function, unit(), degree), function, *box(0.5 * degree)) > 0
@@ -101,7 +101,7 @@ EXPANDED = {
 
 
 def distances_from_polynomials(name, width, degree):
-    """(of f from c + A ε + B ε² + C ε³ on [l, l + width], (points, l); r) for many l."""
+    """(f − (c + A ε + B ε² + C ε³) on [l, l + width], (points, l); r) for many l."""
     lower = torch.linspace(0.3, 4, 200)[:, None]
     if name in ("sigmoid", "softplus", "sin", "cos", "exp"):
         lower = 2 * lower - 5
@@ -184,7 +184,7 @@ def D(number):
 
 
 def digits_outside(name):
-    """How many of 50 points have their true value, to 50 digits, outside the bounds of the box that is the point."""
+    """The number of values, of 50 digits at 50 points, that lie outside their bounds at the point."""
     function, exact = EXACT[name]
     bounded = BoundedFunction(lambda t, x: (function(x),), unit())
     point = box(0.0, 50)[0]
@@ -230,7 +230,7 @@ def test_an_operator_without_a_rule_is_named():
     "function", [lambda x: 1 / x, torch.sqrt, torch.log1p, lambda x: torch.exp(1000 * x), lambda x: torch.sin(50 * x)]
 )
 def test_where_a_function_has_no_bound_none_is_given(function):
-    """And what is computed from it has none either."""
+    """Results that depend on it have no bounds either."""
     bounded = BoundedFunction(lambda t, x: (0 * function(x) * x + x,), unit())
     ((low, high),) = bounded.bounds(torch.tensor([[0.0, -2.0, 0.5]]), torch.tensor([[1.0, 2.0, 1.0]]))
     assert low[0, 0] == -torch.inf
@@ -326,7 +326,7 @@ def test_float32_weights_are_taken_as_they_are():
     ids=lambda f: f.function.__name__,
 )
 def test_close_to_where_a_function_ends_nothing_is_lost(function):
-    """An interval of ratio 1e15 and more: its third derivative is that on it, and not a rounding error outside it."""
+    """On [l, u] with u/l ≥ 1e15: the third derivative is bounded on [l, u], not a rounding error outside it."""
     box = taylor.box_form(torch.tensor([[-1.0]]), torch.tensor([[1.0]]), 2)
     offset = 1.0 if function is functions.log1p else 0.0
     known = 0

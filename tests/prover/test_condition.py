@@ -89,7 +89,7 @@ def test_networks_of_the_package_know_their_gradients(name):
 
 
 LOCAL = Formula(lambda t, x: quadratic(x) - 40 * t.detach() * torch.relu(0.01 - (x - 1).abs()).sum(-1).detach() + 0 * t)
-"""V_t misses a spike of V in a thin part of the domain, which no sample need meet."""
+"""The declared V_t misses a spike of V in a thin part of the domain, in which there may be no sample."""
 
 
 @pytest.mark.parametrize("V", [LOCAL, Formula(lambda t, x: quadratic(x) + 3 * t.detach())], ids=["spike", "everywhere"])

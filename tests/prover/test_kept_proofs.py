@@ -1,4 +1,4 @@
-"""Proofs that are kept in a file and go on, in several threads, and report how far they are."""
+"""Proofs in files: they continue after a stop, are checked, and report their progress."""
 
 import math
 import pickle
@@ -33,12 +33,12 @@ def kept(P, tmp_path):
 
 
 def read(path):
-    """What a file keeps of the one proof in it."""
+    """The content of the one proof in a file."""
     return kept_proofs.read_proofs(path)["above"]
 
 
 def dipped(P, alpha=0.9, delta=0.05):
-    """A condition that holds, with a dip, which takes some boxes."""
+    """A condition that holds; it has a dip, so that its proof needs many boxes."""
     return Planted(loop(P), alpha, delta).plant(torch.tensor([1.1, 0.1, 0.2]), 0.8, -3.0)
 
 
@@ -60,16 +60,16 @@ def test_stopped_and_continued_a_proof_ends_as_in_one_go(P, condition, wanted, t
     whole = go_on(condition, None, wanted=wanted)
     stopped = [go_on(condition, path, boxes, wanted) for boxes in (60, 120)]
     assert all(proof.level < whole.level for proof in stopped)
-    told = []
-    proof = go_on(condition, path, wanted=wanted, report=told.append)
+    reports = []
+    proof = go_on(condition, path, wanted=wanted, report=reports.append)
     assert (proof.verdict, proof.level, proof.boxes) == (whole.verdict, whole.level, whole.boxes)
     assert proof.counterexample == whole.counterexample
     assert proof.remaining_volume == whole.remaining_volume == 0
     assert whole.boxes > stopped[1].boxes > stopped[0].boxes
-    assert told[0].boxes == stopped[1].boxes + 64, "it starts where it stood"
-    assert told[0].seconds > stopped[1].seconds
-    assert [one.boxes for one in told] == sorted(one.boxes for one in told)
-    assert told[-1].remaining == 0
+    assert reports[0].boxes == stopped[1].boxes + 64, "it continues from the last state"
+    assert reports[0].seconds > stopped[1].seconds
+    assert [one.boxes for one in reports] == sorted(one.boxes for one in reports)
+    assert reports[-1].remaining == 0
 
 
 OTHERS = {  # proofs of something else
@@ -91,7 +91,7 @@ def test_the_proof_of_something_else_is_refused(P, kept):
 
 
 def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
-    """A violation where the other proof was done; the twin."""
+    """The twin: a condition that fails on boxes that the other proof had closed."""
     monkeypatch.setattr(kept_proofs.KeptProof, "identity", [])
     kept.unlink()
     go_on(dipped(P), kept, boxes=200)
@@ -108,7 +108,7 @@ def test_without_that_check_it_would_certify_what_fails(P, kept, monkeypatch):
     assert go_on(bad, None, boxes=2000).verdict == "falsified"
 
 
-# The rules that a proof was made by
+# The code that a proof depends on
 
 
 def test_the_rules_are_those_of_the_search_and_of_the_bounds():
@@ -177,7 +177,7 @@ def test_a_kept_proof_is_plain_data(kept):
 
 
 def rewritten(path, change):
-    """The file after a change of its content, by someone who computes the digest again."""
+    """Change the content of a file, with a correct digest."""
     proofs = kept_proofs.read_proofs(path)
     change(proofs["above"])
     kept_proofs.write_proofs(path, proofs)
@@ -271,7 +271,7 @@ def test_a_counterexample_that_is_left_out_is_met_again(P, tmp_path):
 
 
 def test_a_file_that_says_finished_is_bounded_again(P, kept):
-    """All that waits is called closed, as if the proof had ended."""
+    """All waiting leaves are listed as closed, as if the proof were finished."""
     rewritten(kept, called_closed)
     before = read(kept)["boxes"]
     proof = go_on(dipped(P), kept)
@@ -283,7 +283,7 @@ def test_a_file_that_says_finished_is_bounded_again(P, kept):
 
 
 def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
-    """Each of a tree's K cuts was bounded in the search, and one leaf more than these is in the check."""
+    """With K cuts, the search bounds 2K + 1 boxes, and the check bounds the K + 1 leaves."""
     content = read(finished)
     confirmed = checked(dipped(P), finished)
     assert (confirmed.verdict, confirmed.level, confirmed.remaining_volume) == ("certified", 2.0, 0.0)
@@ -293,7 +293,7 @@ def test_a_finished_proof_is_confirmed_by_its_leaves_alone(P, finished):
 
 @pytest.mark.parametrize("change", [without_a_cut, raised, called_closed, emptied], ids=lambda f: f.__name__)
 def test_a_check_believes_neither_lists_nor_levels(change, P, kept):
-    """The proof was stopped early, and says that it was not; its digest is right."""
+    """The file of an unfinished proof is changed to look finished, with a correct digest."""
     rewritten(kept, emptied)
     rewritten(kept, change)
     assert checked(dipped(P), kept, 6.0 if change is raised else 2.0).verdict != "certified"

@@ -1,7 +1,7 @@
 """Bounds at every magnitude from 1e-300 to 1e300, against values of 60 digits.
 
-Every value is held against its bounds in float64, and those that lie closest to them by mpmath.
-LYAPNET_VALUES=1000000 pytest -n 0 -s tests/prover/test_magnitudes.py draws as many values at least.
+Every value is compared with its bounds in float64, and the values closest to their bounds by mpmath too.
+LYAPNET_VALUES=1000000 pytest -n 0 -s tests/prover/test_magnitudes.py draws at least that many values.
 """
 
 import os
@@ -148,7 +148,7 @@ CASES = {
     aten.index_put.default: (
         lambda a, b, c: aten.index_put(pair(a, b), [torch.tensor([1, 1])], pair(a, c), True)[1],
         lambda a, b, c: a + b + c),
-    ROUNDED: (  # any result within θ of a is to lie within the bounds
+    ROUNDED: (  # the bounds must contain every result within θ of a
         lambda a, b, c: ROUNDED(a, b, 2**-24, 1e-45, 3e38), lambda a, b, c: a * (1 + mpmath.mpf(2)**-24)),
 }  # fmt: skip
 CHAINED = [
@@ -188,7 +188,7 @@ def cases():
 
 
 def boxes_of_every_magnitude(boxes, seed):
-    """Boxes (boxes, 3), some of them points, and some with a corner at a place where functions bend or end."""
+    """Boxes (boxes, 3), some of them points, some with a corner at a kink or at the end of the domain of a function."""
     generator = random.Random(seed)
 
     def magnitude():
@@ -241,19 +241,19 @@ def points_in(lower, upper, seed, points=4):
 
 
 def outside(names, seed, most=30):
-    """Of cases, by name: the values outside of their bounds, those held against them, and those of 60 digits.
+    """For each case, numbers of values: those outside their bounds, all compared ones, those compared in 60 digits.
 
-    A value that does not exist, as log −1, lies outside of all bounds but infinite ones. Of a chain, in which a
-    comparison makes a truth of such a value again, what torch has counts.
+    A value that does not exist, such as log −1, counts as outside unless the bounds are infinite. In a chain, a
+    comparison may turn such a value into a truth value; then torch's value is compared.
     """
     lower, upper = boxes_of_every_magnitude(BOXES, seed)
     points = points_in(lower, upper, seed)
-    found, tried, exact, generator = Counter(), Counter(), Counter(), random.Random(seed)
+    found, compared, exact, generator = Counter(), Counter(), Counter(), random.Random(seed)
     for name, ways in zip(names, bounds_of_all(names, lower, upper).movedim(0, 1), strict=True):
         torch_function, true = cases()[name]
-        low, high = ways[:, 0].amax(0), ways[:, 1].amin(0)  # the narrowest of all ways
+        low, high = ways[:, 0].amax(0), ways[:, 1].amin(0)  # the tightest of all ways
         known = (low > -torch.inf) | (high < torch.inf)
-        tried[name] = int(known.sum()) * len(points)
+        compared[name] = int(known.sum()) * len(points)
         if any(str(operation) in name for operation in UNBATCHED):
             margin = torch.rand(points.shape[:2], generator=torch.Generator().manual_seed(seed))
         else:
@@ -269,7 +269,7 @@ def outside(names, seed, most=30):
                 if value is None and " > " in name:
                     value = float(torch_function(*points[point, box]))
                 found[name] += value is None or not float(low[box]) <= value <= float(high[box])
-    return found, tried, exact
+    return found, compared, exact
 
 
 def value_of(function, point):
@@ -277,31 +277,31 @@ def value_of(function, point):
     with mpmath.workdps(60):
         try:
             value = function(*map(mpmath.mpf, point))
-        except (ZeroDivisionError, ValueError, TypeError):  # the last of comparing complex numbers
+        except (ZeroDivisionError, ValueError, TypeError):  # TypeError: a comparison of complex numbers
             return None
         return None if isinstance(value, mpmath.mpc) else value
 
 
 def test_every_rule_has_a_case():
-    """But those that move entries, or read a shape."""
+    """Except for operators that move entries or depend on shapes alone."""
     assert RULES.keys() - ARRANGEMENTS.keys() - OF_SHAPE == CASES.keys()
 
 
 def groups():
-    """Names, of cases that machine code has and of those that it lacks."""
+    """(names of cases with machine code, names of cases without)."""
     lacking = {str(operation) for operation in WITHOUT_MACHINE_CODE}
     return [[name for name in cases() if (name in lacking) == missing] for missing in (False, True)]
 
 
 @pytest.mark.gate
 def test_no_value_lies_outside():
-    found, tried, exact, seed = Counter(), Counter(), Counter(), 0
-    while sum(tried.values()) < VALUES:
+    found, compared, exact, seed = Counter(), Counter(), Counter(), 0
+    while sum(compared.values()) < VALUES:
         for names in groups():
-            for total, counts in zip((found, tried, exact), outside(names, seed), strict=True):
+            for total, counts in zip((found, compared, exact), outside(names, seed), strict=True):
                 total.update(counts)
         seed += 1
-    print(f"{sum(found.values())} of {sum(tried.values())} values outside, {sum(exact.values())} by mpmath")
+    print(f"{sum(found.values())} of {sum(compared.values())} values outside, {sum(exact.values())} by mpmath")
     assert not +found
     assert min(exact[name] for name in map(str, CASES)) > 10
 

@@ -1,6 +1,6 @@
-"""The table of operators: each row's columns against torch and one another, the overview in docs, a row of one's own.
+"""The table of operators: all columns agree with torch; the overview in the docs; registration of a row.
 
-`python -m tests.prover.test_operator_table` writes the overview in docs/operators.md anew.
+`python -m tests.prover.test_operator_table` updates the overview in docs/operators.md.
 """
 
 import ctypes
@@ -101,8 +101,8 @@ def by_javascript(row):
     calls = (
         f"const y = new Float64Array({expected.numel()});\nf(Float64Array.from({json.dumps(x.flatten().tolist())}), y)"
     )
-    shown = "console.log(JSON.stringify([...y].map(String)))"
-    program = "\n".join([javascript_functions.HELPERS, *tables.text, text, calls, shown])
+    output = "console.log(JSON.stringify([...y].map(String)))"
+    program = "\n".join([javascript_functions.HELPERS, *tables.text, text, calls, output])
     done = subprocess.run([NODE, "-e", program], capture_output=True, text=True, check=True)
     return torch.tensor([float(number.replace("Infinity", "inf")) for number in json.loads(done.stdout)])
 
@@ -156,7 +156,7 @@ def test_bounds_hold_and_derivatives_are_torchs(name):
 
 @pytest.mark.parametrize("name", [name for name in ROWS if None not in OPERATORS[name].domain])
 def test_slopes_of_torch_are_differences(name):
-    """The derivative that all readers trace, but where a function jumps."""
+    """The derivative that all readers trace, except where a function jumps."""
     row = OPERATORS[name]
     x = torch.stack(row.at(0.05 + 0.9 * unit(row.operands)[8:])).requires_grad_()
     y = row(*x).double()
@@ -218,7 +218,7 @@ def test_a_wrong_column_is_found(wrong, registered, tmp_path):
     found = {"C": are_equal(by_c(row, tmp_path), row), "CasADi": are_equal(by_casadi(row), row)}
     try:
         found["numbers"] = are_equal(by_numbers(row), row)
-    except NotImplementedError:  # a kernel holds itself against torch
+    except NotImplementedError:  # a kernel compares itself with torch
         found["numbers"] = False
     derived = {"C": ["numbers", "C"]}.get(wrong, [wrong])  # the kernel computes C number by number
     assert [name for name in ("numbers", "C", "CasADi") if not found[name]] == [name for name in derived if name]
@@ -397,7 +397,7 @@ if __name__ == "__main__":
     PAGE.write_text(re.sub(r"\| bounds \|.*", lambda _: overview() + "\n", text, flags=re.DOTALL), encoding="utf-8")
 
 
-# What is registered and fails leaves nothing behind
+# A registration that fails leaves nothing behind
 
 ERFINV = Operator("erfinv", domain=((-0.9, 0.9),))
 
@@ -405,8 +405,8 @@ ERFINV = Operator("erfinv", domain=((-0.9, 0.9),))
 @pytest.mark.parametrize(
     ("row", "bound", "kind", "says"),
     [
-        (ERFINV, lambda operators, x: None, "smooth", "as they were tried"),
-        (Operator("erfinv", domain=((-0.9, 0.9),) * 2), lambda operators, x: x, "smooth", "as they were tried"),
+        (ERFINV, lambda operators, x: None, "smooth", "while they were checked"),
+        (Operator("erfinv", domain=((-0.9, 0.9),) * 2), lambda operators, x: x, "smooth", "while they were checked"),
         (Operator("erfinv", domain=((2.0, 3.0),)), lambda operators, x: operators.mul(x, 0.0), "smooth", "not finite"),
         (ERFINV, lambda operators, x: operators.mul(x, 0.0), "smooth", "values outside"),
         (ERFINV, lambda operators, x: x, "bogus", "kind as one of smooth, kink, jump"),

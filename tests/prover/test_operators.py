@@ -1,4 +1,4 @@
-"""All of torch's operators, with all that they can be told: each is refused by name, or its bounds hold its values."""
+"""All of torch's operators with all their arguments: each is refused by name, or its bounds contain its values."""
 
 import faulthandler
 import itertools
@@ -48,7 +48,7 @@ def outside(function, boxes=12, points=12):
 
 # Every operator of aten, by its schema
 
-VALUES = {  # what arguments of a type are set to, by turns
+VALUES = {  # values of arguments of each type, used in turn
     "number": (0.3, -1.5, 2, 3.0, True), "float": (0.3, -2.0, 1.0), "int": (0, 1, -1, 2), "bool": (False, True),
     "List[int]": ([0], [3], [1, 0], []), "str": ("none", "floor", "trunc", "tanh"),
     "dtype": (torch.float32, torch.int64, torch.float64, torch.bool),
@@ -57,7 +57,7 @@ SHAPES = ((3,), (3, 3), (1, 3, 3), (), (3,), (3, 3), (3, 1))
 
 
 def operators():
-    """What torch's functions, methods and modules are called by, as operators of tensors that change none."""
+    """The operators of torch's public functions, methods and modules that take tensors and change none."""
     spaces = (torch, torch.Tensor, functional)
     for name in dir(aten):
         public = name.startswith(("linalg_", "special_")) or any(hasattr(space, name) for space in spaces)
@@ -81,7 +81,7 @@ def value_of(argument, turn, tensors):
 
 
 def calls(operator, tries):
-    """Functions of (t, x) that call it on the point, with what it requires and, by turns, with something optional."""
+    """Functions of (t, x) that call the operator on the point, some with one optional argument."""
     arguments = operator._schema.arguments
     optional = [a for a in arguments if a.has_default_value() and not str(a.type).startswith("Optional[Generator")]
     generator = torch.Generator().manual_seed(zlib.crc32(str(operator).encode()))
@@ -94,7 +94,7 @@ def calls(operator, tries):
 def calling(operator, shape, extra, turns, constant):
     """A call on tensors of a shape; all but the first are constant, or none is."""
     grid = torch.linspace(0.1, 0.9, torch.Size(shape).numel(), dtype=torch.float64).reshape(shape)
-    middle, slope = 0.5 + grid, 1 - grid  # before it is traced: as few operators as there can be beside the one
+    middle, slope = 0.5 + grid, 1 - grid  # computed before tracing, so that the trace has few other operators
     slopes = slope, 0 * slope if constant else slope
 
     def call(t, x):
@@ -115,28 +115,28 @@ def calling(operator, shape, extra, turns, constant):
 
 
 def examined(operator, tries=3):
-    """(calls that torch takes, those that were bounded, values outside)."""
-    taken, bounded, wrong = 0, 0, 0
+    """(calls that torch accepts, calls that were bounded, values outside)."""
+    accepted, bounded, wrong = 0, 0, 0
     for function in calls(operator, tries):
         try:
             function(LOWER[0], LOWER[1:])
-        except Exception:  # of any kind: no such call
+        except Exception:  # torch does not accept the call
             continue
         count = outside(function)
-        taken, bounded, wrong = taken + 1, bounded + (count is not None), wrong + (count or 0)
-    return taken, bounded, wrong
+        accepted, bounded, wrong = accepted + 1, bounded + (count is not None), wrong + (count or 0)
+    return accepted, bounded, wrong
 
 
 def test_whether_torch_finds_a_matrix_singular_is_not_known():
-    """The matrices here are, up to rounding: torch then returns another code than zero."""
+    """The matrices here are singular up to rounding: torch then returns a code other than 0."""
     assert examined(aten.linalg_solve_ex.default, 8) == (3, 0, 0)
 
 
 def in_children(function, items):
-    """What a function returns of each item, in processes of their own; None of one that ends its process by a signal.
+    """The results of a function for all items, in child processes; None for an item that crashes its process.
 
-    A few of torch's operators end the process on arguments that they were not made for. A child goes through the items
-    until one ends it; the next child begins with that one, and is ended by it alone.
+    A few of torch's operators crash on unsuitable arguments. A child handles the items until one crashes it; the next
+    child starts with that item. If the first item of a child crashes it, its result is None.
     """
     answers = []
     while len(answers) < len(items):
@@ -146,7 +146,7 @@ def in_children(function, items):
 
 
 def in_a_child(function, items):
-    """What a function returns of the first items, in a process of its own: all of them, unless it is ended."""
+    """The results for the first items, in a child process: for all of them, unless one crashes it."""
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
@@ -168,7 +168,7 @@ def in_a_child(function, items):
 
 
 def ending(number):
-    """The process, by three items of four."""
+    """Abort the process, unless the number is 1."""
     return number if number == 1 else os.abort()
 
 
@@ -190,7 +190,7 @@ def test_each_operator_is_refused_or_bounded():
     assert sum(bounded > 0 for _, bounded, _ in counts.values()) > 60
 
 
-# What parameters do
+# Parameters of operators
 
 REFUSED = {
     "sum in float32": lambda x: x.sum(dtype=torch.float32),
@@ -233,7 +233,7 @@ def test_parameters_are_in_the_bounds(name):
 
 @pytest.mark.parametrize("sides", [(-0.3, math.inf), (-math.inf, 0.2), (-math.inf, math.inf)])
 def test_a_limit_on_one_side_is_bounded(sides):
-    """The other is no limit: infinity minus infinity would be anything."""
+    """An infinite limit is left out, because ∞ − ∞ is undefined."""
     low, high = torch.tensor(sides).double()
     assert outside(lambda t, x: (x.clamp(low, high),)) == 0
     ends = BoundedFunction(lambda t, x: (x.clamp(low, high),), (LOWER, UPPER)).bounds(LOWER[None], UPPER[None])
@@ -242,7 +242,7 @@ def test_a_limit_on_one_side_is_bounded(sides):
 
 @pytest.mark.parametrize("m", [1, 2])
 def test_the_law_within_limits_is_bounded_by_them(m):
-    """Also on boxes so wide that nothing else is known; one beside them is not in the bounds."""
+    """Also on boxes so wide that the limits are the only bounds."""
     limits = [-1.03, -0.37][:m], [0.9, 0.5][:m]
     controls, factor = ControlBox(*limits), torch.tensor([[1.0, 0.3], [-0.4, 0.8]])[:m, :m].double()
 
@@ -259,7 +259,7 @@ def test_the_law_within_limits_is_bounded_by_them(m):
 
 @pytest.mark.parametrize("name", ["scalars", "comparisons", "α"])
 def test_numbers_are_float64_where_torch_makes_float32_ones(name):
-    """As for a user, whose default is float32: 0.1 is not rounded to 0.10000000149."""
+    """With float32 as the default, as users have it: 0.1 is not rounded to 0.10000000149."""
     functions = {
         "scalars": lambda x: 0.1 * x + 0.3,
         "comparisons": lambda x: (x > 0.1).to(x.dtype) * x + functional.leaky_relu(x, 0.1),

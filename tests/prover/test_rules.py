@@ -183,7 +183,7 @@ def values_at(function, points):
 
 
 def values_on(function, lower, upper, starts=4, steps=8):
-    """Values in each box, (boxes, values, *shape): from corners and random points, on the way up or down one entry."""
+    """Values in each box, (boxes, values, *shape): at corners, random points, and on ascents or descents."""
     unit = torch.rand(starts, *lower.shape)
     unit[::2] = unit[::2].round()
     points, seen, directions = (lower + (upper - lower) * unit).flatten(0, 1), [], None
@@ -288,7 +288,7 @@ def test_no_value_of_many_compositions_lies_outside(expression):
 
 
 def test_a_wrong_rule_shows_in_compositions(monkeypatch):
-    """The twin: of a product, the remainder is forgotten."""
+    """The twin: the rule of products without their remainder."""
 
     def wrong(x, y):
         form = RIGHT(x, y)
@@ -301,7 +301,7 @@ def test_a_wrong_rule_shows_in_compositions(monkeypatch):
 RIGHT = RULES[aten.mul.Tensor]
 
 
-# What is taken on trust: torch's elementary functions
+# The assumption about torch's elementary functions
 
 ELEMENTARY = {
     "exp": (torch.exp, mpmath.exp, -700, 700),
@@ -326,7 +326,7 @@ def points_of(low, high, count):
 
 
 def largest_error(name, count):
-    """In ε|f|, against 400 bits, which leave 50 digits after the cancellation of 1 + 1e-9 or sin 100π."""
+    """In units of ε|f|; 400 bits leave 50 digits after the cancellation in 1 + 1e-9 or sin 100π."""
     function, exact, low, high = ELEMENTARY[name]
     points = points_of(low, high, count)
     with mpmath.workprec(400):

@@ -1,6 +1,6 @@
-"""A second opinion on whole conditions: V̇ + αℓ − δ of a network by mpmath, written by hand, in 50 digits and on boxes.
+"""An independent check of whole conditions: V̇ + αℓ − δ of a network, written by hand for mpmath.
 
-Nothing is shared with lyapnet.claims but the weights: neither the graph, nor autograd, nor the arithmetic.
+It shares only the weights with lyapnet: neither the graph, nor autograd, nor the arithmetic.
 """
 
 import mpmath
@@ -102,7 +102,7 @@ def boxes_outside(width, count=20, inner=10):
             disjoint += b < mpf(other.a) or mpf(other.b) < a
             corners = torch.rand(inner, 3)
             corners[::2] = corners[::2].round()
-            points = torch.minimum(lower[i] + (upper[i] - lower[i]) * corners, upper[i])  # rounding may lead outside
+            points = torch.minimum(lower[i] + (upper[i] - lower[i]) * corners, upper[i])  # rounding may leave the box
             outside += sum(not a <= at_point(V, p) <= b for p in points)
     return disjoint, outside
 
@@ -129,7 +129,7 @@ def mutilated(rule, change):
 
 
 def test_a_mutilated_rule_is_caught_at_points(monkeypatch):
-    """By one part in 10¹²."""
+    """The error is one part in 10¹²."""
     sigmoid = torch.ops.aten.sigmoid.default
     monkeypatch.setitem(RULES, sigmoid, mutilated(elementary_functions.sigmoid, lambda terms: terms * (1 + 1e-12)))
     assert points_outside(20)[0] > 0

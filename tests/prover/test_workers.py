@@ -1,4 +1,4 @@
-"""Workers: the proof of one process, and one line where they are killed."""
+"""Workers: the same proof as by one process, and an error of one line if they are killed."""
 
 import os
 import signal
@@ -22,7 +22,7 @@ from tests.claims.test_least_cost import problem
 
 
 class InHalves(Question):
-    """Cut whatever has a width above the level across its widest axis; a box further right is for the one who asks."""
+    """Cut boxes wider than the level across their widest axis; their keys are the id of the process."""
 
     level = 0.3
 
@@ -69,13 +69,16 @@ def test_a_worker_that_is_killed_is_one_line():
             os.kill(os.getpid(), signal.SIGKILL)
 
     question = Killed()
-    with pytest.raises(UsageError, match="Expected workers that live on, got one killed"), bounding(question, 2) as run:
+    with (
+        pytest.raises(UsageError, match="Expected all workers to finish, got one that was killed"),
+        bounding(question, 2) as run,
+    ):
         list(run(question.undecided, chunks()))
     assert threading.active_count() < 20
 
 
 def test_another_machine_bounds_the_same_or_nothing():
-    """The condition goes there as bytes, and is traced anew: the same boxes to the last bit, or one line."""
+    """The condition is pickled and traced again: the same boxes to the last bit, or an error."""
     pickle = pytest.importorskip("cloudpickle")
     condition = DecreaseCondition(loop(riccati()), 0.9, 0.02)
     bounded = bounded_condition(condition, domain(), 1)
@@ -107,22 +110,22 @@ def test_a_cluster_proves_the_same():
 
 @pytest.mark.gate
 def test_what_a_cluster_cannot_do_is_one_line(monkeypatch):
-    """More workers than it has cores; other code there; and SIGTERM stays with who had it."""
+    """Too many workers; other code there; and the handler of SIGTERM stays."""
     pytest.importorskip("ray")
-    condition, asked = RiseCondition(loop(riccati()).requires_grad_(False), 0.9, 0.02, problem()), lambda *_: None
-    before = signal.signal(signal.SIGTERM, asked)
+    condition, handler = RiseCondition(loop(riccati()).requires_grad_(False), 0.9, 0.02, problem()), lambda *_: None
+    before = signal.signal(signal.SIGTERM, handler)
     try:
         with pytest.raises(UsageError, match="cores of the cluster, got --workers 5000; ask for fewer"):
             prove(condition, domain(), 1.0, Budget(60, workers=5000, ray="local"))
         monkeypatch.setattr(proof, "proved_by", lambda bounded: ("other", "code", "here"))
         with pytest.raises(UsageError, match="Expected the same condition, lyapnet and torch on each machine"):
             prove(condition, domain(), 1.0, Budget(60, ray="local"))
-        assert signal.getsignal(signal.SIGTERM) is asked
+        assert signal.getsignal(signal.SIGTERM) is handler
     finally:
         signal.signal(signal.SIGTERM, before)
 
 
-def test_a_cluster_that_is_not_there_is_told_at_once():
+def test_a_cluster_that_does_not_exist_is_an_error_at_once():
     pytest.importorskip("ray")
     with pytest.raises(UsageError, match="Expected a Ray cluster as auto, local or ray://host:port"):
         prove(DecreaseCondition(loop(riccati()), 0.9, 0.02), domain(), 10.0, Budget(30, ray="ray://host:abc"))

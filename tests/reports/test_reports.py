@@ -12,8 +12,8 @@ from lyapnet.base.errors import UsageError
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import parts_of
 from lyapnet.experiment.config import load_config
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.stages import silent
+from lyapnet.training.penalty_weight import find_penalty_weight
+from lyapnet.training.stage_messages import silent
 from tests.cli.test_check_tasks import facts_before_optima
 from tests.marks import sample
 from tests.reports.run import HERE, task_of
@@ -36,7 +36,7 @@ FACTS = {
     "jets": {"modes": "0 (6 times) 1/s", "controllable": "yes"},
     "minimum_time": {"goal": "an equilibrium without control", "stiffness": "made to be held for Δt"},
     "distance": {
-        "kink": "q and φ have a kink at the goal: training rounds them, √(x² + ε²) − ε with ε = 0.0",
+        "kink": "q and φ have a kink at the goal: training smooths them, √(x² + ε²) − ε with ε = 0.0",
         "controllable": "yes",
         "stiffness": "made to be held for Δt",
     },
@@ -143,9 +143,9 @@ def test_what_an_operating_point_is_rounded_to_is_solved_for():
 @pytest.mark.gate
 @pytest.mark.parametrize("name", ["reach", "sir"])
 def test_a_penalty_keeps_the_constraints(name, monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 6)
+    monkeypatch.setattr("lyapnet.training.penalty_weight.OPTIMA", 6)
     problem, state = problem_in(HERE / name), list(RIGHT[name])[1:2]
-    found = find_relaxation(problem.relaxed(), silent)
+    found = find_penalty_weight(problem.relaxed(), silent)
     assert found.kept == 6
     free = oracle_of(problem.replaced(constraints=None)).solve(torch.tensor(state)).u.transpose(0, 1)
     assert replay(problem, state, free).h > KEPT, "the twin: without constraints they are violated"

@@ -20,10 +20,10 @@ from lyapnet.lab.comparison.reference_problems import bounded_problem
 from lyapnet.task.constraints import AllOf, Ball, Constraints, OfFirstStates, StateLimits, parts_of
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.training.build_learner import build_learner
-from lyapnet.training.facts import facts_of
 from lyapnet.training.modules import ValueModule
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.stages import silent
+from lyapnet.training.penalty_weight import find_penalty_weight
+from lyapnet.training.stage_messages import silent
+from lyapnet.training.task_facts import facts_of
 from lyapnet.value.expansions import greedy_law, optimal_trajectories, path_under, riccati
 from tests.configs import objects
 from tests.fits import shorten_fits
@@ -174,9 +174,9 @@ def test_a_state_from_which_a_limit_cannot_be_kept_has_no_optimum():
 
 @pytest.mark.gate
 def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
-    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 3)
+    monkeypatch.setattr("lyapnet.training.penalty_weight.OPTIMA", 3)
     problem = bryson_denham(0.1).relaxed()
-    found, said = find_relaxation(problem, silent), []
+    found, said = find_penalty_weight(problem, silent), []
     assert found.kept == found.states
     problem.cost.weight.fill_(found.weight)
     x0, idle = torch.tensor([[0.0, 1.0]]), torch.zeros(100, 1, 1)
@@ -188,7 +188,7 @@ def test_the_penalty_is_as_dear_as_the_optima_need(monkeypatch):
     assert float(problem.constraints.worst(optimal_trajectories(problem, x0, idle).path.x).max()) > 0
     impossible = problem_of({**constrained(upper={"position": 1.01}), "controls": {"lower": -1, "upper": 1}})
     impossible = impossible.replaced(initial_states=lyapnet.Box([0.99, 0.1], [1.0, 0.2])).relaxed()
-    found = find_relaxation(impossible, lambda stage, *counts: said.append(stage))
+    found = find_penalty_weight(impossible, lambda stage, *counts: said.append(stage))
     assert found.kept < found.states
     assert f"penalties up to {found.largest:.3g}/s" in str(found)
     assert found.worst > 0
@@ -201,7 +201,7 @@ def few_optima(monkeypatch):
     """For what does not ask how good a start is."""
     monkeypatch.setattr("lyapnet.training.start.MAX_OPTIMA", 12)
     shorten_fits(monkeypatch, 260, 140)
-    monkeypatch.setattr("lyapnet.training.relaxation.OPTIMA", 6)
+    monkeypatch.setattr("lyapnet.training.penalty_weight.OPTIMA", 6)
 
 
 @pytest.fixture(scope="module")

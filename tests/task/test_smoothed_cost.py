@@ -14,10 +14,10 @@ from lyapnet.task.cost import PenaltyCost, SmoothedCost
 from lyapnet.task.domain import Border, DomainCost, as_written
 from lyapnet.training.build import build_module
 from lyapnet.training.curves import members_of
-from lyapnet.training.facts import kink_facts
+from lyapnet.training.task_facts import kink_facts
 from lyapnet.value.derivatives import jacobian
 from lyapnet.value.expansions import Expansion, at_rest, greedy_law, in_float64, optimal_trajectories, path_under
-from lyapnet.value.linearisation import SOLVED, TRAINED, riccati_or_reason, rounded
+from lyapnet.value.linearisation import SOLVED, TRAINED, riccati_or_reason, smooth_kinks
 from tests.configs import objects
 from tests.reports.run import HERE
 from tests.reports.values import RIGHT
@@ -79,7 +79,7 @@ def curvature(function, x):
 @pytest.mark.parametrize("name", [*NORMS, *ABSOLUTE])
 def test_values_are_those_of_the_formula(name):
     q = NORMS[name] if name in NORMS else lambda x: ABSOLUTE[name](x).sum(-1)
-    problem = rounded(problem_of(q))
+    problem = smooth_kinks(problem_of(q))
     cost, x = problem.cost, torch.randn(50, 2, dtype=torch.float64)
     x = torch.cat([x, 1e-3 * x, 0 * x])
     assert isinstance(cost, SmoothedCost)
@@ -105,21 +105,21 @@ def test_what_is_smooth_stays_the_same_object():
     }
     for q in smooth.values():
         problem = problem_of(q)
-        assert rounded(problem) is problem
+        assert smooth_kinks(problem) is problem
     plain = objects(config_from_plain(PLAIN, []))[0]
-    assert rounded(plain) is plain
+    assert smooth_kinks(plain) is plain
     kinked = problem_of(lyapnet.norm)
-    assert rounded(kinked) is not kinked, "the twin"
-    assert rounded(rounded(kinked)).cost.cost is kinked.cost
+    assert smooth_kinks(kinked) is not kinked, "the twin"
+    assert smooth_kinks(smooth_kinks(kinked)).cost.cost is kinked.cost
 
 
 def test_a_kink_that_no_root_makes_is_left_with_its_reason():
     problem = problem_of(lambda x: torch.relu(x).sum(-1) + x.square().sum(-1))
-    assert rounded(problem) is problem
+    assert smooth_kinks(problem) is problem
 
 
 def test_a_root_that_does_not_vanish_at_the_goal_is_left_as_it_is():
-    problem = rounded(problem_of(lambda x: torch.sqrt(1 + x[..., 0] ** 2) - 1 + x[..., 1].abs()))
+    problem = smooth_kinks(problem_of(lambda x: torch.sqrt(1 + x[..., 0] ** 2) - 1 + x[..., 1].abs()))
     assert isinstance(problem.cost, SmoothedCost)
     first, second = problem.cost.widths["q"]
     assert first == 0 < second
@@ -130,7 +130,7 @@ def test_a_root_that_does_not_vanish_at_the_goal_is_left_as_it_is():
 
 def test_constraints_and_the_record_are_those_of_the_task():
     problem = problem_of(lyapnet.norm)
-    smooth = rounded(problem)
+    smooth = smooth_kinks(problem)
     assert as_written(smooth.cost) is problem.cost
     assert smooth.record() == problem.record()
     assert smooth.has_goal
@@ -144,7 +144,7 @@ def test_in_a_domain_a_root_is_rounded_and_the_price_of_leaving_is_not():
     problem = problem_of(lambda x: torch.sqrt(x[..., 0]) + x[..., 1] ** 2, "initial_states.lower=[0,-1]")
     problem = problem.within([Border("position", "lower", 0.0, "where q is defined")])
     for share in (TRAINED, SOLVED):
-        smooth = rounded(problem, share)
+        smooth = smooth_kinks(problem, share)
         outer = smooth.cost
         assert isinstance(outer, DomainCost)
         assert isinstance(outer.cost, SmoothedCost)
@@ -155,7 +155,7 @@ def test_in_a_domain_a_root_is_rounded_and_the_price_of_leaving_is_not():
 
 
 def test_traces_are_the_functions():
-    problem = rounded(problem_of(lyapnet.norm))
+    problem = smooth_kinks(problem_of(lyapnet.norm))
     x = torch.randn(3, 2, dtype=torch.float64)
 
     def both(x):
@@ -173,7 +173,7 @@ def test_what_trains_is_rounded():
     problem = members_of(module)[0].problem
     assert isinstance(problem.cost, SmoothedCost)
     (fact,) = kink_facts(problem)
-    assert fact.found.startswith("q and φ have a kink at the goal: training rounds them, √(x² + ε²) − ε with ε = ")
+    assert fact.found.startswith("q and φ have a kink at the goal: training smooths them, √(x² + ε²) − ε with ε = ")
     plain = members_of(build_module(config_from_plain(PLAIN, [])))[0].problem
     assert not isinstance(plain.cost, SmoothedCost)
     assert not kink_facts(plain), "the twin"
@@ -185,7 +185,7 @@ def test_the_distance_to_a_goal():
     pytest.importorskip("casadi")
     problem, x0 = problem_in(HERE / "distance"), torch.tensor(list(RIGHT["distance"]), dtype=torch.float64)
     right = torch.tensor(list(RIGHT["distance"].values()), dtype=torch.float64)
-    smooth = in_float64(rounded(problem, SOLVED))
+    smooth = in_float64(smooth_kinks(problem, SOLVED))
     known = riccati_or_reason(smooth)
     assert isinstance(known, Expansion)
     assert not isinstance(riccati_or_reason(problem), Expansion), "the twin, as it is written"

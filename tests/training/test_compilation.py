@@ -15,7 +15,7 @@ from lyapnet.cli import main
 from lyapnet.graphs import compilation
 from lyapnet.graphs.number_kernel import assembly
 from lyapnet.training.compilation import Compilation
-from lyapnet.training.stages import PATIENCE, Stages
+from lyapnet.training.stage_messages import PATIENCE, StageMessages
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import FCN, NETWORKS
 from tests.marks import sample
@@ -116,7 +116,7 @@ def test_the_start_is_compiled_for_on_the_cpu_wherever_the_training_runs(trained
     module = Mock(spec=LightningModule, device=torch.device("cpu"))
     module.compile_for = lambda size: compiled.append(module.device.type)
     trainer = Mock(spec=Trainer, strategy=SimpleNamespace(root_device=device), is_global_zero=True)
-    callback = Compilation(Stages(Console(), "training", PATIENCE), 3, lambda **facts: records.append(facts))
+    callback = Compilation(StageMessages(Console(), "training", PATIENCE), 3, lambda **facts: records.append(facts))
     callback.before_start(trainer, module)
     assert len(records) == seen_before_training
     module.device = device

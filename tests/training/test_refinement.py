@@ -32,7 +32,7 @@ from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.sets import Box
 from lyapnet.training import experiment, refinement
 from lyapnet.training.modules import ValueModule
-from lyapnet.training.runs import Run
+from lyapnet.training.runs import TrainingRun
 from tests.fits import shorten_fits
 
 TINY = [
@@ -105,7 +105,7 @@ def no_training(monkeypatch):
 def test_a_round_is_a_run_that_learns_from_what_failed(run, trained):
     checkpoint, certificate = refine(run)
     folder = run / "refine_1"
-    again = Run(folder / "version_0")
+    again = TrainingRun(folder / "version_0")
     assert runs(folder) == ["version_0"]
     assert again.finished
     assert checkpoint == again.best
@@ -220,8 +220,8 @@ def test_the_same_command_does_not_train_again(run, monkeypatch):
 def test_a_second_round_starts_from_the_first_and_keeps_its_points(run):
     refine(run)
     checkpoint, _ = refine(run, rounds=2)
-    assert checkpoint == Run(run / "refine_2/version_0").best
-    assert Run(run / "refine_2/version_0").finetuned_from == best(run / "refine_1/version_0").resolve()
+    assert checkpoint == TrainingRun(run / "refine_2/version_0").best
+    assert TrainingRun(run / "refine_2/version_0").finetuned_from == best(run / "refine_1/version_0").resolve()
     (_, first), (_, both) = points_of(run / "refine_1"), points_of(run / "refine_2")
     assert torch.equal(both[-len(first) :], first)
     assert len(both) > len(first)

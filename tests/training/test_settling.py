@@ -12,9 +12,9 @@ from lyapnet.experiment.config import config_from_plain
 from lyapnet.training.build import build_module
 from lyapnet.training.learner import Learner
 from lyapnet.training.optimizer import OptimizerOptions
-from lyapnet.training.runs import Run
+from lyapnet.training.runs import TrainingRun
 from lyapnet.training.settling import COOLING, WINDOW, Settling, end_of
-from lyapnet.training.stages import Stages
+from lyapnet.training.stage_messages import StageMessages
 from tests.runs import SMALL, Desk, both, checkpoint, dies_at, differences, without_figures
 
 pytestmark = pytest.mark.gate
@@ -67,7 +67,7 @@ def test_when_a_loss_has_stopped_falling(losses, stopped):
 
 def has_stopped(losses, warmup):
     """Whether it has after losses every EVERY steps, from the start on."""
-    settling = Settling(1e-3, warmup, Stages(Console(), ""))
+    settling = Settling(1e-3, warmup, StageMessages(Console(), ""))
     settling.losses[""] = [(EVERY * k, loss) for k, loss in enumerate(losses)]
     return settling._has_stopped("", EVERY * (len(losses) - 1))
 
@@ -114,7 +114,7 @@ def test_training_ends_early_and_says_so(run):
     assert f"settled: in {WINDOW} steps {ends}" in out
     assert f"step {END}/{END}" in out
     assert checkpoint(one, "last")["global_step"] == END
-    assert Run(one.run).finished
+    assert TrainingRun(one.run).finished
 
 
 def test_without_a_least_gain_it_takes_all_steps(tmp_path):

@@ -12,8 +12,8 @@ from lyapnet.experiment.config import config_from_plain
 from lyapnet.training import start_cache
 from lyapnet.training.build import build_module
 from lyapnet.training.checkpoints import Checkpoints
-from lyapnet.training.facts import facts_of
 from lyapnet.training.start_cache import StartCache, load_or_choose_start
+from lyapnet.training.task_facts import facts_of
 from tests.fits import few_optima
 
 TASK = {

@@ -5,7 +5,7 @@ import importlib.util
 from lyapnet.base.errors import OracleError, one_line
 from lyapnet.evaluation.oracles.base import Optima, Oracle, Report, silent
 from lyapnet.evaluation.oracles.noisy_riccati import noisy_riccati
-from lyapnet.evaluation.oracles.of_rounded import OracleOfRounded
+from lyapnet.evaluation.oracles.of_smoothed import OracleOfSmoothed
 from lyapnet.evaluation.oracles.riccati import (
     RiccatiOracle,
     RiccatiSolution,
@@ -16,7 +16,7 @@ from lyapnet.loop.rollout import ADAPTIVE_METHODS
 from lyapnet.task.cost import is_quadratic
 from lyapnet.task.problem import Problem
 from lyapnet.task.systems import is_linear
-from lyapnet.value.linearisation import SOLVED, rounded
+from lyapnet.value.linearisation import SOLVED, smooth_kinks
 
 __all__ = [
     "Optima",
@@ -77,9 +77,9 @@ def oracle_of(problem: Problem, method: str | None = None) -> Oracle:
         )
     from lyapnet.evaluation.oracles.transcription import Transcription  # needs CasADi
 
-    steps, smooth = "rk4" if method in ADAPTIVE_METHODS else method, rounded(problem, SOLVED)
+    steps, smooth = "rk4" if method in ADAPTIVE_METHODS else method, smooth_kinks(problem, SOLVED)
     found = Transcription(smooth, steps)
-    return found if smooth is problem else OracleOfRounded(found, problem, steps)
+    return found if smooth is problem else OracleOfSmoothed(found, problem, steps)
 
 
 def optimal_cost(problem: Problem, method: str | None = None) -> Oracle | None:

@@ -13,7 +13,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.exchange.export import c, programs
 from lyapnet.exchange.export.law import Law
 from lyapnet.exchange.export.verification import Agreement, verify
-from lyapnet.value.beyond import BEYOND
+from lyapnet.value.law_after_horizon import BEYOND
 
 FORMATS = {"c": "", "onnx": ".onnx", "torch": ".pt2"}  # ↦ how a file's name ends; c is a folder
 PROGRAMS = {

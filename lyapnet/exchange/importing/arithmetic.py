@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from lyapnet.prover.rounding import rounded
+from lyapnet.prover.rounding import mark_rounded
 
 FLOAT, DOUBLE, BOOL, INT64 = 1, 11, 9, 7  # onnx.TensorProto
 WHOLE = {  # onnx.TensorProto: least and largest
@@ -71,7 +71,7 @@ class Numbers(NamedTuple):
         if self.format is None or self.point is None:
             return y
         unit, least, largest, _ = self.format
-        return rounded(y, self.point, units * unit, absolute * unit + lost * least, largest)
+        return mark_rounded(y, self.point, units * unit, absolute * unit + lost * least, largest)
 
     def function(self, name: str, y: Tensor) -> Tensor:
         """The result of an elementary function, which is y in real numbers."""
@@ -80,7 +80,7 @@ class Numbers(NamedTuple):
     def limited(self, y: Tensor, largest: float) -> Tensor:
         """y, of which nothing is known where it may exceed a number."""
         exact = self.format is None or self.point is None
-        return y if exact else rounded(y, self.point, 0.0, 0.0, largest)  # pyright: ignore[reportArgumentType]
+        return y if exact else mark_rounded(y, self.point, 0.0, 0.0, largest)  # pyright: ignore[reportArgumentType]
 
     def summands(self, y: Tensor, terms: int, weight: float = 1.0) -> Tensor:
         """Numbers before `terms` of them, times weights that add up to `weight` at most, are added in any order, with
@@ -91,7 +91,7 @@ class Numbers(NamedTuple):
         unit, _, largest, _ = self.format
         k = (terms + 2) * unit
         most = largest / max(terms, weight, 1.0)  # so that no partial sum overflows
-        return rounded(y, self.point, k / (1 - k), 0.0, most / 2)
+        return mark_rounded(y, self.point, k / (1 - k), 0.0, most / 2)
 
     def product(self, a: Tensor, b: Tensor, factor: float = 1.0) -> Tensor:
         """ab of matrices or vectors, of which each sum is rounded, but for what underflows.

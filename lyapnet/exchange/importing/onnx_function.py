@@ -22,7 +22,7 @@ from lyapnet.exchange.importing.arithmetic import (
     WHOLE,
     Numbers,
 )
-from lyapnet.exchange.importing.operators import OPERATORS, Operator
+from lyapnet.exchange.importing.operators import OPERATORS, OnnxOperator
 
 DOMAIN = ("", "ai.onnx")
 INPUTS = {FLOAT: np.float32, DOUBLE: np.float64}
@@ -161,7 +161,7 @@ class OnnxFunction(nn.Module):
             raise UsageError(f"Expected an output in float32 or float64 in {self.name!r}, got another; cast it.")
 
     def _moves(
-        self, node: Any, operator: Operator, kind: int, names: Sequence[str], moving: Mapping[str, Tensor],
+        self, node: Any, operator: OnnxOperator, kind: int, names: Sequence[str], moving: Mapping[str, Tensor],
         results: Mapping[str, Tensor],
     ) -> bool:  # fmt: skip
         """Whether a result depends on x, or on how constants are rounded."""
@@ -173,7 +173,7 @@ class OnnxFunction(nn.Module):
         return not (node.op_type == "Cast" and (kind == DOUBLE or torch.equal(y.float().double(), y)))
 
     def _results(
-        self, node: Any, operator: Operator, given: Sequence[Any], attributes: Mapping[str, Any]
+        self, node: Any, operator: OnnxOperator, given: Sequence[Any], attributes: Mapping[str, Any]
     ) -> dict[str, Tensor]:
         """Those of a node at one x, whose sizes are known before they are computed."""
         arithmetic = [Numbers()] if operator.rounds else []
@@ -240,7 +240,7 @@ class OnnxFunction(nn.Module):
             raise self._unknown_type(node.op_type)
         return kind
 
-    def _require_whole(self, node: Any, operator: Operator, kind: int, given: Sequence[Any]) -> None:
+    def _require_whole(self, node: Any, operator: OnnxOperator, kind: int, given: Sequence[Any]) -> None:
         """Refuse an operation on whole numbers that would leave their type, divide by 0, or is not known here."""
         numbers = [y for k, y in enumerate(given) if isinstance(y, Tensor) and k not in operator.plain]
         if all(y.is_floating_point() or y.dtype == torch.bool for y in numbers) and kind not in WHOLE:

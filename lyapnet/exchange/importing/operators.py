@@ -18,7 +18,7 @@ from lyapnet.exchange.importing.arithmetic import LARGEST_ANGLE, REPRESENTED, Nu
 SLOPE = 0.009999999776482582  # of LeakyRelu unless it is given: 0.01 in float32
 
 
-class Operator(NamedTuple):
+class OnnxOperator(NamedTuple):
     """What an ONNX operator does."""
 
     function: Callable[..., Any]
@@ -27,28 +27,28 @@ class Operator(NamedTuple):
     whole: bool = False  # whether it may be of whole numbers
 
 
-def _basic(function: Callable[..., Tensor], whole: bool = False) -> Operator:
+def _basic(function: Callable[..., Tensor], whole: bool = False) -> OnnxOperator:
     """An operation whose result is rounded correctly."""
-    return Operator(lambda numbers, *tensors: numbers.rounded(function(*tensors)), whole=whole)
+    return OnnxOperator(lambda numbers, *tensors: numbers.rounded(function(*tensors)), whole=whole)
 
 
-def _elementary(name: str, function: Callable[[Tensor], Tensor]) -> Operator:
+def _elementary(name: str, function: Callable[[Tensor], Tensor]) -> OnnxOperator:
     """A function of one number."""
-    return Operator(lambda numbers, x: numbers.function(name, function(x)))
+    return OnnxOperator(lambda numbers, x: numbers.function(name, function(x)))
 
 
-def _wave(name: str, function: Callable[[Tensor], Tensor]) -> Operator:
+def _wave(name: str, function: Callable[[Tensor], Tensor]) -> OnnxOperator:
     """A function of an angle."""
 
     def computed(numbers: Numbers, x: Tensor) -> Tensor:
         return numbers.function(name, function(numbers.limited(x, LARGEST_ANGLE)))
 
-    return Operator(computed)
+    return OnnxOperator(computed)
 
 
-def _exact(function: Callable[..., Any], *plain: int, whole: bool = True) -> Operator:
+def _exact(function: Callable[..., Any], *plain: int, whole: bool = True) -> OnnxOperator:
     """An operation that does not round."""
-    return Operator(function, plain, rounds=False, whole=whole)
+    return OnnxOperator(function, plain, rounds=False, whole=whole)
 
 
 def _clip(x: Tensor, low: float | None = None, high: float | None = None) -> Tensor:
@@ -163,7 +163,7 @@ def _split(
     return [x.narrow(axis, sum(split[:k]), each) for k, each in enumerate(split)]
 
 
-def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[Tensor], Tensor]) -> Operator:
+def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[Tensor], Tensor]) -> OnnxOperator:
     """A function of a sum over some axes, of a function of the numbers, and of how many they are."""
 
     def reduced(
@@ -176,7 +176,7 @@ def _reducing(of_sum: Callable[[Numbers, Tensor, int], Tensor], each: Callable[[
         total = numbers.summands(each(x), terms).sum(axes, bool(keepdims)) if axes else each(x)
         return of_sum(numbers, numbers.rounded(total, 0), terms)
 
-    return Operator(reduced, (1,))
+    return OnnxOperator(reduced, (1,))
 
 
 def _each(function: Callable[[Tensor, Tensor], Tensor]) -> Callable[..., Tensor]:
@@ -196,7 +196,7 @@ def _constant(**value: Any) -> Tensor:
     )  # fmt: skip
 
 
-OPERATORS: dict[str, Operator] = {
+OPERATORS: dict[str, OnnxOperator] = {
     # arithmetic
     "Add": _basic(torch.add, whole=True),
     "Sub": _basic(torch.sub, whole=True),
@@ -204,12 +204,12 @@ OPERATORS: dict[str, Operator] = {
     "Div": _basic(_divide, whole=True),
     "Sqrt": _elementary("Sqrt", torch.sqrt),
     "Reciprocal": _elementary("Reciprocal", torch.reciprocal),
-    "Pow": Operator(_power, (1,)),
-    "LeakyRelu": Operator(lambda numbers, x, alpha=SLOPE: numbers.rounded(functional.leaky_relu(x, alpha))),
-    "Sum": Operator(_total),
-    "Mean": Operator(lambda numbers, *tensors: numbers.rounded(_total(numbers, *tensors) / len(tensors), 2)),
-    "MatMul": Operator(lambda numbers, a, b: numbers.rounded(numbers.product(a, b), 0)),
-    "Gemm": Operator(_gemm),
+    "Pow": OnnxOperator(_power, (1,)),
+    "LeakyRelu": OnnxOperator(lambda numbers, x, alpha=SLOPE: numbers.rounded(functional.leaky_relu(x, alpha))),
+    "Sum": OnnxOperator(_total),
+    "Mean": OnnxOperator(lambda numbers, *tensors: numbers.rounded(_total(numbers, *tensors) / len(tensors), 2)),
+    "MatMul": OnnxOperator(lambda numbers, a, b: numbers.rounded(numbers.product(a, b), 0)),
+    "Gemm": OnnxOperator(_gemm),
     "ReduceSum": _reducing(lambda numbers, total, terms: total, lambda x: x),
     "ReduceMean": _reducing(lambda numbers, total, terms: numbers.rounded(total / terms, 2), lambda x: x),
     "ReduceSumSquare": _reducing(lambda numbers, total, terms: total, lambda x: x**2),
@@ -220,12 +220,12 @@ OPERATORS: dict[str, Operator] = {
     "Tanh": _elementary("Tanh", torch.tanh),
     "Sigmoid": _elementary("Sigmoid", torch.sigmoid),
     "Softplus": _elementary("Softplus", _softplus),
-    "Elu": Operator(_elu),
+    "Elu": OnnxOperator(_elu),
     "Sin": _wave("Sin", torch.sin),
     "Cos": _wave("Cos", torch.cos),
     "Tan": _wave("Tan", torch.tan),
     # what does not round
-    "Cast": Operator(_cast, whole=True),
+    "Cast": OnnxOperator(_cast, whole=True),
     "Neg": _exact(torch.neg),
     "Abs": _exact(torch.abs),
     "Relu": _exact(torch.relu, whole=False),

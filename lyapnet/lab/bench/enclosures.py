@@ -52,7 +52,9 @@ def mean_value(bounded: BoundedFunction, c: Value, sample: Sides) -> Enclosure:
         c_t, c_x = slopes.image(interval_form(lower, upper))
         steepest = torch.cat([c_t.magnitude[:, None], c_x.magnitude], -1)
         at = bounded.image(interval_form(middle, middle))[0]
-        return at.with_parts(at.terms, at.radius + (steepest * reach).sum(-1)).rounded(len(lower[0]) + 2).interval()
+        return (
+            at.with_parts(at.terms, at.radius + (steepest * reach).sum(-1)).with_rounding(len(lower[0]) + 2).interval()
+        )
 
     return enclose
 

@@ -29,7 +29,7 @@ from lyapnet.lab.comparison.results import OURS, PLANNED, ControlTimes, Measurem
 from lyapnet.lab.comparison.scoring import Costs, costs_of, optima_of
 from lyapnet.lab.comparison.timing import times_of_controller, times_of_policy
 from lyapnet.lab.sweep.points import Point
-from lyapnet.training.runs import Run
+from lyapnet.training.runs import TrainingRun
 
 RECORD, LOCK = "job.json", "lock"
 
@@ -137,7 +137,7 @@ def controllers_of(jobs: Sequence[Job]) -> dict[str, Controller]:
     return found
 
 
-def _validations(run: Run, steps: int, before: float) -> list[Measurement]:
+def _validations(run: TrainingRun, steps: int, before: float) -> list[Measurement]:
     """The validations of a run, `steps` environment steps to an iteration and `before` seconds before it,
     from its metrics.csv.
 

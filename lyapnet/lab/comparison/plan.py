@@ -11,7 +11,7 @@ from omegaconf import MISSING
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import Config, load_config
-from lyapnet.experiment.schema import check_values, checked, option, read_yaml
+from lyapnet.experiment.schema import check_values, checked, read_yaml, setting
 from lyapnet.lab.comparison.baselines.baseline import VALIDATIONS, Baseline
 from lyapnet.lab.comparison.baselines.settings import SETTINGS
 from lyapnet.lab.comparison.planners import planner_of
@@ -26,33 +26,35 @@ RESULT = "result.json"  # written last: its presence says that the job is finish
 class ComparedTask:
     """One task: what lyapnet trains on it, and what the baselines may."""
 
-    config: str = option(MISSING, "The experiment of lyapnet, a YAML file; it also defines the task.")
-    overrides: list[str] = option([], "Changes to it, as key.sub=value.")
-    control_scale: list[float] | None = option(
+    config: str = setting(MISSING, "The experiment of lyapnet, a YAML file; it also defines the task.")
+    overrides: list[str] = setting([], "Changes to it, as key.sub=value.")
+    control_scale: list[float] | None = setting(
         None, "Largest |u_i| of the baselines; null: the reference task's of that name.", above=0
     )
-    hidden: list[int] = option([64, 64], "Widths of the baselines' networks.", at_least=1)
-    steps: dict[str, int] = option(
+    hidden: list[int] = setting([64, 64], "Widths of the baselines' networks.", at_least=1)
+    steps: dict[str, int] = setting(
         {}, "Environment steps of each baseline; one without is not compared here.", at_least=1
     )
-    validations: dict[str, int] = option({}, f"Validations of each baseline; {VALIDATIONS} of one without.", at_least=1)
-    options: dict[str, Any] = option({}, "Options of a baseline's algorithm that differ from its setting's.")
+    validations: dict[str, int] = setting(
+        {}, f"Validations of each baseline; {VALIDATIONS} of one without.", at_least=1
+    )
+    options: dict[str, Any] = setting({}, "Options of a baseline's algorithm that differ from its setting's.")
 
 
 @dataclass
 class ComparisonConfig:
     """One comparison: every method on every task, from several seeds."""
 
-    comparison: str = option("compare", "Its name: everything goes to <logs>/<comparison>.", folder=True)
-    logs: str = option("logs", "The folder of all runs.")
-    methods: list[str] = option(list(LEARNED), "What is compared; lqr, ilqr, mpc_10, mpc_25 and mpc_100 too.")
-    seeds: int = option(5, "Seeds of lyapnet: 0, 1, …", at_least=1)
-    baseline_seeds: int = option(3, "Seeds of each baseline.", at_least=1)
-    evaluation_states: int = option(
+    comparison: str = setting("compare", "Its name: everything goes to <logs>/<comparison>.", folder=True)
+    logs: str = setting("logs", "The folder of all runs.")
+    methods: list[str] = setting(list(LEARNED), "What is compared; lqr, ilqr, mpc_10, mpc_25 and mpc_100 too.")
+    seeds: int = setting(5, "Seeds of lyapnet: 0, 1, …", at_least=1)
+    baseline_seeds: int = setting(3, "Seeds of each baseline.", at_least=1)
+    evaluation_states: int = setting(
         256, "States of X₀ on which all methods are measured, the same for all.", at_least=1
     )
-    evaluation_seed: int = option(0, "Seed with which those states are drawn.", at_least=0)
-    tasks: dict[str, ComparedTask] = option({}, "What they are compared on, by name.")
+    evaluation_seed: int = setting(0, "Seed with which those states are drawn.", at_least=0)
+    tasks: dict[str, ComparedTask] = setting({}, "What they are compared on, by name.")
 
     @property
     def folder(self) -> Path:

@@ -12,12 +12,12 @@ from rich.text import Text
 
 from lyapnet.lab.comparison.plan import Job
 from lyapnet.lab.comparison.workers import Outcome
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.stage_messages import StageReport, silent
 
 
 @contextmanager
 def progress(
-    jobs: Sequence[Job], total: int, workers: int, console: Console, report: Report = silent
+    jobs: Sequence[Job], total: int, workers: int, console: Console, report: StageReport = silent
 ) -> Iterator[tuple[Callable[[Job], None], Callable[[Outcome[Job]], None]]]:
     """A line for each job that ends, and in a terminal a bar with what runs and the time left.
 

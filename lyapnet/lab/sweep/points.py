@@ -9,7 +9,7 @@ from pathlib import Path
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.config import Config, differing_keys, load_config
 from lyapnet.lab.comparison.workers import Runnable
-from lyapnet.training.runs import CONFIG, Run, runs_of
+from lyapnet.training.runs import CONFIG, TrainingRun, runs_of
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Point(Runnable):
         """The resolved config."""
         return load_config(self.path, self.settings)
 
-    def run(self) -> Run | None:
+    def run(self) -> TrainingRun | None:
         """The newest run of this very config from fresh weights, finished or not."""
         config = self.config
         for run in reversed(runs_of(config)):

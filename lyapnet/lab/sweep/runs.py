@@ -11,7 +11,7 @@ from lyapnet.base.tables import csv_text
 from lyapnet.experiment.config import load_config
 from lyapnet.lab.comparison.workers import run_jobs
 from lyapnet.lab.sweep.points import Point
-from lyapnet.training.runs import EVALUATION, Run
+from lyapnet.training.runs import EVALUATION, TrainingRun
 
 MEASURES = (
     "cost_mean", "optimal_cost_mean", "cost_ratio", "value_error", "value_to_cost", "constraint_loss",
@@ -66,7 +66,7 @@ def sweep(points: Sequence[Point], workers: int, say: Callable[[str], Any], ray:
     return [row for point, run in runs if run is not None and run.finished for row in rows_of(point, run)]
 
 
-def rows_of(point: Point, run: Run) -> Iterator[SweepRow]:
+def rows_of(point: Point, run: TrainingRun) -> Iterator[SweepRow]:
     """A finished run's rows."""
     config, name = point.config, load_config(point.path, point.overrides).experiment
     result = json.loads(read_file(run.folder / EVALUATION))

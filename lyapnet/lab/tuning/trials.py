@@ -21,7 +21,7 @@ from lyapnet.lab.comparison.workers import Runnable
 from lyapnet.lab.tuning.space import Dimension
 from lyapnet.training.metrics_file import STEP, read_curves
 from lyapnet.training.run_lock import RunLock
-from lyapnet.training.runs import Run, runs_of
+from lyapnet.training.runs import TrainingRun, runs_of
 
 # of a trial, which is measured by its validations alone: no figures, and no test states
 BRIEF = ("loggers=[csv]", "evaluation.animate=false", "evaluation.test_states=1", "evaluation.certify_every=0")
@@ -81,7 +81,7 @@ class Training(Runnable):
         return load_config(self.task.path, self.settings)
 
     @property
-    def run(self) -> Run | None:
+    def run(self) -> TrainingRun | None:
         """Its run, once there is one."""
         return next(reversed(runs_of(self.config)), None)
 

@@ -1,1 +1,1 @@
-"""Bounds of a function by machine code, one block of boxes after another."""
+"""Bounds of a function by machine code, on one block of boxes after another."""

@@ -1,4 +1,4 @@
-"""Rules that write programs of bounds of kinks, truths and choices: those of lyapnet.prover.branches."""
+"""The rules of lyapnet.prover.branches (kinks, truth values, choices) for machine code."""
 
 import math
 from typing import Any
@@ -54,7 +54,7 @@ def _clamp_between(program: Program, x: Any, low: Any = None, high: Any = None) 
     y = x if low is None or _is_constant(low, -math.inf) else _maximum(program, x, low)
     y = y if high is None or _is_constant(high, math.inf) else _minimum(program, y, high)
     if isinstance(low, Tensor) and isinstance(high, Tensor) and bool((low.isfinite() & high.isfinite()).all()):
-        return each(program.no_wider, y, torch.minimum(low, high), high)
+        return each(program.within_limits, y, torch.minimum(low, high), high)
     return y
 
 

@@ -1,8 +1,8 @@
 // Taylor forms on a block of boxes, one box in each lane.
 //
-// The formulas, and what is covered of rounding, are those of lyapnet/prover/taylor.py, elementary_functions.py and
-// branches.py, to whose names the comments refer. A form holds the terms of its support alone: the monomials that it can
-// have. Sums run in another order than torch's, and a product may be added without being rounded first (a fused
+// The formulas and the bounds of rounding are those of lyapnet/prover/taylor.py, elementary_functions.py and
+// branches.py; comments name the function that is implemented. A form stores only the terms of its support, the
+// monomials that it can have. Sums have another order than torch's, and a product may be added without rounding (fused
 // multiply-add); the bounds of rounding cover both.
 
 #pragma once
@@ -16,25 +16,25 @@ namespace {
 constexpr int MOST_AXES = 16;
 
 struct Support {
-    int count;         // of monomials; the first is 1
-    const int *upto;   // how many of them are of degree ≤ 0, 1, 2, 3
-    const int *at;     // their numbers, rising
+    int count;         // number of monomials; the first is the constant 1
+    const int *upto;   // numbers of monomials of degree ≤ 0, 1, 2 and 3
+    const int *at;     // the numbers of the monomials, increasing
 };
 
-struct Entry {  // a form of one number: its terms, r, and Σ |terms| of degree 1, 2, 3
+struct Entry {  // the form of one number: its terms, r, and Σ |terms| of degree 1, 2, 3
     V *terms;
     const Support *support;
     V &radius() const { return terms[support->count]; }
     V &size(int degree) const { return terms[support->count + degree]; }
 };
 
-struct Block {  // what all operations on a block of boxes share
+struct Block {  // data that all operations on a block of boxes use
     int dimension, degree, terms;
-    const int *axes;  // of each monomial, three
+    const int *axes;  // three for each monomial; −1 for none
     std::vector<Support> supports;
-    std::vector<const int *> products;  // for each term of a product: how many x[i] · y[j] it is the sum of, and (i, j)
-    std::vector<const int *> placings;  // where the terms of one support stand in another
-    V *arena, *spare;                   // the forms; room for an operation's own
+    std::vector<const int *> products;  // for each term of a product: number of summands, and (i, j) of x[i] · y[j]
+    std::vector<const int *> placings;  // the position of each term of one support in another
+    V *arena, *spare;                   // memory of the forms; memory for intermediate results of one operation
     const double *numbers;
 
     Entry entry(const int *&code) const {
@@ -48,7 +48,7 @@ struct Block {  // what all operations on a block of boxes share
     }
     V magnitude(const Entry &x) const { return absolute(x.terms[0]) + spread(x) + x.radius(); }
 
-    // The end of an operation: the sizes of its result, and room for so many rounded operations.
+    // The end of an operation: the sizes of its result, and room in r for this many rounded operations.
     void finish(const Entry &x, double operations) const {
         for (int k = 1, i = 1; k <= degree; k++) {
             V total = splat(0);
@@ -152,11 +152,11 @@ void secant(const Entry &x, const Entry &out, V lo, V hi, const F &f) {
     out.radius() = absolute(a) * x.radius() + (most - least) * 0.5 + nearby + 16 * EPSILON * largest + TINY;
 }
 
-struct Powers {  // of a form, in the support of a smooth function of it
+struct Powers {  // tables for y², y³ and y in the support of a smooth function of y
     const int *square, *cube, *placing;
 };
 
-struct Argument {  // of a function: a form x = m + y with |y| ≤ w, and what its powers are
+struct Argument {  // the argument of a function: a form x = m + y with |y| ≤ w, and the powers of y
     Range ends;
     M known;
     V lo, hi, m, w;
@@ -168,7 +168,7 @@ Argument argument_of(const Entry &x, M known, const Range &ends) {
     return {ends, known, lo, hi, m, (hi - lo) * 0.5 * (1 + 8 * EPSILON) + 4 * EPSILON * absolute(m), x, x, x};
 }
 
-// The powers of y, which lie in `spare`.
+// Computes y and its powers in `spare`.
 void expand(const Block &block, const Powers &powers, const Entry &x, const Entry &out, Argument &of) {
     const int room = block.terms + 1 + block.degree;
     of.y = {block.spare, x.support};
@@ -183,7 +183,7 @@ void expand(const Block &block, const Powers &powers, const Entry &x, const Entr
     multiply(block, powers.cube, of.yy, of.y, of.yyy);
 }
 
-// elementary_functions._expanded, up to `finish`; of the derivative of order DEGREE + 1 the range is given
+// elementary_functions._expanded, up to `finish`; `range` is that of the derivative of order DEGREE + 1
 template <int DEGREE>
 void expanded(const Powers &powers, const Argument &of, const Jet &jet, const Range &range, const Entry &out) {
     constexpr bool CUBIC = DEGREE == 3;
@@ -208,7 +208,7 @@ void expanded(const Powers &powers, const Argument &of, const Jet &jet, const Ra
     out.terms[0] += a;
 }
 
-// The end of a function: nothing is known of it where its argument is not, or it is not defined.
+// The end of a function: r is infinite where no bound of the argument is known, or f is not smooth on its interval.
 void settle(const Block &block, const Entry &out, M known, double operations) {
     for (int i = 0; i < out.support->count; i++) out.terms[i] = known ? out.terms[i] : splat(0);
     block.finish(out, operations);
@@ -233,12 +233,12 @@ void apply(const Block &block, const Powers &powers, const Entry &x, const Range
     settle(block, out, known, 2);
 }
 
-struct Sigmoidal {  // what the sigmoid and the softplus of one form share
+struct Sigmoidal {  // data that the sigmoid and the softplus of one form share
     Argument of;
     Logistic middle, low, high;
 };
 
-// The same for the sigmoid and the softplus in higher degrees
+// The same for the sigmoid and the softplus in degrees 2 and 3
 template <class F>
 void apply(const Block &block, const Powers &powers, const Sigmoidal &shared, const Entry &out, const F &f) {
     const Argument &of = shared.of;
@@ -259,7 +259,7 @@ Truth truth_of(const Block &block, const Entry &x) {
     return {(ends.low > 0) | (ends.high < 0), ~(block.magnitude(x) == 0)};
 }
 
-// branches.where; the support of the result holds those of both
+// branches.where; the support of the result contains those of x and y
 void where(
     const Block &block, const Truth &is, const int *const placings[2], const Entry &x, const Entry &y, const Entry &out
 ) {
@@ -279,8 +279,8 @@ void where(
     block.finish(out, 0);
 }
 
-// branches._no_wider
-void no_wider(const Block &block, const Entry &y, const Entry &out, double low, double high) {
+// branches._within_limits
+void within_limits(const Block &block, const Entry &y, const Entry &out, double low, double high) {
     const Range ends = interval(block, y);
     const M wide = ~(ends.high - ends.low <= high - low);
     const double room = 4 * EPSILON * (std::fabs(low) + std::fabs(high)) + TINY;

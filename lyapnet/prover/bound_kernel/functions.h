@@ -1,6 +1,6 @@
-// Elementary functions of one number in each lane, with what bounds need of them: derivatives, their ranges, and where
-// they take a slope. The formulas are those of lyapnet/prover/elementary_functions.py. exp, expm1 and log1p err by less
-// than 4 ε, the others are those of the C library.
+// Elementary functions of one number in each lane, with the facts that bounds need: derivatives, their ranges, and the
+// points where f'(x) = a. The formulas are those of lyapnet/prover/elementary_functions.py. exp, expm1 and log1p have
+// relative errors below 4 ε; the other functions are those of the C library.
 
 #pragma once
 
@@ -17,14 +17,14 @@ constexpr int LANES = 4;
 #endif
 
 typedef double V __attribute__((vector_size(8 * LANES)));
-typedef int64_t M __attribute__((vector_size(8 * LANES)));  // truths, or the bits of numbers
+typedef int64_t M __attribute__((vector_size(8 * LANES)));  // truth values, all bits 0 or all 1; or the bits of numbers
 
 constexpr double EPSILON = 2.220446049250313e-16, TINY = 1e-300, FLOOR = TINY / EPSILON, PI = 3.141592653589793;
 constexpr int MOST_STATIONARY = 10;
 
 inline V splat(double value) { return V{} + value; }
 inline V absolute(V x) { return (V)((M)x & INT64_MAX); }
-inline V larger(V x, V y) { return (x > y) | (x != x) ? x : y; }    // nan where either is
+inline V larger(V x, V y) { return (x > y) | (x != x) ? x : y; }    // nan if either is nan
 inline V smaller(V x, V y) { return (x < y) | (x != x) ? x : y; }
 inline V clamped(V x, V lo, V hi) { return smaller(larger(x, lo), hi); }
 inline M finite(V x) { return absolute(x) <= 1.7976931348623157e308; }
@@ -42,13 +42,13 @@ struct Range {
     V low, high;
 };
 
-// elementary_functions._between
-inline Range roomy(V low, V high) {
+// elementary_functions._widened
+inline Range widened(V low, V high) {
     const V room = 64 * EPSILON * larger(absolute(low), absolute(high)) + TINY;
     return {low - room, high + room};
 }
 
-// The most of A ε + m ε² over |ε| ≤ 1, for A ≥ 0
+// The maximum of A ε + m ε² over |ε| ≤ 1, for A ≥ 0
 inline V parabola(V A, V m) {
     const M inner = -2 * m > A;
     return inner ? A * (A / (inner ? -4 * m : splat(1))) : A + m;
@@ -58,7 +58,7 @@ struct Exponential {
     V whole, less_one;  // eˣ and eˣ − 1
 };
 
-// eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2, by the series of eʳ − 1
+// eˣ = 2ᵏ eʳ with |r| ≤ ½ log 2, by the power series of eʳ − 1
 inline Exponential exponential(V x) {
     const double LOG2_HIGH = 6.93147180369123816490e-01, LOG2_LOW = 1.90821492927058770002e-10, SHIFT = 0x1.8p52;
     const V inside = clamped(x, splat(-708), splat(709));
@@ -69,8 +69,8 @@ inline Exponential exponential(V x) {
     for (double factorial : over) tail = tail * r + 1 / factorial;
     const V p = r + r * r * tail;
     const V scale = (V)(((M)shifted + 1023) << 52);  // the low bits of `shifted` are k
-    const M beyond = x > 709;
-    return {beyond ? splat(INFINITY) : scale + scale * p, beyond ? splat(INFINITY) : scale * p + (scale - 1)};
+    const M overflows = x > 709;
+    return {overflows ? splat(INFINITY) : scale + scale * p, overflows ? splat(INFINITY) : scale * p + (scale - 1)};
 }
 
 // log(1 + u) = 2 artanh(u/(2 + u)) for 0 ≤ u ≤ 1, by its series
@@ -82,17 +82,17 @@ inline V log_one_more(V u) {
 }
 
 struct Jet {
-    V d[5];  // f and its derivatives, as far as they are known
+    V d[5];  // f and its derivatives, as many as bounds need
 };
 
-// Functions whose derivatives rise or fall on all of their domain
+// Functions whose derivatives are monotone on each interval of their domain
 template <class F>
 struct Monotone {
     static constexpr bool SMOOTH = true;
     template <int ORDER>
     Range range(V lo, V hi) const {
         const V a = F().jet(lo).d[ORDER], b = F().jet(hi).d[ORDER];
-        return roomy(smaller(a, b), larger(a, b));
+        return widened(smaller(a, b), larger(a, b));
     }
     M defined(V, V) const { return always(); }
 };
@@ -158,36 +158,37 @@ struct Logistic {
     }
 };
 
-// The range of σ' on [lo, hi]
-inline Range steepness(V lo, V hi, V p_lo, V p_hi) {
-    const Range ends = roomy(smaller(p_lo, p_hi), larger(p_lo, p_hi));
+// elementary_functions._slope_range: the range of σ' on [lo, hi]
+inline Range slope_range(V lo, V hi, V p_lo, V p_hi) {
+    const Range ends = widened(smaller(p_lo, p_hi), larger(p_lo, p_hi));
     return {ends.low, (lo < 0) & (hi > 0) ? splat(0.25) + 64 * EPSILON * 0.25 : ends.high};
 }
 
 // elementary_functions._sigmoid_third_range
 inline Range sigmoid_third(V lo, V hi, V p_lo, V p_hi) {
-    const Range p = steepness(lo, hi, p_lo, p_hi);
+    const Range p = slope_range(lo, hi, p_lo, p_hi);
     const V top = larger(p.low, smaller(p.high, splat(1.0 / 12)));
     const V a = p.low - 6 * p.low * p.low, b = p.high - 6 * p.high * p.high, c = top - 6 * top * top;
-    return roomy(smaller(smaller(a, b), c), larger(larger(a, b), c));
+    return widened(smaller(smaller(a, b), c), larger(larger(a, b), c));
 }
 
 inline V logit(V s) { return each<std::log>(s) - each<std::log1p>(-s); }
 
 struct Sigmoid {
-    static constexpr bool SMOOTH = false;  // by itself: it shares the powers of its argument
+    static constexpr bool SMOOTH = false;  // the `apply` for Sigmoidal expands it, with shared powers of the argument
 
     Jet jet(const Logistic &l) const { return {{l.up, l.p, -l.p * l.tanh_half, l.p * (1 - 6 * l.p), splat(0)}}; }
     Jet jet(V v) const { return jet(Logistic(v)); }
     template <int ORDER>
     Range range(V lo, V hi, const Logistic &a, const Logistic &b) const {
         if (ORDER == 3) return sigmoid_third(lo, hi, a.p, b.p);
-        const Range p = steepness(lo, hi, a.p, b.p);
+        const Range p = slope_range(lo, hi, a.p, b.p);
         V least = splat(INFINITY), most = splat(-INFINITY);
         for (V f : {p.low, p.high})
             for (V g : {12 * p.low - 1, 12 * p.high - 1})
-                for (V t : {a.tanh_half, b.tanh_half}) least = smaller(f * g * t, least), most = larger(f * g * t, most);
-        return roomy(least, most);
+                for (V t : {a.tanh_half, b.tanh_half})
+                    least = smaller(f * g * t, least), most = larger(f * g * t, most);
+        return widened(least, most);
     }
     int stationary(V a, V, V, V *at) const {
         const V s = 2 * a / (1 + root(larger(1 - 4 * a, splat(0))));
@@ -212,13 +213,13 @@ struct Softplus {
         V least = smaller(x, y), most = larger(x, y);
         least = (lo <= STEEPEST) & (hi >= STEEPEST) ? splat(-EXTREME) : least;
         most = (lo <= -STEEPEST) & (hi >= -STEEPEST) ? splat(EXTREME) : most;
-        return roomy(least, most);
+        return widened(least, most);
     }
     int stationary(V a, V, V, V *at) const { return at[0] = logit(a), 1; }
     M defined(V, V) const { return always(); }
 };
 
-// All of ±base + 2πk in an interval of at most two periods
+// All points ±base + 2πk in an interval of at most two periods, and some outside
 inline int periodic(V base, V lo, V hi, V offset, V *at) {
     const V middle = each<std::nearbyint>((lo + hi) / (4 * PI)) * (2 * PI);
     int count = 0;
@@ -227,10 +228,10 @@ inline int periodic(V base, V lo, V hi, V offset, V *at) {
     return count;
 }
 
-// A range around the middle for a function of slope at most 1 that stays between −1 and 1
+// The range on [lo, hi] of a function with slope at most 1 and values in [−1, 1], from its value in the middle
 inline Range around(V value, V lo, V hi) {
     const V reach = (hi - lo) * 0.5 + 2 * EPSILON * larger(-lo, hi);
-    return roomy(larger(value - reach, splat(-1)), smaller(value + reach, splat(1)));
+    return widened(larger(value - reach, splat(-1)), smaller(value + reach, splat(1)));
 }
 
 struct Sin {
@@ -263,17 +264,17 @@ struct Cos {
 
 struct Tan {
     static constexpr bool SMOOTH = false;
-    static V branch(V lo, V hi) { return each<std::nearbyint>((lo + hi) / (2 * PI)) * PI; }
+    static V branch_center(V lo, V hi) { return each<std::nearbyint>((lo + hi) / (2 * PI)) * PI; }
     Jet jet(V v) const {
         const V t = each<std::tan>(v);
         return {{t, 1 + t * t}};
     }
     int stationary(V a, V lo, V hi, V *at) const {
         const V base = each<std::atan>(root(larger(a - 1, splat(0))));
-        at[0] = branch(lo, hi) - base, at[1] = branch(lo, hi) + base;
+        at[0] = branch_center(lo, hi) - base, at[1] = branch_center(lo, hi) + base;
         return 2;
     }
-    M defined(V lo, V hi) const { return (lo - branch(lo, hi) > -1.57) & (hi - branch(lo, hi) < 1.57); }
+    M defined(V lo, V hi) const { return (lo - branch_center(lo, hi) > -1.57) & (hi - branch_center(lo, hi) < 1.57); }
 };
 
 struct Square {
@@ -290,7 +291,7 @@ struct Absolute {
     M defined(V, V) const { return always(); }
 };
 
-// v above 0 and a multiple of v below
+// v for v > 0, and slope · v for v ≤ 0
 struct Leaky {
     static constexpr bool SMOOTH = false;
     double slope;

@@ -1,4 +1,4 @@
-"""Bounds of one function on many boxes by machine code: a program on forms, run by compiled C++."""
+"""Bounds of one function on many boxes by machine code: compiled C++ that runs a program on Taylor forms."""
 
 import ctypes
 import logging
@@ -16,23 +16,23 @@ from lyapnet.base.errors import CompilationError
 from lyapnet.base.types import Corners
 from lyapnet.graphs.compilation import library_of
 from lyapnet.prover.bound_kernel.program import Entry, Program, Support
-from lyapnet.prover.bound_kernel.writing import written
+from lyapnet.prover.bound_kernel.writing import write_graph
 from lyapnet.prover.taylor import TaylorForm
 
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("functions.h", "forms.h", "program.cpp"))
-MOST_AXES = 16  # as in forms.h
+MOST_AXES = 16  # equal to that in forms.h
 
 
 class BoundKernel:
-    """The forms of a graph's results, for boxes with a width along the same axes, or for forms of the same supports.
+    """Machine code for the results of a graph, for boxes with a width along the same axes or forms of equal supports.
 
     Args:
-        nodes, constants: of the graph, and the values of those that do not depend on the point.
-        inputs, dimension, degree: of Program.
+        nodes, constants: the nodes of the graph, and the values of those that do not depend on the point.
+        inputs, dimension, degree: those of Program.
 
     Raises:
-        NotImplementedError: an operation has no rule here.
-        CompilationError: there is no machine code.
+        NotImplementedError: an operation has no rule for machine code.
+        CompilationError: the C++ code cannot be compiled.
     """
 
     def __init__(
@@ -41,17 +41,17 @@ class BoundKernel:
         if dimension > MOST_AXES:
             raise NotImplementedError(f"more than {MOST_AXES} axes")
         program = Program(inputs, dimension, degree)
-        results = written(program, nodes, constants)
+        results = write_graph(program, nodes, constants)
         self._program = program.assembled([Entry(k) for y in results for k in y.entries.flatten().tolist()])
         self._shapes = [y.shape for y in results]
         self._terms, self._dimension = len(program.monomials), program.dimension
 
     def forms(self, lower: Corners, upper: Corners) -> list[TaylorForm]:
-        """The results on boxes (boxes, 1 + n), one form each."""
+        """The results on boxes (boxes, 1 + n), as forms."""
         return self._run(len(lower), lower.contiguous(), upper.contiguous())
 
     def image(self, given: TaylorForm) -> list[TaylorForm]:
-        """The results of numbers in forms, (boxes, inputs); what they have beyond their supports is not looked at."""
+        """The results if the inputs are in a form, (boxes, inputs); its terms outside the supports must be 0."""
         parts = torch.cat([given.terms.movedim(0, -1), given.radius[..., None]], -1)
         return self._run(len(parts), parts.contiguous(), None)
 
@@ -76,7 +76,7 @@ class BoundKernel:
 def kernel_of(
     nodes: Sequence[Any], constants: dict[Any, Any], inputs: Sequence[Support], dimension: int, degree: int
 ) -> BoundKernel | None:
-    """A kernel; None where an operation has no rule, or there is no machine code."""
+    """A kernel; None if an operation has no rule for machine code, or the C++ code cannot be compiled."""
     try:
         return BoundKernel(nodes, constants, inputs, dimension, degree) if has_library() else None
     except NotImplementedError:
@@ -85,7 +85,7 @@ def kernel_of(
 
 @cache
 def has_library() -> bool:
-    """Whether there is machine code; a note says why not."""
+    """Whether the C++ code can be compiled; if not, a note in the log says why."""
     try:
         library()
     except CompilationError as error:
@@ -97,16 +97,16 @@ def has_library() -> bool:
 
 @cache
 def library() -> ctypes.CDLL:
-    """The compiled C++ of bounds.
+    """The compiled C++ code of bounds.
 
     Raises:
-        CompilationError: as library_of.
+        CompilationError: it cannot be compiled; see library_of.
     """
     return library_of("bounds", SOURCES)
 
 
 def elementary(which: int, points: Tensor) -> Tensor:
-    """eˣ (0), eˣ − 1 (1) or log(1 + x) (2) at points, as machine code computes them for bounds."""
+    """eˣ (which = 0), eˣ − 1 (1) or log(1 + x) (2) at points, as the C++ code computes them; for tests."""
     values = points.double().clone()
     library().lyapnet_elementary(which, ctypes.c_void_p(values.data_ptr()), ctypes.c_long(values.numel()))
     return values

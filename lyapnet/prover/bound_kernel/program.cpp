@@ -1,5 +1,5 @@
-// A function's operations on Taylor forms as a flat program, run on one block of boxes after another: all forms of a
-// block stay in the cache. Programs are written by program.py.
+// Runs a flat program of operations on Taylor forms on one block of boxes after another, so that all forms of a block
+// stay in the cache. program.py writes the programs.
 
 #include "forms.h"
 
@@ -9,14 +9,15 @@
 
 namespace {
 
-constexpr int TILE = 4;  // rows and columns of a product of matrices that stay in registers
+constexpr int TILE = 4;  // rows and columns of a block of a matrix product; 4 × 4 vectors fit into the registers
 
-// Σ_m w_m x_m + offset; rounded by what comes out, where each number of it is the result of one operation
+// Σ_m w_m x_m + offset. The rounding error of one operation is bounded by ε times the magnitude of the result, that of
+// several by ε times the magnitudes of the operands.
 void combine(const Block &block, const int *&code) {
     const Entry out = block.entry(code);
     const int operations = *code++, count = *code++;
     const double offset = block.numbers[*code++];
-    V entered = splat(std::fabs(offset)), radius = splat(0);
+    V operands = splat(std::fabs(offset)), radius = splat(0);
     fill(out, splat(0));
     for (int n = 0; n < count; n++) {
         const Entry x = block.entry(code);
@@ -27,10 +28,10 @@ void combine(const Block &block, const int *&code) {
         else
             for (int i = 0; i < x.support->count; i++) out.terms[placing[i]] += weight * x.terms[i];
         radius += std::fabs(weight) * x.radius();
-        if (operations > 1) entered += std::fabs(weight) * block.magnitude(x);
+        if (operations > 1) operands += std::fabs(weight) * block.magnitude(x);
     }
     out.terms[0] += offset;
-    out.radius() = operations > 1 ? radius + 2 * operations * EPSILON * entered + TINY : radius;
+    out.radius() = operations > 1 ? radius + 2 * operations * EPSILON * operands + TINY : radius;
     block.finish(out, operations == 1);
 }
 
@@ -53,11 +54,11 @@ void tiles(const V *const *x, const double *w, int inner, int columns, V *const 
     if (terms - t == 3) tile<J, 3>(x, w, inner, columns, out, t);
 }
 
-// taylor.matrix_product, of one row; entries with a smaller support than that of the result are padded
+// taylor.matrix_product for one row; entries with a smaller support than that of the result are padded
 void matrix_product(const Block &block, const int *&code) {
     const int inner = *code++, columns = *code++;
     const double *weights = block.numbers + *code++;
-    const int count = *code++;  // of terms of the result
+    const int count = *code++;  // number of terms of the result
     std::vector<const V *> x(inner);
     std::vector<V *> out(columns);
     V *radius = block.spare, *room = block.spare + inner;
@@ -132,16 +133,18 @@ void apply_functions(const Block &block, const int *&code) {
             else apply(block, powers, *shared, out, Softplus{});
         } else {
             apply_one(block, powers, function, x, ends, out, p, q);
-            shared.reset();  // whose powers lay where those of this one do now
+            shared.reset();  // `apply_one` has overwritten the powers of the shared argument
         }
         if (function == SIGMOID || function == SOFTPLUS)
-            out.radius() += ends.high > p ? splat(q) : splat(0);  // bound_rules._loosened_above
+            out.radius() += ends.high > p ? splat(q) : splat(0);  // bound_rules._widened_above
     }
 }
 
-enum Operation { COMBINE, MATRIX_PRODUCT, MULTIPLY, FUNCTION, WHERE, NO_WIDER, SIGN, POSITIVE, NEGATION, CONJUNCTION, ROUNDED };
+enum Operation {
+    COMBINE, MATRIX_PRODUCT, MULTIPLY, FUNCTION, WHERE, WITHIN_LIMITS, SIGN, POSITIVE, NEGATION, CONJUNCTION, ROUNDED
+};
 
-// bound_rules._rounded: what another arithmetic, in which numbers go up to `largest`, makes of x
+// bound_rules._rounded: x (1 + θ) + η, rounded in an arithmetic with numbers up to `largest`
 void rounded(const Block &block, const Entry &x, const Entry &out, double relative, double absolute, double largest) {
     const V size = block.magnitude(x) * (1 + 1e-9);
     const V radius = x.radius() + (relative * size + absolute) * (1 + 1e-9);
@@ -172,9 +175,9 @@ void operate(const Block &block, int operation, const int *&code) {
         const Truth a = truth_of(block, x), b = truth_of(block, y);
         return between(block, block.entry(code), one(a.certain & b.certain), one(a.possible & b.possible));
     }
-    if (operation == NO_WIDER) {  // from here on, the second entry is the result
+    if (operation == WITHIN_LIMITS) {  // from here on, y is the result
         const double low = block.numbers[*code++];
-        return no_wider(block, x, y, low, block.numbers[*code++]);
+        return within_limits(block, x, y, low, block.numbers[*code++]);
     }
     if (operation == ROUNDED) {
         const double *const limits[] = {block.numbers + code[0], block.numbers + code[1], block.numbers + code[2]};
@@ -189,7 +192,7 @@ void operate(const Block &block, int operation, const int *&code) {
     between(block, y, one(~truth.possible), one(~truth.certain));
 }
 
-// taylor.box_form, of the boxes in the lanes
+// taylor.box_form for the boxes of a block
 void read_boxes(
     const Block &block, const int *&code, const double *lower, const double *upper, long first, long boxes
 ) {
@@ -208,7 +211,7 @@ void read_boxes(
     }
 }
 
-// Forms (boxes, inputs, terms and radius) that are given
+// Reads input forms (boxes, inputs, terms and r)
 void read_forms(const Block &block, const int *&code, const double *given, long first, long boxes) {
     const int inputs = *code++, row = block.terms + 1;
     for (int input = 0; input < inputs; input++) {
@@ -223,7 +226,7 @@ void read_forms(const Block &block, const int *&code, const double *given, long 
     }
 }
 
-// (results, terms and radius, boxes)
+// Writes the results (results, terms and r, boxes)
 void write_results(const Block &block, const int *&code, double *results, long first, long boxes) {
     const long here = boxes - first < LANES ? boxes - first : LANES;
     const int count = *code++;
@@ -236,7 +239,8 @@ void write_results(const Block &block, const int *&code, double *results, long f
     }
 }
 
-// dimension, degree, terms, axes of each monomial, and with their counts: supports, products, placings
+// Reads dimension, degree, number of terms, axes of each monomial; then the supports, products and placings, each list
+// after its length
 void read_tables(Block &block, const int *tables) {
     block.dimension = *tables++, block.degree = *tables++, block.terms = *tables++;
     block.axes = tables, tables += 3 * block.terms;
@@ -256,8 +260,8 @@ void read_tables(Block &block, const int *tables) {
 
 }  // namespace
 
-// Runs a program on boxes (boxes, axes) each, or on the forms in `lower` where there is no `upper`; `results` holds
-// zeros.
+// Runs a program on boxes (lower, upper), (boxes, axes) each; if `upper` is null, on the forms in `lower`. `results`
+// must be 0. Returns 1 if there is too little memory.
 extern "C" int lyapnet_bound(
     const int *tables, const int *code, const double *numbers, const double *lower, const double *upper, long boxes,
     long arena, long spare, double *results
@@ -289,7 +293,7 @@ extern "C" int lyapnet_bound(
     return 0;
 }
 
-// eˣ, eˣ − 1 or log(1 + x) of numbers, as bounds compute them
+// eˣ (which = 0), eˣ − 1 (1) or log(1 + x) (2) of numbers, as bounds compute them; for tests
 extern "C" void lyapnet_elementary(int which, double *values, long count) {
     for (long i = 0; i < count; i++) {
         const V x = splat(values[i]);

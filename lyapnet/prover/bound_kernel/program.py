@@ -1,4 +1,4 @@
-"""A function's operations on Taylor forms as a flat program for program.cpp, which runs it on many boxes."""
+"""The operations of a function on Taylor forms as a flat list of numbers, which program.cpp runs on many boxes."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from lyapnet.prover.taylor import monomials
 OPERATIONS = {
     name: code
     for code, name in enumerate((
-        "combine", "matrix_product", "multiply", "functions", "where", "no_wider", "sign", "positive", "negation",
+        "combine", "matrix_product", "multiply", "functions", "where", "within_limits", "sign", "positive", "negation",
         "conjunction", "rounded",
     ))
 }  # fmt: skip
@@ -25,22 +25,22 @@ FUNCTIONS = {
         "leaky", "clamp",
     ))
 }  # fmt: skip
-LINEAR = {"tan", "square", "absolute", "leaky", "clamp"}  # functions that are bounded by a line in forms of any degree
+LINEAR = {"tan", "square", "absolute", "leaky", "clamp"}  # functions that are bounded by a line for any degree
 
-Support = tuple[int, ...]  # the numbers of the monomials that a form can have, rising; the constant is one of them
+Support = tuple[int, ...]  # increasing numbers of the monomials that a form can have, 0 (the constant) included
 CONSTANT: Support = (0,)
 
 
 def of_boxes(axes: int, wide: Sequence[int]) -> list[Support]:
-    """The supports of the numbers of a box, of which those along wide axes have an ε each."""
+    """The supports of the coordinates of a box; each coordinate along a wide axis has an ε of its own."""
     return [(0, 1 + wide.index(k)) if k in wide else CONSTANT for k in range(axes)]
 
 
 class Entry(int):
-    """The form of one number: its place in the list of a program's forms."""
+    """The form of one number, given by its index in the list of forms of a program."""
 
 
-ZERO = Entry(0)  # so that what an arrangement pads with 0 is zero
+ZERO = Entry(0)  # the number 0, so that an arrangement that pads with the index 0 pads with zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +48,14 @@ class Forms:
     """A value that depends on the point, as forms of its numbers.
 
     Args:
-        entries: (*shape), whole numbers; what operators arrange is done to them.
+        entries: (*shape), the Entry of each number as an integer; operators that arrange entries act on this tensor.
     """
 
     entries: Tensor
 
     @property
     def shape(self) -> torch.Size:
-        """That of the value."""
+        """The shape of the value."""
         return self.entries.shape
 
 
@@ -65,16 +65,16 @@ class Assembled(NamedTuple):
     tables: np.ndarray
     code: np.ndarray
     numbers: np.ndarray
-    arena: int  # numbers of a box that its forms take
-    spare: int  # those that one operation takes besides
+    arena: int  # memory for the forms of one box, in numbers
+    spare: int  # memory for intermediate results of one operation, in numbers
 
 
 class Program:
-    """Operations on the forms of single numbers, no two of them alike.
+    """Operations on the forms of single numbers; equal operations are written once.
 
     Args:
-        inputs: the support of each number that the function is of.
-        dimension, degree: of the forms.
+        inputs: the support of each input number.
+        dimension, degree: those of the forms.
     """
 
     def __init__(self, inputs: Sequence[Support], dimension: int, degree: int):
@@ -97,7 +97,7 @@ class Program:
         self.inputs = [self._new(support) for support in inputs]
 
     def constant(self, value: float) -> Entry:
-        """The form of a number that is the same everywhere."""
+        """The form of a constant."""
         key = ("constant", value)
         if key not in self._known:
             self._known[key] = self._new(CONSTANT)
@@ -108,7 +108,7 @@ class Program:
         """Σ w x + offset.
 
         Args:
-            operations: by which each number of the result is rounded; 1 where it is the result of a single one.
+            operations: number of rounded operations for each number of the result.
         """
         summands = [(weight, x) for weight, x in summands if x != ZERO]
         if not summands:
@@ -138,7 +138,7 @@ class Program:
         return self.function("square", x) if self.degree == 1 else self.multiply(x, x)
 
     def function(self, name: str, x: Entry, p: float = 0.0, q: float = 0.0) -> Entry:
-        """f(x), with its parameters."""
+        """f(x) with parameters p and q."""
         support = power = self.supports[x]
         if name not in LINEAR:
             for _ in range(self.degree - 1):
@@ -150,7 +150,7 @@ class Program:
         key = (name, x, *parameters)
         if key not in self._known:
             self._known[key] = self._new(support)
-            if x not in self._functions:  # those of one form share its range, and some its powers
+            if x not in self._functions:  # functions of one form share its range, and some also its powers
                 self._functions[x] = [OPERATIONS["functions"], x, 0]
                 self._instructions.append(self._functions[x])
             self._functions[x][2] += 1
@@ -173,24 +173,24 @@ class Program:
         return [Entry(self._known[key] + j) for j in range(weight.shape[1])]
 
     def where(self, truth: Entry, x: Entry, y: Entry) -> Entry:
-        """x where a number is not 0, else y; their hull where that is undecided."""
+        """x where the truth is not 0, else y; a form that encloses both where that is undecided."""
         support = self._union((x, y))
         return self._emit("where", support, x, y, truth, behind=(self._placing(x, support), self._placing(y, support)))
 
     def truth(self, name: str, *operands: Entry) -> Entry:
-        """A truth, or a sign."""
+        """A truth value or a sign."""
         return self._emit(name, CONSTANT, *operands)
 
-    def no_wider(self, x: Entry, low: float, high: float) -> Entry:
-        """x, but [low, high] where it is wider."""
-        return self._emit("no_wider", self.supports[x], x, behind=(self._at(low), self._at(high)))
+    def within_limits(self, x: Entry, low: float, high: float) -> Entry:
+        """x, replaced by [low, high] on boxes where its bounds are wider."""
+        return self._emit("within_limits", self.supports[x], x, behind=(self._at(low), self._at(high)))
 
     def rounded(self, x: Entry, *limits: float) -> Entry:
-        """x rounded in another arithmetic: by how much, relative to it and absolutely, and up to which number."""
+        """x, rounded in another arithmetic; limits are the relative and the absolute error and the largest number."""
         return self._emit("rounded", self.supports[x], x, behind=tuple(self._at(limit) for limit in limits))
 
     def assembled(self, results: Sequence[Entry]) -> Assembled:
-        """The program with its results, its forms laid out so that their places are used again."""
+        """The program with its results; the memory of a form is used again after its last use."""
         offset, arena = self._layout(results)
         of_support = {support: k for k, support in enumerate(dict.fromkeys(self.supports))}
 
@@ -211,7 +211,7 @@ class Program:
         return Assembled(tables, np.array(list(words(code)), dtype=np.int32), numbers, arena, self._spare)
 
     def _layout(self, results: Sequence[Entry]) -> tuple[dict[int, int], int]:
-        """(where each form starts, the numbers that they take together), after each other where they fit."""
+        """(offset of each form, total size); a form takes the place of one of equal size that is no longer used."""
         kept = {*self.constants, *results}
         last = {word: k for k, line in enumerate(self._instructions) for word in line if isinstance(word, Entry)}
         offset: dict[int, int] = {}
@@ -238,7 +238,7 @@ class Program:
         return offset, arena
 
     def _size(self, x: Entry) -> int:
-        """The numbers that a form takes: its terms, its remainder, and the sizes of its terms of each degree."""
+        """The size of a form: its terms, r, and Σ |terms| of each degree."""
         return len(self.supports[x]) + 1 + self.degree
 
     def _tables(self, of_support: dict[Support, int]) -> Iterable[int]:
@@ -263,14 +263,14 @@ class Program:
             yield from map(support.index, a)
 
     def _counts(self, support: Support) -> list[int]:
-        """How many monomials of a support are of degree ≤ 0, 1, 2, 3."""
+        """The numbers of monomials of degree ≤ 0, 1, 2 and 3 in a support."""
         of_degree = [len(self.monomials[k]) for k in support]
         return list(accumulate(of_degree.count(k) for k in range(4)))
 
     def _emit(
         self, name: str, support: Support, *words: int, behind: tuple[int, ...] = (), result_first: bool = False
     ) -> Entry:
-        """The result of an operation, which is computed once."""
+        """Write an operation, unless it is written already; its result."""
         key = (name, *words, *behind)
         if key not in self._known:
             self._known[key] = result = self._new(support)
@@ -286,21 +286,21 @@ class Program:
         return tuple(sorted({*CONSTANT, *(k for x in entries for k in self.supports[x])}))
 
     def _product(self, a: Support, b: Support) -> Support:
-        """The monomials in the products of those of two forms."""
+        """The support of the product of two forms with these supports."""
         if (a, b) not in self._powers:
             self._powers[a, b] = tuple(sorted({self._place[i][j] for i in a for j in b} - {-1}))
         return self._powers[a, b]
 
     def _table(self, a: Support, b: Support, support: Support) -> int:
-        """Which product of forms with two supports it is, in a third."""
+        """The number of the table for products of forms with supports a and b in a third support."""
         return self._products.setdefault((a, b, support), len(self._products))
 
     def _placing(self, x: Entry, support: Support) -> int:
-        """Which placing of the terms of a form among those of a larger support it is."""
+        """The number of the table that gives the position of each term of x in a larger support."""
         return self._placings.setdefault((self.supports[x], support), len(self._placings))
 
     def _factors(self, a: Support, b: Support, support: Support) -> list[list[tuple[int, int]]]:
-        """For each monomial of a support: (i, j) where it is the i-th monomial of a times the j-th of b."""
+        """For each monomial of a support: all (i, j) such that it is the i-th monomial of a times the j-th of b."""
         factors: dict[int, list[tuple[int, int]]] = {monomial: [] for monomial in support}
         for i, m in enumerate(a):
             for j, n in enumerate(b):
@@ -308,7 +308,7 @@ class Program:
         return list(factors.values())
 
     def _at(self, number: float) -> int:
-        """Where a number stands."""
+        """The index of a number in the list of constants."""
         if number not in self._number:
             self._number[number] = len(self._numbers)
             self._numbers.append(number)

@@ -1,4 +1,4 @@
-"""Rules that write programs of bounds: those of lyapnet.prover.bound_rules, number by number."""
+"""The rules of lyapnet.prover.bound_rules for machine code: each writes operations on single numbers."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,11 +15,11 @@ from lyapnet.prover.taylor import TINY
 aten = torch.ops.aten
 
 Rule = Callable[..., Any]
-"""A program and an operator's arguments, some of them forms, ↦ forms."""
+"""(program, arguments of the operator, some of them forms) ↦ forms."""
 
 
 def registering(rules: dict[Any, Rule]) -> Callable[..., Callable[[Rule], Rule]]:
-    """What registers a rule for operators among these."""
+    """A decorator that adds a rule for operators to these rules."""
 
     def rule(*operators: Any) -> Callable[[Rule], Rule]:
         def register(function: Rule) -> Rule:
@@ -36,7 +36,7 @@ rule = registering(RULES)
 
 
 def as_forms(program: Program, value: Any) -> Forms:
-    """A value as forms."""
+    """A value as forms; a constant becomes forms of its numbers."""
     if isinstance(value, Forms):
         return value
     numbers = tensor_of(value)
@@ -45,12 +45,12 @@ def as_forms(program: Program, value: Any) -> Forms:
 
 
 def tensor_of(number: Any) -> Tensor:
-    """A number, or numbers, in float64."""
+    """A number or tensor in float64."""
     return torch.as_tensor(number, dtype=torch.float64)
 
 
 def each(function: Callable[..., Entry], *values: Any) -> Forms:
-    """A function of single numbers, entries or plain ones, on values that are broadcast."""
+    """Apply a function of single numbers, which are entries or constants, to broadcast values."""
     tensors = torch.broadcast_tensors(*(y.entries if isinstance(y, Forms) else tensor_of(y) for y in values))
     columns = [
         map(Entry, tensor.flatten().tolist()) if isinstance(y, Forms) else tensor.flatten().tolist()
@@ -89,7 +89,7 @@ def subtract(program: Program, x: Any, y: Any, alpha: float = 1) -> Forms:
 
 @rule(aten.mul.Tensor, aten.mul.Scalar)
 def multiply(program: Program, x: Any, y: Any) -> Forms:
-    """x · y; a square where both are one value."""
+    """x · y; x² if both are the same value."""
     if x is y:
         return square(program, x)
 
@@ -167,9 +167,9 @@ def function_of(name: str, *parameters: float) -> Callable[[Program, Forms], For
     return lambda program, x: each(lambda a: program.function(name, a, *parameters), x)
 
 
-NOWHERE = (math.inf, 0.0)  # that torch's function would be another one
+NO_THRESHOLD = (math.inf, 0.0)  # torch never replaces the function by another one; see _threshold
 reciprocal = rule(aten.reciprocal.default)(function_of("reciprocal"))
-sigmoid = rule(aten.sigmoid.default)(function_of("sigmoid", *NOWHERE))
+sigmoid = rule(aten.sigmoid.default)(function_of("sigmoid", *NO_THRESHOLD))
 for _name in ("exp", "log", "log1p", "sqrt", "sin", "cos", "tan"):
     rule(getattr(aten, _name).default)(function_of(_name))
 
@@ -181,7 +181,7 @@ def _tanh(program: Program, x: Forms) -> Forms:
 
 
 def _threshold(threshold: float) -> tuple[float, float]:
-    """(where torch's softplus is the identity, by how much it is off at most)."""
+    """(the argument above which torch replaces softplus by the identity, the largest error of that)."""
     return threshold, 1.001 * math.exp(-threshold) + TINY
 
 
@@ -198,21 +198,21 @@ def _softplus_backward(program: Program, gradient: Any, x: Forms, beta: float, t
     return multiply(program, gradient, function_of("sigmoid", *_threshold(threshold))(program, y))
 
 
-# Entries that are added to
+# Additions to entries
 
 
 @rule(aten.index_add.default)
 def _index_add(program: Program, x: Any, dim: int, index: Tensor, source: Any) -> Forms:
-    return _added(program, x, source, lambda base, y: base.index_add(dim, index, y))
+    return _add_at(program, x, source, lambda base, y: base.index_add(dim, index, y))
 
 
 @rule(aten.index_put.default)
 def _index_put(program: Program, x: Any, indices: list[Any], values: Any, accumulate: bool = False) -> Forms:
-    return _added(program, x, values, lambda base, y: base.index_put(indices, y, accumulate=True))
+    return _add_at(program, x, values, lambda base, y: base.index_put(indices, y, accumulate=True))
 
 
-def _added(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor], Tensor]) -> Forms:
-    """x with a source added at places that are all different."""
+def _add_at(program: Program, x: Any, source: Any, put: Callable[[Tensor, Tensor], Tensor]) -> Forms:
+    """x with a source added to entries that are all different."""
     x, source = as_forms(program, x), as_forms(program, source)
     nothing = torch.zeros_like(x.entries)
     if bool((put(nothing, torch.ones_like(source.entries)) > 1).any()):

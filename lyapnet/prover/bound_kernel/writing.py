@@ -1,6 +1,6 @@
-"""Graphs written as programs of bounds, node by node.
+"""Translates graphs into programs of bounds, node by node.
 
-What has no rule here is bounded by the interpreter of lyapnet.prover.bounds.
+A graph with an operator that has no rule here is bounded by the interpreter of lyapnet.prover.bounds.
 """
 
 import operator
@@ -21,11 +21,11 @@ aten = torch.ops.aten
 RULES = {**rules.RULES, **branch_rules.RULES}
 
 
-def written(program: Program, nodes: Sequence[Any], constants: dict[Any, Any]) -> list[Forms]:
-    """The results of a graph at (t, x), whose operations are written into a program.
+def write_graph(program: Program, nodes: Sequence[Any], constants: dict[Any, Any]) -> list[Forms]:
+    """Write the operations of a graph into a program; the results of the graph.
 
     Raises:
-        NotImplementedError: an operation has no rule, or arguments that its rule does not cover.
+        NotImplementedError: an operation has no rule, or its rule does not cover the arguments.
     """
     inputs = iter([Forms(torch.tensor(program.inputs[0])), Forms(torch.tensor(program.inputs[1:]))])
     values = dict(constants)
@@ -49,12 +49,12 @@ def _result(program: Program, node: Any, values: dict[Any, Any], arguments: Any,
     if node.target in RULES:
         return RULES[node.target](program, *arguments, **keywords)
     if node.target in ARRANGEMENTS:
-        return _arranged(program, node.target, *arguments, **keywords)
+        return _arrange(program, node.target, *arguments, **keywords)
     raise NotImplementedError(node.target)
 
 
-def _arranged(program: Program, target: Any, *arguments: Any, **keywords: Any) -> Any:
-    """The operator on the places of forms, beside which constants become forms."""
+def _arrange(program: Program, target: Any, *arguments: Any, **keywords: Any) -> Any:
+    """Apply an operator that arranges entries to the numbers of forms; constants become forms first."""
     if target is operator.getitem:
         return target(*arguments)
     if target in (aten.cat.default, aten.stack.default):

@@ -11,7 +11,7 @@ from lyapnet.base.interpolation import Table
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.systems import SYSTEMS
 from lyapnet.training.experiment import train
-from lyapnet.training.facts import jump_facts
+from lyapnet.training.task_facts import jump_facts
 from tests.fits import shorten_fits
 from tests.problems import problem_of
 

@@ -7,14 +7,14 @@ from matplotlib.figure import Figure
 
 from lyapnet.base.drawing import CYCLE, legend_below, numpy_of
 from lyapnet.controller.controller import Controller
-from lyapnet.evaluation.afterwards import Afterwards
+from lyapnet.evaluation.after_horizon import LoopsAfterHorizon
 
 # distances relative to the largest one before T
 AXIS_BOTTOM, AXIS_TOP = 1e-12, 1e3  # limits of the logarithmic axis
 ZERO = 1e-24  # replaces 0, which a logarithmic axis cannot show
 
 
-def distances(found: Sequence[Afterwards], controller: Controller) -> Figure:
+def distances(found: Sequence[LoopsAfterHorizon], controller: Controller) -> Figure:
     """‖x − x*‖ over t under each law: the mean, and a band from the smallest to the largest distance."""
     figure = Figure(figsize=(5.6, 3.6), layout="constrained")
     axes = figure.subplots()

@@ -9,7 +9,7 @@ from torch import Tensor
 from lyapnet.base.random_streams import START, stream
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.task.problem import Problem
-from lyapnet.training.stages import Report
+from lyapnet.training.stage_messages import StageReport
 from lyapnet.training.start import expansions_of
 from lyapnet.value.expansions import (
     Expansion,
@@ -32,7 +32,7 @@ STALL_TOLERANCE = 1e-2  # change of h, in units of the margin, that counts as no
 MARGIN_RESERVE = 0.5  # share of the margin that optima must leave free for the error of a trained law
 
 
-class Relaxation(NamedTuple):
+class PenaltyWeight(NamedTuple):
     """A penalty weight, and how well the optima with this penalty keep the constraints."""
 
     weight: float  # cost per second at h = 0
@@ -59,7 +59,7 @@ class Relaxation(NamedTuple):
         return self._asdict()
 
 
-def find_relaxation(problem: Problem, report: Report) -> Relaxation:
+def find_penalty_weight(problem: Problem, report: StageReport) -> PenaltyWeight:
     """Choose the smallest penalty weight of a geometric series for which the optima keep h ≤ 0 with a reserve.
 
     The optima without constraints are the first initial guesses; each weight is warm-started from the previous one. The
@@ -78,7 +78,7 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
     finite = path.cost[path.cost.isfinite()]
     free = float(finite.mean()) if len(finite) else 0.0
     unit = (float(sizes(exact, finite).mean()) if len(finite) else 0.0) or 1.0
-    tried, closest = list[Relaxation](), list[Tensor]()
+    tried, closest = list[PenaltyWeight](), list[Tensor]()
     for k in range(MAX_WEIGHTS):
         weight = unit / problem.horizon.duration * FIRST_WEIGHT * WEIGHT_FACTOR**k
         cost.weight.fill_(weight)
@@ -89,7 +89,7 @@ def find_relaxation(problem: Problem, report: Report) -> Relaxation:
         kept = int((closest[-1] <= -MARGIN_RESERVE).sum())
         mean = float(path.cost.mean())
         ratio = mean / free if exact.has_goal and free else None
-        tried.append(Relaxation(weight, kept, ratio, OPTIMA, mean - free, weight, float(worst.max())))
+        tried.append(PenaltyWeight(weight, kept, ratio, OPTIMA, mean - free, weight, float(worst.max())))
         if kept == OPTIMA or (mean - free > abs(free) + unit and _is_stalled(closest)):
             break
     return max(tried, key=lambda each: each.kept)._replace(largest=tried[-1].weight, worst=tried[-1].worst)
@@ -102,7 +102,7 @@ def _is_stalled(closest: Sequence[Tensor]) -> bool:
     )
 
 
-def _free_optima(problem: Problem, report: Report) -> Path:
+def _free_optima(problem: Problem, report: StageReport) -> Path:
     """Optimal trajectories of the problem without constraints."""
     x0 = problem.initial_states.sample(OPTIMA, stream(0, START, 5))
     expansions = [known for _, known in expansions_of(problem, report) if isinstance(known, Expansion)]

@@ -17,10 +17,10 @@ from lyapnet.task.horizon import TABLEAUX
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
-from lyapnet.training.fact import Fact, format_numbers
+from lyapnet.training.config_facts import Fact, format_numbers
 from lyapnet.training.learner import Learner
-from lyapnet.training.relaxation import find_relaxation
-from lyapnet.training.stages import Report, silent
+from lyapnet.training.penalty_weight import find_penalty_weight
+from lyapnet.training.stage_messages import StageReport, silent
 from lyapnet.training.start import NOT_FINITE_REMEDY, STEP_ERROR_REMEDY, TRIAL_STATES
 from lyapnet.training.start_cache import load_or_choose_start
 from lyapnet.value.expansions import in_float64, path_under
@@ -44,7 +44,7 @@ ROUNDING_UNITS = 100  # rounding error of a rate that sums several terms, in uni
 
 def facts_of(
     learner: Learner,
-    report: Report = silent,
+    report: StageReport = silent,
     known: Callable[[Fact], None] = lambda fact: None,
     may_look_ahead: bool = False,
 ) -> list[Fact]:
@@ -79,7 +79,7 @@ def facts_of(
             tell(stiff)
     try:
         if isinstance(problem.cost, PenaltyCost):
-            relaxation = find_relaxation(problem, report)
+            relaxation = find_penalty_weight(problem, report)
             problem.cost.weight.fill_(relaxation.weight)
             tell(Fact("constraints", str(relaxation).removeprefix("constraints: ")))
         start = load_or_choose_start(
@@ -134,7 +134,7 @@ def kink_facts(problem: Problem) -> list[Fact]:
         return []
     kinked = [symbol for symbol, widths in part.widths.items() if any(widths)]
     has, it = ("has", "it") if len(kinked) == 1 else ("have", "them")
-    return [Fact("kink", f"{' and '.join(kinked)} {has} a kink at the goal: training rounds {it}, {part.words}")]
+    return [Fact("kink", f"{' and '.join(kinked)} {has} a kink at the goal: training smooths {it}, {part.words}")]
 
 
 def _start_facts(start: Start | None) -> Iterator[Fact]:

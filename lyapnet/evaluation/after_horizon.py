@@ -17,7 +17,7 @@ from lyapnet.value.after_horizon import LAWS, LONGEST, MULTIPLE, is_held
 DIVERGES = "the closed loop diverges"
 
 
-class Afterwards(NamedTuple):
+class LoopsAfterHorizon(NamedTuple):
     """The closed loops under one law after T."""
 
     beyond: str
@@ -29,7 +29,7 @@ class Afterwards(NamedTuple):
         return None if self.distance is None else float(self.distance[node].mean())
 
 
-def afterwards(controller: Controller, x0: State, multiple: float) -> list[Afterwards]:
+def loops_after_horizon(controller: Controller, x0: State, multiple: float) -> list[LoopsAfterHorizon]:
     """The closed loops of a batch of states up to a multiple of T, under each law that can follow T.
 
     Raises:
@@ -39,17 +39,21 @@ def afterwards(controller: Controller, x0: State, multiple: float) -> list[After
     return [_follow(controller, beyond, x0, last_node(controller, multiple)) for beyond in LAWS]
 
 
-def _follow(controller: Controller, beyond: str, x0: State, steps: int) -> Afterwards:
+def _follow(controller: Controller, beyond: str, x0: State, steps: int) -> LoopsAfterHorizon:
     try:
         other = controller.continued(beyond)
     except ValueError as error:  # the law cannot hold the goal
-        return Afterwards(beyond, None, str(error))
+        return LoopsAfterHorizon(beyond, None, str(error))
     try:
         x = other.rollout(x0, steps).x
     except DivergenceError as error:
-        return Afterwards(beyond, None, f"{DIVERGES}: {error}")
+        return LoopsAfterHorizon(beyond, None, f"{DIVERGES}: {error}")
     distance = torch.linalg.vector_norm(controller.cost.from_goal(x), dim=-1)
-    return Afterwards(beyond, distance, "") if distance.isfinite().all() else Afterwards(beyond, None, DIVERGES)
+    return (
+        LoopsAfterHorizon(beyond, distance, "")
+        if distance.isfinite().all()
+        else LoopsAfterHorizon(beyond, None, DIVERGES)
+    )
 
 
 def share_at_goal(controller: Controller, x0: State) -> float | None:
@@ -91,7 +95,7 @@ def shown_nodes(controller: Controller, multiple: float) -> list[int]:
     return sorted({T, T + max((last - T) // 10, 1), T + max((last - T) // 2, 1), last})
 
 
-def in_plain_data(found: Sequence[Afterwards], controller: Controller, multiple: float) -> list[dict[str, Any]]:
+def in_plain_data(found: Sequence[LoopsAfterHorizon], controller: Controller, multiple: float) -> list[dict[str, Any]]:
     """Plain data for JSON and tables: the mean distance at some times in s for each law, or why there is none."""
     nodes, dt = shown_nodes(controller, multiple), controller.horizon.dt
     return [

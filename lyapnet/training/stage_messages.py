@@ -13,7 +13,7 @@ POLL_INTERVAL = 0.25  # seconds between two checks of the clock
 
 
 @runtime_checkable
-class Report(Protocol):
+class StageReport(Protocol):
     """A function that is called with the current stage and, if it is countable, how much of it is done."""
 
     def __call__(self, stage: str, done: int = 0, total: int = 0) -> None: ...
@@ -23,12 +23,12 @@ def silent(stage: str, done: int = 0, total: int = 0) -> None:
     """A report that shows nothing."""
 
 
-class Stages:
+class StageMessages:
     """A report that shows a line with a spinner in a terminal; elsewhere it prints lines.
 
     It prints one line for each stage that lasts longer than `patience`, and one every LOG_INTERVAL seconds.
 
-    with Stages(console, "start") as report:
+    with StageMessages(console, "start") as report:
         report("optima from 96 states of X₀", 3, 96)
 
     Args:
@@ -65,7 +65,7 @@ class Stages:
         if self._status is not None:
             self._status.stop()
 
-    def __enter__(self) -> "Stages":
+    def __enter__(self) -> "StageMessages":
         self._printed = time.monotonic()
         if self._status is None:
             self._clock.start()

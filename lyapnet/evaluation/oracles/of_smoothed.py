@@ -10,25 +10,25 @@ from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import in_float64, path_under
 
 
-class OracleOfRounded(Oracle):
+class OracleOfSmoothed(Oracle):
     """The original cost of the controls that are optimal for the smoothed cost.
 
     It is at least the optimum, and exceeds it at most by the smoothing error: smoothing lowers the cost, by at most ε
     for each root, norm and absolute value.
 
     Args:
-        rounded: the oracle of the smoothed task.
+        smoothed: the oracle of the smoothed task.
         problem: the original task.
         method: integrator of the steps.
     """
 
-    def __init__(self, rounded: Oracle, problem: Problem, method: str):
-        self.rounded, self.problem = rounded, in_float64(problem.in_steps(method=method))
+    def __init__(self, smoothed: Oracle, problem: Problem, method: str):
+        self.smoothed, self.problem = smoothed, in_float64(problem.in_steps(method=method))
 
     def solve(
         self, x0: State, known: ControlPath | None = None, progress: Report = silent, seconds: float = math.inf
     ) -> Optima:
-        optima = self.rounded.solve(x0, known, progress, seconds)
+        optima = self.smoothed.solve(x0, known, progress, seconds)
         assert optima.u is not None
         u = optima.u.double().cpu()
         cost = path_under(self.problem, lambda n, _: u[n], x0.detach().double().cpu()).cost.to(x0)

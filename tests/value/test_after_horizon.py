@@ -13,8 +13,8 @@ import lyapnet
 from lyapnet import Controller
 from lyapnet.base.errors import UsageError
 from lyapnet.base.interpolation import Table
-from lyapnet.evaluation.afterwards import afterwards, in_plain_data, share_at_goal
-from lyapnet.evaluation.afterwards_figure import distances
+from lyapnet.evaluation.after_horizon import in_plain_data, loops_after_horizon, share_at_goal
+from lyapnet.evaluation.after_horizon_figure import distances
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.experiment.assembly import Parts, build_problem, member
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
@@ -26,7 +26,7 @@ from lyapnet.task.cost.base import quadratic_form
 from lyapnet.task.sets import Box, ControlBox
 from lyapnet.task.systems import DoubleIntegrator, Linear, Pendulum
 from lyapnet.value.after_horizon import AfterHorizon, is_held
-from lyapnet.value.beyond import BEYOND
+from lyapnet.value.law_after_horizon import BEYOND
 from lyapnet.value.policy import POLICIES, HJBPolicy
 from lyapnet.value.regulator import Regulator
 from tests.marks import sample
@@ -439,7 +439,7 @@ def test_another_word_is_refused():
 
 def test_what_each_law_after_the_end_does():
     own = controller(None)
-    found = {one.beyond: one for one in afterwards(own, X, 3)}
+    found = {one.beyond: one for one in loops_after_horizon(own, X, 3)}
     assert list(found) == ["riccati", "receding", "hold"]
     for beyond, one in found.items():
         assert_close(one.distance, controller(beyond).rollout(X, steps=30).x.norm(dim=-1))
@@ -455,7 +455,7 @@ def test_what_each_law_after_the_end_does():
 def test_a_law_that_cannot_follow_says_why():
     """There is no regulator of a plant that no control reaches."""
     problem = problem_of(Linear([[1.0]], [[0.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
-    riccati, receding, hold = afterwards(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
+    riccati, receding, hold = loops_after_horizon(Controller(problem, Quadratic(torch.eye(1))), X[:, :1], 1)
     assert len(hold.distance) == 12, "one step after T at the least"
     assert hold.refused == ""
     assert riccati.distance is None
@@ -467,7 +467,7 @@ def test_a_law_that_leaves_the_finite_numbers_says_so():
     """V(T, ·) = 0 leaves an unstable plant alone, whose states grow by eleven with each step."""
     problem = problem_of(Linear([[100.0]], [[1.0]]), QuadraticCost([[1.0]], [[1.0]], [[1.0]]))
     own = Controller(problem, Formula(lambda t, x: torch.where(t < 0.95, 105.0, 0.0) * (x**2).sum(-1)))
-    riccati, receding, hold = found = afterwards(own, X[:, :1], 40)
+    riccati, receding, hold = found = loops_after_horizon(own, X[:, :1], 40)
     assert hold.distance is None
     assert "the closed loop diverges" in hold.refused
     assert float(receding.distance[-1].max()) < 1e-6
@@ -478,15 +478,15 @@ def test_a_law_that_leaves_the_finite_numbers_says_so():
 
 def test_closed_loops_that_stay_at_the_goal_have_a_figure():
     own = controller(None)
-    assert distances(afterwards(own, 0 * X, 2), own).axes[0].get_ylim()[0] > 0
+    assert distances(loops_after_horizon(own, 0 * X, 2), own).axes[0].get_ylim()[0] > 0
 
 
 def test_what_does_not_fit_is_no_refusal():
     with pytest.raises(ValueError, match="Expected x of shape"):
-        afterwards(controller(None), torch.zeros(2, 3), 2)
+        loops_after_horizon(controller(None), torch.zeros(2, 3), 2)
 
 
 @pytest.mark.parametrize("multiple", [0.5, float("inf"), float("nan"), 1e12])
 def test_a_time_that_never_comes_is_refused(multiple):
     with pytest.raises(UsageError, match=r"Expected a multiple of T (from 1 on|that fits into memory)"):
-        afterwards(controller(None), X, multiple)
+        loops_after_horizon(controller(None), X, multiple)

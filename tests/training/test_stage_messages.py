@@ -6,7 +6,7 @@ import time
 import pytest
 from rich.console import Console
 
-from lyapnet.training.stages import Report, Stages, silent
+from lyapnet.training.stage_messages import StageMessages, StageReport, silent
 
 
 @pytest.fixture
@@ -22,8 +22,8 @@ def wait_for(log, lines):
 
 
 def test_a_log_has_a_line_for_each_stage_and_never_is_silent_for_long(monkeypatch, log):
-    monkeypatch.setattr("lyapnet.training.stages.LOG_INTERVAL", 0.02)
-    with Stages(Console(file=log, width=20), "start") as report:
+    monkeypatch.setattr("lyapnet.training.stage_messages.LOG_INTERVAL", 0.02)
+    with StageMessages(Console(file=log, width=20), "start") as report:
         report("optima from 96 states of X₀")
         report("fitting", 0, 2000)
         report("fitting", 7, 2000)
@@ -31,11 +31,11 @@ def test_a_log_has_a_line_for_each_stage_and_never_is_silent_for_long(monkeypatc
     assert first == "start: optima from 96 states of X₀ …"
     assert second == "start: fitting, 0 of 2000 …"
     assert others[-1] == "start: fitting, 7 of 2000 …"
-    assert isinstance(report, Report)
+    assert isinstance(report, StageReport)
 
 
 def test_a_stage_that_takes_long_has_a_line_and_a_quick_one_has_none(log):
-    with Stages(Console(file=log), "sound", patience=0.6, first=0.3) as report:
+    with StageMessages(Console(file=log), "sound", patience=0.6, first=0.3) as report:
         report("importing torch")
         report("the largest V on X₀")
         wait_for(log, 1)
@@ -46,15 +46,15 @@ def test_a_stage_that_takes_long_has_a_line_and_a_quick_one_has_none(log):
 
 
 def test_what_is_quickly_done_says_nothing(log):
-    with Stages(Console(file=log), "sound", patience=4.0, first=1.0) as report:
+    with StageMessages(Console(file=log), "sound", patience=4.0, first=1.0) as report:
         report("importing torch")
         report("bounding boxes")
     assert not log.getvalue()
 
 
 def test_nothing_is_said_at_rest(monkeypatch, log):
-    monkeypatch.setattr("lyapnet.training.stages.LOG_INTERVAL", 0.02)
-    with Stages(Console(file=log), "sound", patience=0.02) as report:
+    monkeypatch.setattr("lyapnet.training.stage_messages.LOG_INTERVAL", 0.02)
+    with StageMessages(Console(file=log), "sound", patience=0.02) as report:
         report("bounding boxes")
         wait_for(log, 1)
         report.rest()
@@ -67,7 +67,7 @@ def test_nothing_is_said_at_rest(monkeypatch, log):
 
 def test_a_terminal_has_one_line_that_changes():
     screen = io.StringIO()
-    with Stages(Console(file=screen, force_terminal=True, width=60), "check") as report:
+    with StageMessages(Console(file=screen, force_terminal=True, width=60), "check") as report:
         report("optima from 96 states of X₀, which is longer than the screen is wide", 3, 96)
         assert report.now.endswith("wide, 3 of 96 …")
         report.rest()

@@ -203,7 +203,7 @@ def test_the_report_says_what_is_kept(safe, unsafe):
     assert "h(x(t)) ≤ 0" in proved.in_formulas()[1]
     assert "h(x₀) ≤ 0" in proved.in_formulas()[1]
     assert proved.numbers()["constraints"] == ["position within 1.35"]
-    assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.of_the_verdict()
+    assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.verdict_text()
     assert failed.numbers()["violation"]["constraint"] == "position within 1.03"
 
 

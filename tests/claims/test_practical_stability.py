@@ -12,7 +12,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims import region
 from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check
-from lyapnet.claims.disturbances.regions import RegionsUnderPushes
+from lyapnet.claims.disturbances.regions import DisturbedRegions
 from lyapnet.claims.kinds import Region
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import RecedingDecrease
@@ -357,7 +357,7 @@ def controller():
 def test_for_each_size_there_is_a_claim():
     about, pushes = controller(), [0.0, 0.2, 0.4, 30.0]
     claims = [Region(states=D, disturbance={"velocity": w}) for w in pushes]
-    regions = RegionsUnderPushes(about, "velocity", pushes, [certify(about, claim) for claim in claims])
+    regions = DisturbedRegions(about, "velocity", pushes, [certify(about, claim) for claim in claims])
     still, small, large, none = (each.claim for each in regions.certificates)
     assert still.contraction is not None
     assert small.hole == pytest.approx(pushed_claim().hole, rel=1e-3)

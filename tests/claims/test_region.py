@@ -251,7 +251,7 @@ def test_a_rate_that_is_asked_in_vain_is_not_called_unstable():
     assert at(1.9).verdict == "certified"
     claim = at(2.1)
     assert claim.verdict != "certified"
-    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).of_the_verdict()
+    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).verdict_text()
     assert "closed loops may go to the goal even so" in words
 
 

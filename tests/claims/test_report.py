@@ -139,9 +139,9 @@ def test_a_sampled_claim_in_words():
     one = claimed(SampledCertificate, count_successes(97, Tolerances(0.5, None, 0.05)))
     assert one.in_words().startswith("Of 100 states drawn uniformly from X₀ (seed 3), 97 succeed")
     assert one.in_formulas() == ["‖x(T)‖ ≤ 0.5", "J(x₀) ≤ 1.05 V(0, x₀)"]
-    assert "one that fails was found" in one.of_the_verdict()
+    assert "one that fails was found" in one.verdict_text()
     all_succeed = claimed(SampledCertificate, count_successes(100, Tolerances(0.5, None, 0.05)))
-    assert "one that fails" not in all_succeed.of_the_verdict()
+    assert "one that fails" not in all_succeed.verdict_text()
 
 
 def test_a_bound_is_rounded_down_in_words():
@@ -177,7 +177,7 @@ def test_no_funnel_claims_nothing():
     assert nothing.verdict == "falsified"
     assert "nothing is claimed" in nothing.in_words()
     assert not any("1.25" in line or "inf" in line for line in nothing.in_formulas())
-    assert "At t = 1 s, x = (0.5, 1.5) it fails by 0.1" in nothing.of_the_verdict()
+    assert "At t = 1 s, x = (0.5, 1.5) it fails by 0.1" in nothing.verdict_text()
 
 
 @pytest.mark.gate

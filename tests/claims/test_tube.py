@@ -191,12 +191,12 @@ def test_a_closed_loop_that_is_not_its_parts_is_refused():
         prove_tube(controller(Pretending()), Budget(4))
 
 
-advanced = enclosure.nominal.advanced
+integrate = enclosure.nominal.integrate
 
 
 def bad_nominal(slope, t, h, y):
     """Closed loops that are not, by 0.3 % after a second."""
-    return advanced(slope, t, h, y) * (1 + 0.003 * h)
+    return integrate(slope, t, h, y) * (1 + 0.003 * h)
 
 
 def outside(claim, about):
@@ -210,7 +210,7 @@ def outside(claim, about):
 @pytest.mark.gate
 def test_simulations_are_not_believed(monkeypatch):
     """Polynomials along closed loops that are not are further off, and the tube is as much wider."""
-    monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
+    monkeypatch.setattr(enclosure.nominal, "integrate", bad_nominal)
     about = controller(Swinging(), Formula(damped))
     claim = prove_tube(about, Budget(20))
     wrong, bounded = outside(claim, about)
@@ -221,7 +221,7 @@ def test_simulations_are_not_believed(monkeypatch):
 @pytest.mark.gate
 def test_without_the_bounds_they_would_be(monkeypatch):
     """The twin: with the bounds of what polynomials are off taken for 0, what is claimed is false."""
-    monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
+    monkeypatch.setattr(enclosure.nominal, "integrate", bad_nominal)
     bounded = enclosure._Tube._bounded
 
     def careless(self, *arguments):

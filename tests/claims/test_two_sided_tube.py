@@ -133,7 +133,7 @@ def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay()
     assert not certificate.below.claim.everywhere
     assert certificate.result["tube_in_set"] is False
     assert certificate.verdict == "unknown"
-    assert "the tube leaves D" in certificate.of_the_verdict()
+    assert "the tube leaves D" in certificate.verdict_text()
 
 
 @pytest.mark.gate

@@ -16,7 +16,7 @@ from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.assembly import SOURCE
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads
 from lyapnet.graphs.number_kernel.program import OPERATIONS
-from lyapnet.graphs.number_kernel.rewriting import rewritten
+from lyapnet.graphs.number_kernel.rewriting import rewrite
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
 from lyapnet.loop.rollout import Rollout
@@ -167,7 +167,7 @@ def test_what_networks_have_for_tanh_is_one_operation(function, known):
 
     a = torch.linspace(-4, 4, 101, dtype=torch.float64)
     graph = trace(with_slopes, (a,))
-    written = rewritten(graph)
+    written = rewrite(graph)
     names = {node.target for node in written.graph.nodes}
     assert (torch.ops.aten.tanh.default in names) is known
     assert len(written.graph.nodes) < len(graph.graph.nodes) or not known

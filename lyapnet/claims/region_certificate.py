@@ -181,7 +181,7 @@ class RegionCertificate(Certificate):
             f"is invariant under the receding law u(0, x), proved in continuous time {plants}, {disturbances}: no "
             f"closed loop that starts in it leaves it{kept}, and each enters {{x ∈ D: V(0, x) ≤ c}}, c = "
             f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
-            f"ultimate bound). That set lies in {within}. Convergence to the goal or to an equilibrium is not claimed."
+            f"ultimate bound). That set lies in {within}. Convergence to the goal or to rest is not claimed."
         )
 
     @property

@@ -28,7 +28,7 @@ def require_writable(figure: Path | None, folder: Path | None, keep: str | None 
         UsageError: a folder does not exist or cannot be created, or the format of the figure is unknown.
     """
     if keep is not None and not Path(keep).parent.is_dir():
-        raise UsageError(f"Expected keep as a file in an existing folder, got {keep!r}; create the folder first.")
+        raise UsageError(f"Expected keep in a folder that exists, got {keep!r}; make {str(Path(keep).parent)!r} first.")
     if figure is not None:
         formats = Figure().canvas.get_supported_filetypes()
         if figure.suffix.removeprefix(".") not in formats:
@@ -36,7 +36,7 @@ def require_writable(figure: Path | None, folder: Path | None, keep: str | None 
             raise UsageError(f"Expected figure as a file of {known}, got {str(figure)!r}; for example claim.png.")
         if not figure.parent.is_dir():
             raise UsageError(
-                f"Expected figure as a file in an existing folder, got {str(figure)!r}; create the folder first."
+                f"Expected figure in a folder that exists, got {str(figure)!r}; make {str(figure.parent)!r} first."
             )
     if folder is not None:
         try:

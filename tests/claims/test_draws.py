@@ -90,4 +90,4 @@ def test_table_and_report_say_it(run, tmp_path, capsys):
     assert "draws of this checkpoint" in capsys.readouterr().out
     text = (report / "report.md").read_text()
     assert "With confidence 1 − 2e-06" in text
-    assert "one of 2 of this checkpoint" in text
+    assert "chosen among 2 draws of this checkpoint" in text

@@ -98,7 +98,7 @@ def test_a_region_that_was_not_come_to_is_none_and_a_smaller_one_is_one(whole, t
     """Boxes of lowest V come first: what an unfinished proof has come to is a region, too."""
     early, late = tmp_path / "early", tmp_path / "late"
     assert claimed(early, 60).rho == -math.inf
-    assert "go on with lyapnet certify region CKPT --keep" in checked(early)["reason"]
+    assert "resume it with lyapnet certify region CKPT --keep" in checked(early)["reason"]
     claim = claimed(late, whole[0].proof.boxes - 400)
     assert claim.hole < claim.rho < whole[0].rho
     assert claim.proof.remaining_volume > 0
@@ -110,7 +110,7 @@ def test_a_region_that_was_not_come_to_is_none_and_a_smaller_one_is_one(whole, t
 def test_another_rate_set_or_value_does_not_go_on(kept):
     before = kept.read_bytes()
     for options in ({"decay": 0.01}, {"states": Box([-3.0, -4.0], [3.0, 4.1]).double()}, {"V": V_of(0.999)}):
-        with pytest.raises(UsageError, match=r"take another file\.$"):
+        with pytest.raises(UsageError, match=r"choose another file\.$"):
             claimed(kept, **options)
     assert kept.read_bytes() == before
     assert claimed(kept).verdict == "certified"
@@ -296,7 +296,9 @@ def test_a_funnel_is_no_region(kept, tmp_path):
     claim = Funnel(alpha=0.9, delta=0.05, states=[[-2.5, -4.5], [2.5, 4.5]])
     assert certify(about, claim, keep=funnel).verdict == "certified"
     before = kept.read_bytes(), funnel.read_bytes()
-    with pytest.raises(UsageError, match=r"^Expected the proof of a region in .*, got that of a funnel; take another"):
+    with pytest.raises(
+        UsageError, match=r"^Expected the proof of a region in .*, got that of a funnel; choose another"
+    ):
         certify(about, Region(), keep=funnel)
     for claims in ([claim], [claim, LowerBound()]):
         with pytest.raises(

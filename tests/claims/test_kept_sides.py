@@ -191,7 +191,7 @@ def test_sides_of_two_questions_are_no_claim(kept, tmp_path):
     rewritten(kept, lambda proofs: proofs.update(below=kept_proofs.read_proofs(other)["below"]))
     result = check(controller(), kept)
     assert result["verdict"] == "refused"
-    assert "both sides by the same α and δ" in result["reason"]
+    assert "two proofs with the same α and δ" in result["reason"]
     assert check(controller(), other)["verdict"] == "certified"
 
 

@@ -191,9 +191,9 @@ def test_what_is_no_claim_is_refused():
         def running(self, x, u):
             return super().running(x, u) - 5
 
-    with pytest.raises(UsageError, match=r"ℓ = q \+ \(u − u\*\)ᵀR\(u − u\*\), got Own with another running"):
+    with pytest.raises(UsageError, match=r"ℓ = q \+ \(u − u\*\)ᵀR\(u − u\*\), got Own with its own `running`"):
         claimed(about=problem(cost=Own(Q, [[1.0]], Q)))
-    with pytest.raises(UsageError, match="with a lower and an upper one each"):
+    with pytest.raises(UsageError, match="with two finite limits each"):
         claimed(about=problem(ControlBox(0.0, math.inf)))
 
 

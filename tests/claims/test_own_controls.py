@@ -127,7 +127,7 @@ def test_what_keeps_to_its_set_is_proved(controls):
 
 
 def test_what_bounds_do_not_decide_is_said(caplog):
-    assert "held at 20000 points of [0, T] × D, and is not proved" in assumed(Disk())
+    assert "tested at 20000 points of [0, T] × D, and is not proved" in assumed(Disk())
     assert "not proved" in caplog.text
 
 
@@ -153,5 +153,5 @@ class OfOne(Limits):
 
 
 def test_certificates_look_at_it():
-    with pytest.raises(UsageError, match=r"Expected OfOne\.minimise\(R, b\) in the set that contains\(u\) has"):
+    with pytest.raises(UsageError, match=r"Expected OfOne\.minimise\(R, b\) in the set that contains\(u\) describes"):
         claim(controls=OfOne(lambda b: 1e4 * torch.relu(1e-4 - (b - 1.93).abs())))

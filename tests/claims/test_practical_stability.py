@@ -152,7 +152,7 @@ def test_a_hundred_times_larger_pushes_leave_it_and_nothing_is_proved_of_them():
     none = claimed(disturbance=100 * W)
     assert (none.verdict, none.rho, none.volume, none.extent) == ("unknown", -math.inf, 0.0, None)
     assert none.entered_within == math.inf
-    assert none.reason.startswith("no levels c < ρ were found between which V(0, ·) falls whatever the pushes")
+    assert none.reason.startswith("no levels c < ρ were found between which V(0, ·) falls under every disturbance")
     assert "\n" not in none.reason
 
 
@@ -281,11 +281,11 @@ def test_a_kept_proof_is_checked_with_its_disturbance(kept):
 def test_it_goes_on_by_the_same_disturbance_alone(kept, plain):
     before = kept.read_bytes()
     for w in (0.5 * W, 2 * W, 0 * W, None):
-        with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
+        with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; choose another file"):
             kept_at(kept, w)
     assert kept.read_bytes() == before
     assert kept_at(kept).rho == pushed_claim().rho
-    with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
+    with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; choose another file"):
         kept_at(plain)
 
 
@@ -369,7 +369,7 @@ def test_for_each_size_there_is_a_claim():
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     figure = regions.figure()
     volumes, plane = figure.axes
-    assert volumes.get_xlabel() == "largest push on d(velocity)/dt, w_max (m/s²)"
+    assert volumes.get_xlabel() == "largest disturbance of d(velocity)/dt, w_max (m/s²)"
     assert volumes.get_ylabel() == "certified volume (m · m/s)"
     assert [float(y) for y in volumes.lines[0].get_ydata()] == [c.volume for c in (still, small, large, none)]
     assert "none proved" in [text.get_text() for text in volumes.texts]

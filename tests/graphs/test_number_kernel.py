@@ -211,8 +211,8 @@ def test_what_has_no_rule_is_named():
         NumberKernel(trace(lambda x, y: (x.sort(-1).values,), pair()), pair())
 
 
-def test_places_that_depend_on_arguments_are_refused():
-    with pytest.raises(NotImplementedError, match="places that depend on arguments"):
+def test_indices_that_depend_on_arguments_are_refused():
+    with pytest.raises(NotImplementedError, match="indices that depend on arguments"):
         NumberKernel(trace(lambda x, y: (x.mT[y.argmax(-1)],), pair()), pair())
 
 
@@ -266,7 +266,7 @@ def test_integers_are_held_to_what_they_were():
     kernel = NumberKernel(trace(lambda i, x, y: (x[:, i] * y[:, :2],), (places, *pair())), (places, *pair()))
     x, y = pair()
     assert_close(kernel(places, x, y)[0], x[:, places] * y[:, :2])
-    with pytest.raises(ValueError, match="int64 as it was traced"):
+    with pytest.raises(ValueError, match="int64 values of the examples"):
         kernel(places + 1, x, y)
 
 

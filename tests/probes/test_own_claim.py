@@ -151,7 +151,7 @@ WRONG = {
     "Funnel(disturbance='velocity=0.1')": "Expected disturbance as numbers by name",
     "Funnel(disturbance={'velocity': True})": "Expected disturbance as numbers by name",
     "Funnel(alpha=None)": "Expected alpha as a number",
-    "Region(parameters={'mass': 1})": "Expected parameters as numbers by name",
+    "Region(parameters={'mass': 1})": "Expected parameters as finite numbers",
     "Funnel(states=[[], []])": "Expected states",
 }
 

@@ -1,4 +1,4 @@
-"""Reports of certificates: they name what was certified; what cannot be written is refused, or leaves nothing."""
+"""Reports of certificates: their content; and outputs that cannot be written are refused, or leave no file."""
 
 import hashlib
 import json
@@ -76,7 +76,7 @@ def test_a_report_names_what_was_certified(kind, reported, checkpoint):
 
 @pytest.mark.gate
 def test_a_report_has_the_limits_of_the_controller(checkpoint):
-    """Not those of its config, which may be others."""
+    """Not the limits of the config, which may differ."""
 
     def controls_of(**own):
         certificate = certify(load(checkpoint, **own), Sampled(samples=3))
@@ -125,7 +125,7 @@ def test_another_checkpoint_has_another_hash(reported, checkpoint, tmp_path):
 
 
 def claimed(cls, claim, seed=3):
-    """A certificate of a claim, about a controller that is made up."""
+    """A certificate of a claim about an untrained controller."""
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     return cls(Controller(problem_of(DoubleIntegrator()), V), claim, {"seed": seed})
 

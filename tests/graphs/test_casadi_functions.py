@@ -1,4 +1,4 @@
-"""Traced torch functions as CasADi functions: equal at points, and what has no translation is named."""
+"""Traced torch functions as CasADi functions: equal to torch; operators without a rule are named."""
 
 import numpy as np
 import pytest

@@ -182,11 +182,8 @@ def contraction_around(
         return None, slowest
     scale = reach[list(seen)].numpy()
     try:
-        Ys = (
-            [proposed[1]]
-            if proposed
-            else [_coordinates_of(P, A, scale) for P in _candidate_metrics(law, A, goal, seen, scale, own)]
-        )
+        metrics = [] if proposed else _candidate_metrics(law, A, goal, seen, scale, own)
+        Ys = [proposed[1]] if proposed else [_coordinates_of(P, A, scale) for P in metrics]
         at_goal, Y = max(((_rate_of_linear_laws(Y, (A, *others)), Y) for Y in Ys), key=itemgetter(0))
         coordinates = _Coordinates(law, goal, states, seen, Y, min(LEAST * own, at_goal / 2))
     except np.linalg.LinAlgError:

@@ -327,7 +327,7 @@ def test_the_command_prints_both_sides(checkpoint, capsys, tmp_path):
     assert {"lower_level", "lower_level_wanted", "holds_for", "lower_boxes"} <= result.keys()
     assert (tmp_path / "b.png").stat().st_size > 1000
     report = (tmp_path / "r" / "report.md").read_text()
-    assert "--two-sided" in report.rsplit("## Again", 1)[1]
+    assert "--two-sided" in report.rsplit("## To repeat it", 1)[1]
     for other in ("--refine=1", "--disturbance=velocity=1"):
         assert main([*arguments, other]) == 2
         assert "Expected --two-sided alone" in capsys.readouterr().err

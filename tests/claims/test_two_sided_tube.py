@@ -115,7 +115,7 @@ def test_the_command(capsys, tmp_path):
     assert (result["beta"], result["delta"]) == (0.8, 0.5)
     assert result["lower_set"] == [[-3.0, -4.0], [3.0, 4.0]]
     assert {"mean_cost", "lower_level", "holds_for"} <= result.keys()
-    assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## Again", 1)[1]
+    assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## To repeat it", 1)[1]
 
 
 @pytest.mark.parametrize("option", ["--beta=0.9", "--delta=0.1", "--set=-1:1,-1:1"])

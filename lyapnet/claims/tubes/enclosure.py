@@ -14,7 +14,7 @@ from lyapnet.prover.taylor import EPSILON, TaylorForm, monomials
 
 LEAST = 1e-30  # the smallest r̂, for states that do not move
 TRIES = 6  # values of r̂ to test on a step
-SKEW = 100.0  # coordinates with a larger condition number are result orthogonal
+SKEW = 100.0  # coordinates with a larger condition number are made orthogonal
 TURN = 0.3  # largest change of the coordinates within a step, relative to them
 LEAK = 1e-3  # a growth of r of this size over T is accepted without shortening steps
 SHORTEST = 1 / 2000  # shortest step, as a share of T
@@ -88,7 +88,7 @@ class Enclosure:
 
     so that |z| ≤ r + h max |ż| on the step if this is at most r̂; otherwise z would have to leave {|z| ≤ r̂} first. Yv is
     bounded as one Taylor form in (τ, ε, z), in which F along p and Φz cancels with ṗ and Φ̇z. Between steps a skewed Φ
-    is result orthogonal, and the polynomials p of two steps agree up to rounding, which r takes into account.
+    is made orthogonal, and the polynomials p of two steps agree up to rounding, which r takes into account.
 
     Args:
         field: F.
@@ -200,7 +200,7 @@ class _Tube:
     def _frame(self, front: Front, p: Terms, end: float) -> tuple[Moving, Tensor]:
         """Choose coordinates for a step; return them and the size of their change, in floating point.
 
-        They continue those of the previous step, scaled to unit length in the states' units; skewed ones are result
+        They continue those of the previous step, scaled to unit length in the states' units; skewed ones are made
         orthogonal.
         """
         unit, h = self.enclosure.unit, end - front.t

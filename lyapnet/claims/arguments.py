@@ -1,4 +1,4 @@
-"""The options of claims as the sets and tensors that proofs take."""
+"""Converts the options of claims to the sets and tensors that proofs take."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,33 +12,33 @@ from lyapnet.claims.claim import sides_of
 from lyapnet.controller.controller import Controller
 from lyapnet.task.sets import Box
 
-COMPARED = 1000  # states of X₀ whose mean running cost sets δ, and on which costs are held against optima
+COMPARED = 1000  # random states of X₀: their mean running cost sets δ, and their costs are compared with optima
 
 
 def box_of(states: Any) -> Box | None:
-    """D in float64; None where it is to be found."""
+    """D in float64; None if the proof chooses D itself."""
     if states is None:
         return None
     return Box(*(torch.tensor(side, dtype=torch.float64) for side in sides_of(states)))
 
 
-def pushes_of(disturbance: Mapping[str, float] | None, controller: Controller) -> State | None:
-    """w in units of ẋ, (n,), from the largest push on the derivative of each state that is named; None where none is.
+def disturbance_of(disturbance: Mapping[str, float] | None, controller: Controller) -> State | None:
+    """w in units of ẋ, (n,), with 0 for the states that are not named; None if no state is named.
 
     Raises:
-        UsageError: a name that is no state.
+        UsageError: a name is not the name of a state.
     """
     names, w = controller.system.state_names, torch.zeros(controller.system.n, dtype=torch.float64)
-    for name, push in (disturbance or {}).items():
+    for name, bound in (disturbance or {}).items():
         if name not in names:
             hint = did_you_mean(name, names, "name one of them.")
-            raise UsageError(f"Expected a disturbance of {', '.join(names)}, got '{name}={push:g}'; {hint}")
-        w[names.index(name)] = push
+            raise UsageError(f"Expected a disturbance of {', '.join(names)}, got '{name}={bound:g}'; {hint}")
+        w[names.index(name)] = bound
     return w if disturbance else None
 
 
 def slack_of(delta: float | None, controller: Controller) -> float:
-    """δ: what is given, or 0.5 % of the mean running cost on X₀ at t = 0, in cost per second."""
+    """The given δ, else 0.5 % of the mean running cost on X₀ at t = 0; in cost per second."""
     if delta is not None:
         return delta
     x0 = controller.initial_states.sample(COMPARED, stream(0, CERTIFICATION))

@@ -1,4 +1,4 @@
-"""lyapnet.certify: what can be said of a controller, proved or by a draw."""
+"""lyapnet.certify: proves or samples claims about a controller."""
 
 import math
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from lyapnet.controller.loading import load
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.proof import Progress
 
-NOTHING_KEPT = "Stopped while certifying: a {} keeps nothing."
+NOTHING_KEPT = "Stopped while certifying: the proof of a {} cannot be kept."
 
 
 def certify(
@@ -26,27 +26,27 @@ def certify(
     keep: str | Path | None = None,
     report: Callable[[Progress], None] | None = None,
 ) -> Certificate:
-    """What can be said of a controller within a budget; the verdict is certified, falsified or unknown.
+    """Certify a claim about a controller within a budget; the verdict is certified, falsified or unknown.
 
         certificate = lyapnet.certify(controller, lyapnet.Funnel(alpha=0.9), lyapnet.LowerBound())
         print(certificate, certificate.verdict)
 
     Args:
-        controller: or the path of its checkpoint.
-        claims: one, or two sides: one that bounds the cost from above, and LowerBound().
-        budget: seconds, set-up included, or a Budget, which counts from when it was made.
-        seed: of all that is drawn.
-        keep: a file in which the proof is kept, and from which the same call goes on.
-        report: is told how far the proof is.
+        controller: a controller, or the path of its checkpoint.
+        claims: one claim; or two: a claim that bounds the cost from above, and LowerBound().
+        budget: seconds, set-up included; or a Budget, whose time runs from its construction.
+        seed: of all random numbers.
+        keep: a file for the proof; the same call resumes from it.
+        report: called with the progress of the proof.
 
     Raises:
         UsageError: the claims do not fit the controller, each other or the budget.
-        Interrupted: Ctrl-C or SIGTERM; says what is kept.
+        Interrupted: Ctrl-C or SIGTERM; the message says whether the proof was kept.
     """
     for claim in claims:
         if not isinstance(claim, Claim):
             raise UsageError(
-                f"Expected claims such as lyapnet.Funnel(alpha=0.9), got {claim!r}; make one of its class."
+                f"Expected claims such as lyapnet.Funnel(alpha=0.9), got {claim!r}; create one from its class."
             )
     if not isinstance(controller, Controller | str | Path):
         raise UsageError(f"Expected a controller or the path of its checkpoint, got {controller!r}; see lyapnet.load.")
@@ -65,7 +65,7 @@ def certify(
     if len(claims) == 1:
         certificate = claims[0].establish(controller, run)
     elif len(above) == len(below) == 1 and above[0].share_of_two is not None:
-        certificate = _from_two_sides(controller, above[0], below[0], run)
+        certificate = _certify_two_sides(controller, above[0], below[0], run)
     else:
         got = " and ".join(claim.kind for claim in claims) or "none"
         raise UsageError(
@@ -75,13 +75,15 @@ def certify(
     return certificate
 
 
-def _from_two_sides(controller: Controller, above: Claim, given: LowerBound, run: Run) -> Certificate:
-    """What the controller costs at most, and what any control costs at least."""
+def _certify_two_sides(controller: Controller, above: Claim, given: LowerBound, run: Run) -> Certificate:
+    """Bound the cost of the controller from above, and the cost of any control from below."""
     below, options = given.beside(above), run.options(above, **{"two-sided": True}, **given.options_beside(above))
     below.require_fitting(controller)
     upper = above.establish(controller, run.share(above.share_of_two or 1.0))
     if not isinstance(upper, CostCertificate):
-        raise TypeError(f"Expected a CostCertificate of {type(above).__name__}.establish, got {type(upper).__name__}.")
+        raise TypeError(
+            f"Expected a CostCertificate from {type(above).__name__}.establish, got {type(upper).__name__}."
+        )
     try:
         lower = below.establish(controller, run)
     except Interrupted as error:

@@ -1,4 +1,4 @@
-"""A kept proof, checked: what others can do with its file and the checkpoint, without trusting either search."""
+"""Checks a kept proof: anyone can do so with its file and the checkpoint, without trusting the search that made it."""
 
 import copy
 import math
@@ -31,24 +31,24 @@ from lyapnet.prover.kept_proofs import KeptProof, about, part_of, read_proofs, r
 from lyapnet.prover.proof import Progress
 from lyapnet.task.sets import Box
 
-UNLIMITED = 1e9  # seconds: the leaves are an end
+UNLIMITED = 1e9  # seconds: a check ends when all leaves are bounded, so that it needs no budget
 NOT_PROVED = "a leaf is not proved"
 Report = Callable[[Progress], None] | None
 
 
 def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
-    """What `lyapnet certify check --json` prints: whether a file proves the claim that it was kept of.
+    """Check whether a file proves its claim; return the object that `lyapnet certify check --json` prints.
 
-    What the claim is about (α, δ, D, w; λ, B, Y, c) is read from the file, the condition is built from the controller,
-    and all that the claim rests on is computed anew: the levels of X₀ and of the boundary of D, the bounds of the
-    condition and of W on every leaf of the cuts, contraction on B, share and volume, κ, e. The verdict is certified or
-    refused, with the reason. A funnel has to hold all of X₀, and a bound from below too; a region is certified up to
-    the ρ of the file, and how much of X₀ it holds is part of the answer.
+    The parameters of the claim (α, δ, D, w; λ, B, Y, c) are read from the file, and the condition is built from the
+    controller. Everything else is computed again: the levels on X₀ and on the boundary of D, the bounds of the
+    condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The verdict is certified
+    or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is certified up to the
+    ρ of the file, and the result has the share of X₀ in it.
     """
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
-        kind, again = kind_of(path)
-        found = again(controller, path, Budget(UNLIMITED, workers=workers), report)
+        kind, reprove = kind_of(path)
+        found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report)
         numbers, reason = found.numbers, found.reason
         share = found.seconds / found.searched if found.searched > 0 else None
     except UsageError as error:
@@ -59,25 +59,25 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
 
 
 def labels_of(result: Mapping[str, Any]) -> dict[str, str]:
-    """What a table calls the numbers of a check."""
+    """The labels of the numbers of a check in a table."""
     kinds = {"region": RegionCertificate.labels, "two-sided": labels_of_both(SoundCertificate)}
     labels = kinds.get(result["of"], SoundCertificate.labels)
     return {"of": "of", **labels, "share_of_search": "seconds for the leaves / for their search"}
 
 
 class Checked(NamedTuple):
-    """A claim that was made again from a file, without a search."""
+    """A claim that was proved again from a file, without a search."""
 
     numbers: dict[str, Any]
-    reason: str | None  # why it is refused
-    seconds: float  # for the leaves
-    searched: float  # those of the search, as the file says
+    reason: str | None  # why it is refused; None if it is certified
+    seconds: float  # to bound the leaves
+    searched: float  # seconds of the original search, as recorded in the file
 
 
-Again = Callable[[Controller, Path, Budget, Report], Checked]
+Reprove = Callable[[Controller, Path, Budget, Report], Checked]
 
 
-def kind_of(path: Path) -> tuple[str, Again]:
+def kind_of(path: Path) -> tuple[str, Reprove]:
     """(the kind of claim that the proofs in a file make, how it is made again).
 
     Raises:
@@ -89,35 +89,36 @@ def kind_of(path: Path) -> tuple[str, Again]:
 
 
 class KeptSide(NamedTuple):
-    """The funnel {V(t, x) ≤ ρ + δt} within D that a file records as proved, or {W ≤ c} from below, with c as ρ."""
+    """The funnel {V(t, x) ≤ ρ + δt} in D that a file records as proved; for a bound from below, {W ≤ c} with ρ = c."""
 
     alpha: float
     delta: float  # in cost per second
-    states: Box  # D; without width along states that nothing depends on
+    states: Box  # D; of width 0 along ignorable states
     disturbance: State | None
-    degree: int  # of the forms
+    degree: int  # of the Taylor forms
     rho: float
-    seconds: float  # of the search
+    seconds: float  # of the original search
 
 
 def kept_funnel(controller: Controller, path: Path) -> KeptSide:
-    """What the file of a finished proof says of a controller; no leaf is bounded anew.
+    """Read the funnel that a finished proof records for a controller; no leaf is bounded again.
 
     Raises:
-        UsageError: it is another file, an unfinished proof, or that of another controller; or as bounded_condition.
+        UsageError: the file has no such proof, or one that is unfinished or of another controller; or as
+            bounded_condition.
     """
     return _kept_side(controller, path, "above")
 
 
 def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
-    """As kept_funnel, of the proof of that name."""
+    """As kept_funnel, for the proof of that name."""
     content = part_of(read_proofs(path), name, path)
     with refusing(path):
         of = content["of"][0]
         lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
         w = None if of["disturbance"] is None else torch.tensor(of["disturbance"], dtype=torch.float64)
         if of["degree"] not in (2, DEGREE):
-            raise ValueError("forms of another degree")
+            raise ValueError("forms of unknown degree")
         kept = KeptSide(
             float(of["alpha"]), float(of["delta"]), Box(lower, upper), w, int(of["degree"]),
             float(content["proved"]), float(content["seconds"]),
@@ -127,14 +128,14 @@ def _kept_side(controller: Controller, path: Path, name: str) -> KeptSide:
         condition = RiseCondition(loop, kept.alpha, kept.delta, problem)
     else:
         condition = DecreaseCondition(loop, kept.alpha, kept.delta, problem.constraints, kept.disturbance)
-    if kept.states.dimension == controller.system.n:  # the claim says so else
+    if kept.states.dimension == controller.system.n:  # otherwise the claim raises the error
         domain = over_time(kept.states, controller.horizon.duration)
         of = about(bounded_condition(condition, domain, kept.degree), condition, *domain)
         KeptProof(path, of, math.inf).claim(domain)
     return kept
 
 
-def _funnel(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+def _reprove_funnel(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
     kept = kept_funnel(controller, path)
     claim = prove_funnel(
         controller.closed_loop, controller.problem, kept.alpha, kept.delta, kept.states, budget, _generator(), report,
@@ -144,12 +145,12 @@ def _funnel(controller: Controller, path: Path, budget: Budget, report: Report) 
     return Checked(SoundCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, kept.seconds)
 
 
-def _both_sides(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+def _reprove_two_sides(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
     above, below = (_kept_side(controller, path, name) for name in ("above", "below"))
     if (above.alpha, above.delta) != (below.alpha, below.delta) or above.disturbance is not None:
         raise UsageError(
-            f"Expected both sides by the same α and δ in {str(path)!r}, and without disturbances, got others; name "
-            "another."
+            f"Expected two proofs with the same α and δ and without disturbances in {str(path)!r}, got others; choose "
+            "another file."
         )
     loop, problem, numbers = controller.closed_loop, controller.problem, (above.alpha, above.delta)
     upper = prove_funnel(
@@ -164,11 +165,11 @@ def _both_sides(controller: Controller, path: Path, budget: Budget, report: Repo
     return Checked(certificate.proved(), reason, seconds, above.seconds + below.seconds)
 
 
-def _region(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+def _reprove_region(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
     kept = kept_region(path)
     if not kept.rho >= kept.hole > 0:
         raise UsageError(
-            f"Expected a proof that has come to a region in {str(path)!r}, got one that has not; go on with lyapnet "
+            f"Expected the proof of a region in {str(path)!r}, got one without a region yet; resume it with lyapnet "
             f"certify region CKPT --keep {shlex.quote(str(path))} and the same options."
         )
     plants = plants_of(controller, kept.parameters) if kept.parameters else None
@@ -176,17 +177,17 @@ def _region(controller: Controller, path: Path, budget: Budget, report: Report) 
         controller.closed_loop, controller.problem, kept.decay, kept.states, budget, _generator(), report, path, True,
         kept.disturbance, plants,
     )  # fmt: skip
-    reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is beyond what was tried"
+    reason = None if claim.rho >= kept.rho else f"{NOT_PROVED}, or ρ is above the level of the proof"
     seconds = 0.0 if claim.proof is None else claim.proof.seconds
     return Checked(RegionCertificate(controller, claim, {}).numbers(), reason, seconds, kept.seconds)
 
 
-KINDS: dict[tuple[str, ...], tuple[str, Again]] = {
-    ("above",): ("sound", _funnel),
-    ("above", "below"): ("two-sided", _both_sides),
-    ("region",): ("region", _region),
+KINDS: dict[tuple[str, ...], tuple[str, Reprove]] = {
+    ("above",): ("sound", _reprove_funnel),
+    ("above", "below"): ("two-sided", _reprove_two_sides),
+    ("region",): ("region", _reprove_region),
 }
-"""Names of the proofs in a file ↦ what they prove together."""
+"""Names of the proofs in a file ↦ (kind of the claim, the function that proves it again)."""
 
 
 def _generator() -> torch.Generator:

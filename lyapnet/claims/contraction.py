@@ -1,4 +1,4 @@
-"""Where closed loops at one instant's law converge exponentially: a box on which the linearised law contracts."""
+"""Finds a box around the goal on which the closed loop of u(0, x) contracts, so that trajectories converge."""
 
 import math
 import warnings
@@ -13,7 +13,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from torch import Tensor
 
 from lyapnet.base.types import PerState, State, Time
-from lyapnet.claims.preconditions import at_time, beside, first_of, over_time
+from lyapnet.claims.preconditions import append_constants, at_time, first_states, over_time
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.boxes import pieces
@@ -23,14 +23,14 @@ from lyapnet.prover.rounding import rounding
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import gradients
 
-BOXES, SAMPLES = 2000, 200  # that are bounded, and states that are tried, for one size of the box
-GROWTH, SIZES = 1.6, 20  # sizes of the box among which the largest is sought by bisection, up to half of D
-NEAR = 1e-6  # how far YZ may be from 1
-LEAST = 0.2  # of the linearised law's own rate, that is enough; no more than half of what Y has at the goal
-CORNERS = 6  # axes of P at whose corners laws are linearised
-NESTED, CLOSER = 10, 0.9  # balls in each other that rounding leaves, at most, as long as each is so much smaller
-PIECES = 256  # of the box around such a ball, about
-LITTLE = 1e-12  # radius of a ball in which no smaller one is sought
+BOXES, SAMPLES = 2000, 200  # for one size of the box: boxes to bound at most, and states to test before
+GROWTH, SIZES = 1.6, 20  # ratio of two neighbouring sizes of the box, and their number; the largest is half of D
+NEAR = 1e-6  # largest ‖YZ − 1‖ of an inverse Z; it enters the bounds as a factor 1 + NEAR
+LEAST = 0.2  # required share of the linearised law's own rate; but at most half of the rate at the goal is required
+CORNERS = 6  # the law is linearised at the corners of P along so many axes at most
+NESTED, CLOSER = 10, 0.9  # number of nested balls at most; a further one has to be smaller by this factor
+PIECES = 256  # pieces into which the box around a ball is cut, about
+LITTLE = 1e-12  # no ball inside one of this radius is computed
 
 
 @dataclass(frozen=True)
@@ -42,56 +42,56 @@ class Contraction:
     By the mean value theorem on the segment between them, ‖Y(x − x')‖ falls at the rate κ for any two closed loops in
     B. Those of a set that none leaves therefore converge to one equilibrium x_e in B, and ‖Y(x_e − x*)‖ ≤ ‖Y F(x*)‖/κ.
 
-    Of plants ẋ = F(x; p), p ∈ P, the inequality holds for each of them, with one Y: the equilibrium x_e(p) is another
-    one for each plant, and the largest ‖Y F(x*; p)‖ counts.
+    For plants ẋ = F(x; p), p ∈ P, the inequality holds for every p with the same Y. Each plant has its own equilibrium
+    x_e(p), and the bound uses the largest ‖Y F(x*; p)‖.
 
     Source: Lohmiller, Slotine, "On contraction analysis for non-linear systems", Automatica 1998.
     """
 
-    box: Box  # B, in x alone
+    box: Box  # B, without the axes of p
     rate: float  # κ in 1/s
     coordinates: Tensor  # Y, (k, k), of the states that the law depends on
-    offset: float  # ‖x_e − x*‖, at most: rounding, where x* is an equilibrium
-    fingerprint: str  # of F and its Jacobian as they were traced
+    offset: float  # an upper bound of ‖x_e − x*‖; of the size of rounding if x* is an equilibrium
+    fingerprint: str  # of the traced F and its Jacobian
 
 
 class _Law:
-    """F(0, x) in real numbers: its own operations at one x, so that its derivative is theirs; as it is on batches."""
+    """F(x) in real arithmetic. At one x it runs the traced operations, to be differentiated; on a batch, the code."""
 
     def __init__(self, loop: ClosedLoop, states: Box):
         self.loop, self.domain, self.constants = loop, over_time(states, 0.0), loop.system.constants
-        self.bounded = BoundedFunction(lambda t, x: (self._declared(t, x),), self.domain, exact=True)
-        decided = decisions(self.bounded.graph)
-        self.decisions = None if decided is None else BoundedFunction(decided, self.domain)
+        self.bounded = BoundedFunction(lambda t, x: (self._slope(t, x),), self.domain, exact=True)
+        branches = decisions(self.bounded.graph)
+        self.decisions = None if branches is None else BoundedFunction(branches, self.domain)
 
     def is_continuous_on(self, box: Box) -> bool:
-        """Whether every truth and every sign in F is decided in a box: all else is continuous."""
+        """Whether every comparison and every sign in F is constant on a box; all other operations are continuous."""
         if self.decisions is None:
             return True
-        decided = self.decisions.bounds(*at_time(0.0, box.lower, box.upper))
-        return all(bool((high - low < 0.5).all()) for low, high in decided)
+        bounds = self.decisions.bounds(*at_time(0.0, box.lower, box.upper))
+        return all(bool((high - low < 0.5).all()) for low, high in bounds)
 
-    def _declared(self, t: Time, x: State) -> State:
+    def _slope(self, t: Time, x: State) -> State:
         return self.loop.system.dynamics(x, self.loop.policy(t, x))
 
     def __call__(self, t: Time, x: State) -> State:
-        return self.bounded.graph(t, x)[0] if x.ndim == 1 else self._declared(t, x)
+        return self.bounded.graph(t, x)[0] if x.ndim == 1 else self._slope(t, x)
 
     def jacobian(self, t: Time, x: State, seen: Sequence[int]) -> Tensor:
-        """∂F_i/∂x_j for the states i, j that are seen, (*batch, k, k)."""
+        """∂F_i/∂x_j for i, j in seen, (*batch, k, k)."""
         rows = [gradients(lambda t, x, i=i: self(t, x)[..., i], t, x)[1][..., list(seen)] for i in seen]
         return torch.stack(rows, -2)
 
     def linearised(self, goal: State, states: Box, seen: Sequence[int]) -> list[np.ndarray]:
-        """The Jacobian at the goal, of all plants in the middle of P and at its corners; of one without P."""
+        """The Jacobian at the goal; with parameters, that in the middle of P and those at its corners."""
         n = len(goal) - len(self.constants)
-        corners = beside(Box(goal[:n], goal[:n]), states).corners(CORNERS)
+        corners = append_constants(Box(goal[:n], goal[:n]), states).corners(CORNERS)
         at = [goal] if not self.constants else [goal, *corners]
         return [self.jacobian(goal.new_zeros(()), z, seen).detach().numpy() for z in at]
 
 
 class _Coordinates:
-    """Coordinates Y in which a law is asked to contract at a rate, and bounds of the rate at which it does.
+    """Coordinates Y in which a law is to contract at least at the rate `least`, and bounds of its rate there.
 
     Raises:
         LinAlgError: as _inverse.
@@ -103,9 +103,10 @@ class _Coordinates:
         self.bounded = BoundedFunction(lambda t, x: (self.rate(t, x),) * 2, law.domain)
 
     def rate(self, t: Time, x: State) -> PerState:
-        """A lower bound of the least eigenvalue of S = −½ZᵀPJZ and its transpose; Z is near Y⁻¹.
+        """A lower bound of the least eigenvalue of S = −½(ZᵀPJZ + its transpose), where Z ≈ Y⁻¹.
 
-        It is that of Gershgorin's discs. Y makes S diagonal for one plant; of several, Brauer's ovals tell more.
+        It uses Gershgorin's discs. For several plants, where Y cannot make every S diagonal, it also uses Brauer's
+        ovals, which are tighter.
         """
         M = self.Z.mT @ (self.Y.mT @ (self.Y @ (self.law.jacobian(t, x, self.seen) @ self.Z)))
         S, rows = -(M + M.mT) / 2, range(len(self.seen))
@@ -118,26 +119,26 @@ class _Coordinates:
         return torch.maximum(discs, reduce(torch.minimum, ovals))
 
     def on(self, box: Box, seconds: float) -> Contraction | None:
-        """The contraction on a box around the goal; None where it is not seen within the time."""
-        whole = beside(box, self.states)
+        """The contraction on a box around the goal; None if it is not proved in time."""
+        whole = append_constants(box, self.states)
         x = torch.cat([whole.sample(SAMPLES, torch.Generator().manual_seed(0)), whole.corners()])
         with torch.no_grad():
             hopeless = bool((self.rate(x.new_zeros(()), x) < self.least).any())
         if hopeless or not seconds or not self.law.is_continuous_on(whole):
             return None
-        ends, tried = at_time(0.0, whole.lower, whole.upper), Budget(seconds, boxes=BOXES)
-        rate = minimum(self.rate, *ends, tried, enough=self.least, bounded=self.bounded)
+        ends, budget = at_time(0.0, whole.lower, whole.upper), Budget(seconds, boxes=BOXES)
+        rate = minimum(self.rate, *ends, budget, enough=self.least, bounded=self.bounded)
         if not rate >= self.least * (1 - 1e-6):
             return None
-        rate /= 1 + NEAR  # ZᵀPZ is 1 but for as much
+        rate /= 1 + NEAR  # since ZᵀPZ is 1 up to NEAR
         corner = box.reach_from(self.goal[: box.dimension])  # the equilibrium lies in B
         offset = min(self._offset(rate), float(torch.linalg.vector_norm(corner)))
         return Contraction(box, rate, self.Y, offset, self.bounded.fingerprint)
 
     def _offset(self, rate: float) -> float:
-        """‖Y F(x*)‖ / (κ σ), with the bounds of F(x*) and the least singular value σ of Y."""
+        """A bound of ‖Y F(x*)‖ / (κσ), where σ is the least singular value of Y."""
         n = self.states.dimension - len(self.law.constants)
-        at_goal = over_time(beside(Box(self.goal[:n], self.goal[:n]), self.states), 0.0)
+        at_goal = over_time(append_constants(Box(self.goal[:n], self.goal[:n]), self.states), 0.0)
         plants = pieces(*at_goal, [1 + i for i in self.law.constants])
         ((low, high),) = self.law.bounded.bounds(*plants)
         size = torch.maximum(low.abs(), high.abs())[:, list(self.seen)]
@@ -146,7 +147,7 @@ class _Coordinates:
 
 
 def _oval(a: Tensor, b: Tensor, product: Tensor) -> Tensor:
-    """A lower bound of the smaller root λ of (λ − a)(λ − b) = product ≥ 0; where that is above 0, half of it or more.
+    """A lower bound of the smaller root λ of (λ − a)(λ − b) = product ≥ 0; for λ > 0 it is at least λ/2.
 
     λ = 2 (ab − product)/(a + b + s) with s = √((a − b)² + 4 product), and s ≤ a + b where ab ≥ product and a + b > 0.
     """
@@ -161,57 +162,58 @@ def contraction_around(
     seconds: float = 60.0,
     proposed: tuple[Box, Tensor] | None = None,
 ) -> tuple[Contraction | None, float]:
-    """(contraction, slowest): on the largest box around the goal on which the law contracts, of sizes that grow in the
-    shape of D; and the largest real part among the eigenvalues of the linearised law, in 1/s.
+    """Find the largest box around the goal on which the law contracts, among boxes in the shape of D.
 
     Args:
-        goal, states: x* and D, no box is larger than half of it; of plants, beside the middle of P and P.
-        seen: the indices of the states that the law depends on, but for constants.
-        seconds: when to stop.
-        proposed: the (B, Y) that alone are tried; nothing of them is believed.
+        goal, states: x* and D; for several plants, followed by the middle of P and by P.
+        seen: the indices of the states that the law depends on, without constants.
+        seconds: the time limit.
+        proposed: the only (B, Y) to test, for example from a file; the test assumes nothing about them.
 
     Returns:
-        None for the contraction where the linearised law is not stable, or contracts on no box that was tried.
+        (contraction, slowest): the contraction, or None if the linearised law is unstable or contracts on no tested
+        box; and the largest real part among the eigenvalues of the linearised law, in 1/s.
     """
     law, reach, budget = _Law(loop, states), torch.minimum(goal - states.lower, states.upper - goal), Budget(seconds)
     A, *others = law.linearised(goal, states, seen)
-    slowest = float(np.max([_slowest(each) for each in (A, *others)]))  # nan if one is
+    slowest = float(np.max([_largest_real_part(each) for each in (A, *others)]))  # nan if one of them is nan
     own, found = -slowest / 2, None
     if not own > 0:
         return None, slowest
     scale = reach[list(seen)].numpy()
     try:
-        Ys = [proposed[1]] if proposed else [_turned(P, A, scale) for P in _metrics(law, A, goal, seen, scale, own)]
-        at_goal, Y = max(((_rate_seen(Y, (A, *others)), Y) for Y in Ys), key=itemgetter(0))
+        metrics = [] if proposed else _candidate_metrics(law, A, goal, seen, scale, own)
+        Ys = [proposed[1]] if proposed else [_coordinates_of(P, A, scale) for P in metrics]
+        at_goal, Y = max(((_rate_of_linear_laws(Y, (A, *others)), Y) for Y in Ys), key=itemgetter(0))
         coordinates = _Coordinates(law, goal, states, seen, Y, min(LEAST * own, at_goal / 2))
     except np.linalg.LinAlgError:
         return None, slowest
     n = len(goal) - len(loop.system.constants)
     radii = reach.where(torch.isin(torch.arange(len(goal)), torch.tensor(list(seen))), 0.0)[:n] / 2
-    goal, within = goal[:n], first_of(states, n)
+    goal, within = goal[:n], first_states(states, n)
     if proposed is not None:
         box = proposed[0]
         fits = _is_around(box, goal, within, radii * GROWTH**-SIZES)
         return coordinates.on(box, budget.left) if fits and at_goal > 0 else None, slowest
-    low, high = -1, SIZES if at_goal > 0 else 0  # seen to contract at low, and not at high
+    low, high = -1, SIZES if at_goal > 0 else 0  # contraction is proved for size low, and not for size high
     while high - low > 1:
         k = (low + high) // 2
         size = radii * GROWTH ** (k + 1 - SIZES)
-        one = coordinates.on(Box(goal - size, goal + size), budget.left / 2)  # the rest is for smaller boxes
+        one = coordinates.on(Box(goal - size, goal + size), budget.left / 2)  # the other half is for smaller boxes
         low, high, found = (k, high, one) if one is not None else (low, k, found)
     return found, slowest
 
 
 def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Box, seen: Sequence[int]) -> float:
-    """How far from the goal closed loops stay in the end, at most, where u is rounded: ẋ = F̂(x) in place of F(x).
+    """An upper bound of the distance from the goal as t → ∞, where u is rounded: ẋ = F̂(x) instead of F(x).
 
-    While a closed loop is in B, ‖Y(x − x_e)‖ falls at the rate κ, but for ‖Y(F̂ − F)‖. In the end it is therefore within
-    a ball, R = sup ‖Y(F̂ − F)‖/κ over B; hence within another one, over the box around the first; and so on. In norms of
-    x that is R/σ, with the least singular value σ of Y, beside the distance of x_e.
+    In B, d/dt ‖Y(x − x_e)‖ ≤ −κ‖Y(x − x_e)‖ + ‖Y(F̂ − F)‖. As t → ∞ the closed loop therefore comes into the ball of
+    radius R = sup ‖Y(F̂ − F)‖/κ, where the supremum is over B. The supremum over a box around that ball gives a smaller
+    ball, and so on. The bound is R/σ plus the distance of x_e, where σ is the least singular value of Y.
 
     Args:
-        around: the contraction of F, with a set within B that no closed loop of F̂ leaves.
-        goal, states, seen: of contraction_around.
+        around: the contraction of F; B holds a set that no closed loop of F̂ leaves.
+        goal, states, seen: as of contraction_around.
     """
 
     def error(t: Time, x: State) -> tuple[State]:
@@ -224,7 +226,7 @@ def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Bo
     of_ball = torch.linalg.vector_norm(_inverse(Y, len(seen)), dim=-1)
     axes = [1 + i for i in (*seen, *loop.system.constants)]
     for _ in range(NESTED):
-        whole = beside(box, states)
+        whole = append_constants(box, states)
         ((low, high),) = bounded.bounds(*pieces(*over_time(whole, 0.0), axes, PIECES))
         size = torch.maximum(low.abs(), high.abs())[:, chosen] @ Y.abs().mT
         found = float(torch.linalg.vector_norm(size, dim=-1).max()) / around.rate * (1 + NEAR)
@@ -241,32 +243,35 @@ def distance_left(loop: ClosedLoop, around: Contraction, goal: State, states: Bo
     return min(left, float(torch.linalg.vector_norm(around.box.reach_from(goal[:n]))))
 
 
-def _slowest(A: np.ndarray) -> float:
-    """The largest real part among the eigenvalues; nan where there are none."""
+def _largest_real_part(A: np.ndarray) -> float:
+    """The largest real part among the eigenvalues; nan if A is not finite."""
     return float(np.linalg.eigvals(A).real.max()) if np.isfinite(A).all() else math.nan
 
 
 def _is_around(box: Box, goal: State, states: Box, least: State) -> bool:
-    """Whether a box lies in D and reaches at least so far from the goal on each side, and nowhere where that is 0."""
+    """Whether a box lies in D and reaches at least `least` from the goal on each side; along axes of least = 0, it must
+    have width 0.
+    """
     if box.lower.shape != goal.shape:
         return False
     within, room = (states.lower <= box.lower) & (box.upper <= states.upper), (goal - box.lower, box.upper - goal)
     return bool(torch.where(least > 0, within & (torch.minimum(*room) >= least), (room[0] == 0) & (room[1] == 0)).all())
 
 
-def _metrics(
+def _candidate_metrics(
     law: _Law, A: np.ndarray, goal: State, seen: Sequence[int], scale: np.ndarray, own: float
 ) -> list[np.ndarray]:
-    """P in which a linear law A contracts, in states of this scale: at the rate own, where A's eigenvalues have less
-    than −own. Of plants there is V_xx too, as V falls with all of them, if V is any good.
+    """Candidates for P, in states divided by scale: the linear law A contracts in the first one at least at the rate
+    `own`, if its eigenvalues have real parts below −own. For several plants V_xx is another candidate, since a good V
+    falls for all of them.
 
     Raises:
-        LinAlgError: rounding leaves none of it, or overflow.
+        LinAlgError: A is not finite in this scale.
     """
     scaled, eye = A * scale / scale[:, None], np.eye(len(A))
     if not np.isfinite(scaled).all():
-        raise np.linalg.LinAlgError("Expected a finite law in units of D, got another.")
-    with warnings.catch_warnings():  # about rounding: what is found is tried before it is used
+        raise np.linalg.LinAlgError("Expected a finite linearised law in units of D, got infinite entries.")
+    with warnings.catch_warnings():  # about rounding: each P is tested before it is used
         warnings.simplefilter("ignore")
         found = [solve_continuous_lyapunov((scaled + own * eye).T, -eye)]
     if law.constants and law.loop.V is not None:
@@ -277,8 +282,8 @@ def _metrics(
     return found
 
 
-def _turned(P: np.ndarray, A: np.ndarray, scale: np.ndarray) -> Tensor:
-    """Y with YᵀY = P, but for the scale, and ½(M + Mᵀ) diagonal for M = Y A Y⁻¹.
+def _coordinates_of(P: np.ndarray, A: np.ndarray, scale: np.ndarray) -> Tensor:
+    """Y in unscaled states with YᵀY = P and ½(M + Mᵀ) diagonal, where M = Y A Y⁻¹.
 
     Raises:
         LinAlgError: P is not positive definite.
@@ -289,8 +294,8 @@ def _turned(P: np.ndarray, A: np.ndarray, scale: np.ndarray) -> Tensor:
     return torch.from_numpy(turn.T @ L.T / scale)
 
 
-def _rate_seen(Y: Tensor, laws: Sequence[np.ndarray]) -> float:
-    """At which rate some linear laws contract in coordinates Y.
+def _rate_of_linear_laws(Y: Tensor, laws: Sequence[np.ndarray]) -> float:
+    """The rate at which all of some linear laws contract in coordinates Y.
 
     Raises:
         LinAlgError: as _inverse.
@@ -301,15 +306,15 @@ def _rate_seen(Y: Tensor, laws: Sequence[np.ndarray]) -> float:
 
 
 def _inverse(Y: Tensor, k: int) -> Tensor:
-    """Z with ‖YZ − 1‖ < NEAR/10, whatever Y is: rounding of the product is counted.
+    """Z with ‖YZ − 1‖ < NEAR/10; the test counts the rounding of the product.
 
     Raises:
-        LinAlgError: there is none.
+        LinAlgError: Y has no such inverse, or another shape.
     """
     if Y.shape != (k, k) or not bool(Y.isfinite().all()):
-        raise np.linalg.LinAlgError("Expected coordinates of the states, got others.")
+        raise np.linalg.LinAlgError("Expected finite coordinates of k states, got others.")
     Z = torch.from_numpy(np.linalg.inv(Y.numpy()))
     rounding = (k + 2) * torch.finfo(Z.dtype).eps * Y.abs() @ Z.abs()
     if not float(torch.linalg.matrix_norm((Y @ Z - torch.eye(k, dtype=Z.dtype)).abs() + rounding)) < NEAR / 10:
-        raise np.linalg.LinAlgError("Expected coordinates that can be inverted, got others.")
+        raise np.linalg.LinAlgError("Expected invertible coordinates, got others.")
     return Z

@@ -1,4 +1,4 @@
-"""Whether the law keeps to a control set of the user's own: u ∈ U on all of [0, T] × D, as `contains` says it."""
+"""Checks u(t, x) ∈ U on [0, T] × D for a control set U that the user wrote, by its method `contains`."""
 
 import logging
 import operator
@@ -22,23 +22,24 @@ from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, searc
 from lyapnet.prover.taylor import interval_form
 from lyapnet.value.policy import ValuePolicy
 
-POINTS, DESCENTS = 20_000, 20  # at which u ∈ U is held where it is not proved, and steps from the worst of them
-ROUNDING = 1e-6  # of the largest |u|, by which u may leave U
-BOXES, SECONDS = 2000, 20.0  # for the proof
-ASSUMED = "That u stays in U was held at {} points of [0, T] × D, and is not proved: {} is no set that bounds decide."
+POINTS, DESCENTS = 20_000, 20  # where u ∈ U is not proved: points to test, and descent steps from the worst of them
+ROUNDING = 1e-6  # of the largest |u|: how far u may lie outside of U
+BOXES, SECONDS = 2000, 20.0  # limits of the proof
+ASSUMED = "That u stays in U was tested at {} points of [0, T] × D, and is not proved: bounds cannot decide it for {}."
 
 
 def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
-    """Refuse a law that leaves a control set of the user's own somewhere in a box of (t, x).
+    """Refuse a law that leaves a control set U of the user somewhere in a box of (t, x).
 
-    The comparisons of `contains` are bounded on boxes, as the condition is. Where that decides nothing, as for a disk
-    whose rim u reaches, they are held at points, down their slopes from the worst of these.
+    The comparisons of `contains` are bounded on boxes, like the condition. If these bounds decide nothing, for example
+    because u reaches the boundary of a disk, the comparisons are tested at random points and along gradient descents
+    from the worst of them.
 
     Returns:
-        What is assumed of u, as a claim says it; nothing where it is proved, or U is none of the user's own.
+        A sentence for the claim that says what is assumed of u; empty if u ∈ U is proved, or U is built in.
 
     Raises:
-        UsageError: u leaves U; or `contains` and `minimise` cannot be traced.
+        UsageError: u leaves U; or `contains` cannot be traced.
     """
     policy = loop.policy
     if not isinstance(policy, ValuePolicy) or not policy.controls.limited or not reaches_own_code(policy.controls):
@@ -49,10 +50,10 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
     with torch.no_grad():
         u = policy(points[:, 0], points[:, 1:])
         room = ROUNDING * float(u.abs().max())
-        # rounding aside: beside a control of U, in one of these directions, there are others of it
+        # u may lie outside by rounding: it passes if U contains u shifted by `room` in one of these directions
         axes = torch.eye(u.shape[-1]).to(u)
-        near = torch.cat([axes, -axes, axes.new_tensor([[1.0], [-1.0]]).expand(2, len(axes)), 0 * axes[:1]])
-        outside = points[~policy.controls.contains(u[:, None] + room * near).any(-1)]
+        shifts = torch.cat([axes, -axes, axes.new_tensor([[1.0], [-1.0]]).expand(2, len(axes)), 0 * axes[:1]])
+        outside = points[~policy.controls.contains(u[:, None] + room * shifts).any(-1)]
     margin, proved = _margin(policy), False
     if margin is not None and not len(outside):
         try:
@@ -62,14 +63,14 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
         else:
             budget = Budget(SECONDS, boxes=BOXES)
             proved = not len(searched(question, roots(lower[None], upper[None]), budget).frontier.key)
-        question.look(_descended(margin, points, lower, upper))
+        question.look(_descend(margin, points, lower, upper))
         outside, proved = question.outside, proved and not len(question.outside)
     if len(outside):
         with torch.no_grad():
             u = policy(outside[0, 0], outside[0, 1:])
         raise UsageError(
-            f"Expected {name}.minimise(R, b) in the set that contains(u) has, got u = {u.tolist()} outside at "
-            f"(t, x) = {[round(y, 6) for y in outside[0].tolist()]}; mend one of the two."
+            f"Expected {name}.minimise(R, b) in the set that contains(u) describes, got u = {u.tolist()} outside of it "
+            f"at (t, x) = {[round(y, 6) for y in outside[0].tolist()]}; correct one of the two."
         )
     if proved:
         return ""
@@ -80,15 +81,17 @@ def check_controls(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> str:
 
 @dataclass
 class _Inside(Question):
-    """Whether a margin is at least −room on boxes, by Taylor forms or by intervals, whichever know more of it.
+    """Whether a margin is at least −room on boxes, by Taylor forms or by intervals, whichever bound is tighter.
 
-    Intervals know that what is clamped reaches its limits and no further.
+    Intervals are exact at the limits of a clamped control.
     """
 
     margin: Callable[[Tensor, Tensor], Tensor]
     bounded: BoundedFunction | None
     room: float
-    outside: Tensor = field(default_factory=lambda: torch.zeros(0, 0))  # a point where it is less, if one was seen
+    outside: Tensor = field(
+        default_factory=lambda: torch.zeros(0, 0)
+    )  # (t, x) with a smaller margin: one row if one was found, else none
 
     @property
     def settled(self) -> bool:
@@ -105,42 +108,44 @@ class _Inside(Question):
         return boxes[chosen], axis_to_cut(self.bounded, forms[worst], boxes, chosen, worst)
 
     def look(self, points: Tensor) -> None:
-        """Keep the first of some points outside."""
+        """Keep the first of some points whose margin is too small."""
         if len(points) and not self.settled:
             with torch.no_grad():
                 self.outside = points[(self.margin(points[:, 0], points[:, 1:]) < -self.room).any(-1)][:1]
 
 
 def _margin(policy: ValuePolicy) -> Callable[[Tensor, Tensor], Tensor] | None:
-    """(t, x) ↦ by how much each of the comparisons in `contains(u)` holds, all of which have to, (*batch, comparisons);
-    None where `contains` is made of others."""
+    """(t, x) ↦ the margins of the comparisons in `contains(u)`, all of which must be ≥ 0, (*batch, comparisons).
+
+    None if `contains` is not a conjunction of comparisons.
+    """
     like = torch.zeros(policy.system.m, dtype=torch.float64)
     try:
         graph = trace(lambda u: (policy.controls.contains(u),), [like])
-    except Exception as error:  # of any kind: it is the user's
+    except Exception as error:  # user code may raise anything
         raise UsageError(
             f"Expected {type(policy.controls).__name__}.contains(u) that torch can trace, got {error}; write it in "
             "torch operations."
         ) from error
     try:
-        _interpreted(graph, like)
+        _margins_of(graph, like)
     except NotImplementedError:
         return None
 
     def margin(t: Tensor, x: Tensor) -> Tensor:
         u = policy(t, x)
-        return torch.func.vmap(lambda v: _interpreted(graph, v))(u) if u.ndim > 1 else _interpreted(graph, u)
+        return torch.func.vmap(lambda v: _margins_of(graph, v))(u) if u.ndim > 1 else _margins_of(graph, u)
 
     return margin
 
 
-def _interpreted(graph: GraphModule, u: Tensor) -> Tensor:
-    """A graph of truths with the margin of each comparison in the place of its truth: below 0 where it does not hold.
+def _margins_of(graph: GraphModule, u: Tensor) -> Tensor:
+    """Run a graph with the margin of each comparison instead of its truth value: below 0 where it is false.
 
-    Where several have to hold they are kept side by side: no bound is exact of the least of them.
+    The margins of a conjunction are joined into one vector, since bounds of their minimum would be less tight.
 
     Raises:
-        NotImplementedError: a truth is used in another way.
+        NotImplementedError: the graph uses a truth value in another way.
     """
     values, truths, joined = dict[Any, Any](), set[Any](), set[Any]()
     for node in graph.graph.nodes:
@@ -159,7 +164,7 @@ def _interpreted(graph: GraphModule, u: Tensor) -> Tensor:
                     raise NotImplementedError(str(node.target))
                 values[node] = torch.cat([values[source].reshape(-1) for source in sources])
                 joined.add(node)
-            elif name == "eq" and node.args[0] is node.args[1]:  # isfinite asks whether a number is one
+            elif name == "eq" and node.args[0] is node.args[1]:  # isfinite compares a number with itself
                 values[node] = _finite(arguments[0])
             elif is_truth and name in MARGINS and joined.isdisjoint(sources):
                 values[node] = MARGINS[name](*arguments, **keywords)
@@ -171,28 +176,28 @@ def _interpreted(graph: GraphModule, u: Tensor) -> Tensor:
     raise AssertionError("a graph ends with its output")
 
 
-def _apart(a: Tensor, b: Any) -> Tensor:
+def _unequal(a: Tensor, b: Any) -> Tensor:
     if b in (torch.inf, -torch.inf):
         return _finite(a)
-    raise NotImplementedError("ne")  # no margin says by how much two numbers differ and may
+    raise NotImplementedError("ne")  # a ≠ b has no margin
 
 
 def _finite(value: Tensor) -> Tensor:
-    return 1 + 0 * value  # a value with bounds is finite
+    return 1 + 0 * value  # every bounded value is finite
 
 
-# an operator whose result is a truth ↦ by how much it holds; arrangements of truths are those of their margins
+# operator with a boolean result ↦ its margin; operators that rearrange booleans rearrange their margins
 MARGINS: dict[str, Callable[..., Tensor]] = {
     "le": lambda a, b: b - a, "lt": lambda a, b: b - a, "ge": lambda a, b: a - b, "gt": lambda a, b: a - b,
-    "eq": lambda a, b: -(a - b).abs(), "ne": _apart, "isfinite": _finite,
+    "eq": lambda a, b: -(a - b).abs(), "ne": _unequal, "isfinite": _finite,
     "bitwise_or": torch.maximum, "logical_or": torch.maximum, "bitwise_not": torch.neg, "logical_not": torch.neg,
 } | {
     name: getattr(torch.ops.aten, name) for name in ("select", "slice", "view", "unsqueeze", "squeeze", "stack", "cat")
 }  # fmt: skip
 
 
-def _descended(margin: Callable[[Tensor, Tensor], Tensor], points: Tensor, lower: Corner, upper: Corner) -> Tensor:
-    """Where steps down the slope of a margin lead from the points at which it is least."""
+def _descend(margin: Callable[[Tensor, Tensor], Tensor], points: Tensor, lower: Corner, upper: Corner) -> Tensor:
+    """The ends of gradient descents on the least margin, from the points where it is smallest."""
     with torch.no_grad():
         least = margin(points[:, 0], points[:, 1:]).amin(-1).argsort()[:256]
     at, width = points[least], upper - lower

@@ -1,4 +1,4 @@
-"""Certificates of what the controller costs at most, against the optimum."""
+"""Certificates that bound the cost of the controller from above, compared with the optimum."""
 
 import math
 import time
@@ -18,73 +18,73 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.optimality import ratio_of_means
 from lyapnet.evaluation.oracles import RiccatiOracle, oracle_of
 
-SEARCHED = 64  # largest number of states for an oracle that solves each by a search
+SEARCHED = 64  # states at most for an oracle that solves an optimal control problem for each
 
 
 class Inside(NamedTuple):
-    """States of X₀ for which something is proved, V(0, x₀), and what the controller is proved to cost from there."""
+    """States of X₀ for which bounds of the cost are proved, with V(0, x₀) and these bounds."""
 
     x0: State
     value: PerState
-    guaranteed: PerState  # at most
-    low: PerState | None = None  # at least, where that is proved
+    guaranteed: PerState  # upper bound of the cost
+    low: PerState | None = None  # lower bound of the cost, if one is proved
 
 
 class CostCertificate(Certificate):
-    """A bound of what the controller costs, from those states of X₀ for which it is proved."""
+    """An upper bound of the cost of the controller, for the states of X₀ for which it is proved."""
 
-    picture_of_both: ClassVar[str]  # what a report calls the figure of both sides
-    labels_beside: ClassVar[Mapping[str, str]] = {}  # labels in a table of the numbers of `beside`
+    picture_of_both: ClassVar[str]  # file name of the figure of a two-sided certificate
+    labels_beside: ClassVar[Mapping[str, str]] = {}  # table labels of the numbers of `beside`
 
     @cached_property
     @abstractmethod
     def inside(self) -> Inside:
-        """The states for which the bound is proved, among random states of X₀."""
+        """The states for which the bound is proved, among COMPARED random states of X₀."""
 
     @cached_property
     def optimum(self) -> PerState | None:
-        """The optimum of the first of these states, which is beside the claim; None where it is not known in time."""
+        """The optimal costs of the first of these states, for comparison; None if they are not computed in time."""
         return optima_of(self.controller, self.inside.x0, max(1.0, 0.1 * self.options["seconds"]))
 
     @property
     def cost_ratio(self) -> float | None:
-        """Mean guaranteed cost over the mean optimum; None where costs may be of any sign."""
+        """Mean guaranteed cost divided by the mean optimum; None for tasks whose costs may have any sign."""
         if self.optimum is None or not self.controller.problem.has_goal:
             return None
         return ratio_of_means(self.inside.guaranteed[: len(self.optimum)], self.optimum)
 
     @abstractmethod
     def proved(self) -> dict[str, Any]:
-        """The numbers of the claim, without the optimum, which takes an oracle."""
+        """The numbers of the claim, without a comparison with the optimum."""
 
     def numbers(self) -> dict[str, Any]:
         return {**self.proved(), "guaranteed_cost_ratio": self.cost_ratio}
 
     def beside(self, lower: ProvedLowerBound) -> dict[str, Any]:
-        """What else there is to say beside a bound from below."""
+        """Further numbers of a two-sided certificate."""
         return {}
 
-    def why_apart(self, lower: ProvedLowerBound) -> str:
-        """Why the two bounds are not about the same controls; empty where they are."""
+    def mismatch(self, lower: ProvedLowerBound) -> str:
+        """Why the bound from below may not hold for this controller; empty if it does."""
         return ""
 
     @abstractmethod
     def in_short(self, lower: ProvedLowerBound) -> str:
-        """The numbers of both bounds in the title of a figure."""
+        """The numbers of both bounds for the title of a figure."""
 
     @abstractmethod
     def figure_of_both(self, lower: ProvedLowerBound, whose: str, headline: str) -> figures.Figure:
-        """Both bounds, drawn.
+        """A figure of both bounds.
 
         Args:
-            whose: which controls the one from below is about.
+            whose: the controls for which the bound from below holds.
         """
 
 
 def optima_of(controller: Controller, x0: State, seconds: float = math.inf) -> Tensor | None:
-    """The optimum of the first of some states; None where there are no states or no oracle, or it takes longer.
+    """The optimal costs of the first of some states; None without states, without an oracle, or if time runs out.
 
-    IPOPT solves the first SEARCHED states only, starting from the controller's trajectories.
+    IPOPT solves only the first SEARCHED states, starting from the controller's trajectories.
     """
     end = time.monotonic() + seconds
 

@@ -1,4 +1,4 @@
-"""Where closed loops could violate a constraint: the level of V below which none does, and closed loops that do."""
+"""State constraints: the level of V below which no closed loop violates one, and closed loops that do."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,13 +18,13 @@ from lyapnet.task.constraints import Constraints, names_of
 from lyapnet.task.problem import Problem
 from lyapnet.value.calculus import gradients
 
-SHELL = 1e-2  # 0 ≤ h ≤ SHELL, in which h = 0 is looked for
-LOOPS, FINER = 1000, 4  # closed loops, and steps in each Δt
-SURE = 1e-6  # h that is more than an error of theirs
+SHELL = 1e-2  # {h = 0} is bounded as part of {0 ≤ h ≤ SHELL}, which has a volume
+LOOPS, FINER = 1000, 4  # simulated closed loops, and their steps in each Δt
+SURE = 1e-6  # a larger h is a violation, not an error of the simulation
 
 
 class Violation(NamedTuple):
-    """A state of X₀ whose closed loop violates a constraint, as Runge-Kutta steps have it."""
+    """A state of X₀ whose closed loop, simulated by Runge-Kutta steps, violates a constraint."""
 
     x0: list[float]
     t: float
@@ -35,11 +35,11 @@ class Violation(NamedTuple):
 def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], budget: Budget, enough: float) -> float:
     """A lower bound of W on {(t, x): h_j(x) = 0 and ∇h_jᵀ(f + gu) ≥ 0 for some j}; ∞ where that is empty.
 
-    A closed loop that starts with h ≤ 0 and keeps W below it keeps h ≤ 0: if some h_j became positive along it, then
-    h_j = 0 and ḣ_j ≥ 0 at the last time before at which h_j = 0.
+    A closed loop that starts with h ≤ 0 and whose W stays below this bound keeps h ≤ 0: if some h_j became positive,
+    then h_j = 0 and ḣ_j ≥ 0 at the last time before with h_j = 0.
 
     Args:
-        enough: a level beyond which nothing is asked.
+        enough: the search stops when the bound is at least this level.
 
     Raises:
         UsageError: h has kinks or jumps, where it has no gradient.
@@ -72,9 +72,9 @@ def crossing_level(condition: DecreaseCondition, domain: tuple[Corner, Corner], 
 def beginning_level(
     condition: DecreaseCondition, states: tuple[Corners, Corners], budget: Budget, enough: float
 ) -> float:
-    """A lower bound of W where some h_j ≥ SURE on X₀, at t = 0; ∞ where X₀ is proved to keep the constraints.
+    """A lower bound of W(0, ·) on {x ∈ X₀: some h_j ≥ SURE}; ∞ if all of X₀ is proved to satisfy the constraints.
 
-    States of X₀ that violate one may lie between all that are sampled.
+    Sampling is not enough here: a violation may lie between the samples.
     """
     if condition.constraints is None:
         return float("inf")
@@ -95,7 +95,7 @@ def _least(
 
 
 def find_violation(closed_loop: ClosedLoop, problem: Problem, generator: torch.Generator | None) -> Violation | None:
-    """The worst violation of a constraint among closed loops from corners and samples of X₀, if there is one."""
+    """The worst violation of a constraint among simulated closed loops from corners and samples of X₀, or None."""
     constraints, horizon = problem.constraints, problem.horizon
     if constraints is None:
         return None

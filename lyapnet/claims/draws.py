@@ -1,4 +1,4 @@
-"""The draws that were made of one checkpoint, in its run's folder: who draws until a claim pleases has to say so."""
+"""Records the draws made for one checkpoint in its run's folder: choosing the best draw must lower the confidence."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,28 +8,28 @@ from typing import Any, NamedTuple
 from lyapnet.base.files import appending, digest_of_file, read_file
 from lyapnet.base.provenance import RUN_RECORD
 
-DRAWS = "draws.jsonl"  # a line for each claim from sampled states
+DRAWS = "draws.jsonl"  # file with one line for each claim from sampled states
 
 
 class Draws(NamedTuple):
-    """The draws of a checkpoint by claims that ask for the same, which choose between seeds or numbers of states.
+    """The recorded draws of a checkpoint for claims that differ only in the seed or the number of states.
 
     Args:
-        file: where they are recorded; None where there is no run's folder.
-        about: what they are draws of.
+        file: the record; None if the checkpoint is not in a run's folder.
+        about: the checkpoint and the options of the claim.
     """
 
     file: Path | None
     about: Mapping[str, Any]
 
     def others(self, seed: int, samples: int) -> int:
-        """How many other draws there were; a line that cannot be read counts as one."""
-        made = {self._draw(line, i) for i, line in enumerate(self._lines())} - {None, (seed, samples)}
-        # a draw for a sampled claim shows the states of the same seed, and no others
-        return len(made - {("sampled", seed)})
+        """The number of other draws; a line that cannot be read counts as one."""
+        recorded = {self._draw(line, i) for i, line in enumerate(self._lines())} - {None, (seed, samples)}
+        # a sampled claim with the same seed draws the same states
+        return len(recorded - {("sampled", seed)})
 
     def record(self, kind: str, seed: int, samples: int, verdict: str) -> str | None:
-        """Add a draw, unless it is there already; why it could not be recorded."""
+        """Add a draw unless it is there already; return the reason if it cannot be recorded, else None."""
         entry = {**self.about, "kind": kind, "seed": seed, "samples": samples, "verdict": verdict}
         if self.file is None:
             return "not recorded: the checkpoint lies outside a run's folder; other draws are not accounted for"
@@ -45,11 +45,11 @@ class Draws(NamedTuple):
     def _lines(self) -> list[str]:
         try:
             return [] if self.file is None else read_file(self.file).decode(errors="replace").splitlines()
-        except OSError:  # none yet, or none that can be read: then none can be added
+        except OSError:  # no record yet; or it cannot be read, and then `record` fails too
             return []
 
     def _draw(self, line: str, number: int) -> tuple[Any, Any] | None:
-        """What tells a recorded draw apart; None if it is of something else."""
+        """The identity of a recorded draw; None if it is about another checkpoint or other options."""
         try:
             entry = json.loads(line)
             if any(entry[key] != value for key, value in self.about.items()):
@@ -60,18 +60,18 @@ class Draws(NamedTuple):
 
 
 def draws_of(checkpoint: Path, at: Sequence[str] | None = None, **about: Any) -> Draws:
-    """The draws of a checkpoint's content, or of one member of its family, for claims with these further facts."""
-    digest = " ".join([digest_of_file(checkpoint), *sorted(_plain(each) for each in at or [])])
+    """The draws of a checkpoint, or of one member of its family, for claims with these options."""
+    digest = " ".join([digest_of_file(checkpoint), *sorted(_normalise(each) for each in at or [])])
     folders = _folders(checkpoint.resolve())
     return Draws(next((folder / DRAWS for folder in folders), None), {"checkpoint": digest, **about})
 
 
-def _plain(at: str) -> str:
-    """NAME=VALUE with the value as Python writes it: 0.90 is 0.9."""
+def _normalise(at: str) -> str:
+    """NAME=VALUE with the value in Python's notation: 0.90 becomes 0.9."""
     name, _, value = at.partition("=")
     return f"{name}={float(value)!r}"
 
 
 def _folders(checkpoint: Path) -> Iterator[Path]:
-    """The run's folder: above checkpoints/, or above that of a seed."""
+    """The run's folder: the parent of checkpoints/, or the parent of a seed's folder."""
     return (folder for folder in checkpoint.parents[1:3] if (folder / RUN_RECORD).is_file())

@@ -1,4 +1,4 @@
-"""Claims that a function of (t, x) is at most 0 on a whole box: the frame for claims of your own."""
+"""Claims that a function of (t, x) is at most 0 on a whole box: the base class for your own claims."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -12,9 +12,9 @@ from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import PerState, State, Time
 from lyapnet.claims import figures
 from lyapnet.claims.arguments import box_of
-from lyapnet.claims.certificates import FROZEN, Certificate, listed
-from lyapnet.claims.claim import Claim, Run, option
-from lyapnet.claims.funnel import proof_within
+from lyapnet.claims.certificates import FROZEN, Certificate, format_state
+from lyapnet.claims.claim import Claim, Run, option, sides_of
+from lyapnet.claims.funnel import prove_within
 from lyapnet.claims.preconditions import check_states, freeze, over_time, require_dimension
 from lyapnet.controller.controller import Controller
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
@@ -23,13 +23,14 @@ from lyapnet.prover.proof import Proof
 from lyapnet.prover.verdict import Verdict, time_spent
 from lyapnet.task.sets import Box
 
-DRAWN = 2000  # points of a figure
+DRAWN = 2000  # random points in a figure
 
 
 class PointwiseCondition(DecreaseCondition):
-    """c(t, x) ≤ 0 on a whole box. W = 1 is constant, so that boxes have no order; Ẇ = −1 satisfies Ẇ ≤ 0.
+    """c(t, x) ≤ 0 on a whole box, as a DecreaseCondition with the constant W = 1, so that boxes have no order, and
+    Ẇ = −1 ≤ 0.
 
-    In a file its proof has the name of a funnel's; the fingerprints differ.
+    In a file its proof has the same name as that of a funnel; the fingerprints differ.
     """
 
     def __init__(self, closed_loop: ClosedLoop, margin: Callable[[ClosedLoop, Time, State], PerState]):
@@ -46,25 +47,27 @@ class PointwiseCondition(DecreaseCondition):
 
 @dataclass(frozen=True, kw_only=True)
 class Everywhere(Claim):
-    """c(t, x) ≤ 0 at every t ∈ [0, T] and every x in a set of states D: proved on boxes, or refuted by a point.
+    """c(t, x) ≤ 0 for all t ∈ [0, T] and all x in a set of states D: proved on boxes, or refuted by a point.
 
-    A claim of your own says what c is, and what it means; the search, the counterexample, the kept proof, the table,
-    the report and the figure are those of every proof.
+    A subclass defines c and describes its meaning. It inherits the search, the counterexample, the kept proof, the
+    table, the report and the figure.
     """
 
-    states: Box | Sequence[Sequence[float]] | None = option(None, "The set D; X₀ if none.", flag="set")
+    states: Box | Sequence[Sequence[float]] | None = option(
+        None, "The set D; X₀ if none.", flag="set", check=sides_of
+    )  # fmt: skip
 
     @abstractmethod
     def margin(self, loop: ClosedLoop, t: Time, x: State) -> PerState:
-        """c(t, x) in torch, of one state (n,) and of batches, with loop.system, loop.cost, loop.policy and loop.V."""
+        """c(t, x) in torch, for one state (n,) and for batches, from loop.system, loop.cost, loop.policy and loop.V."""
 
     @abstractmethod
     def in_words(self) -> str:
-        """What it means that c ≤ 0 everywhere."""
+        """The meaning of c ≤ 0, as a sentence."""
 
     @abstractmethod
     def in_formulas(self) -> list[str]:
-        """c ≤ 0, written out."""
+        """c ≤ 0 as formulas, one for each line."""
 
     def establish(self, controller: Controller, run: Run) -> "EverywhereCertificate":
         states = box_of(self.states) or box_of(controller.initial_states)
@@ -77,7 +80,7 @@ class Everywhere(Claim):
         check_states(condition, domain)
         memory.check()
         set_up = run.budget.elapsed
-        proof = proof_within(
+        proof = prove_within(
             condition, domain, float("inf"), run.budget, generator=run.generator, report=run.report, keep=run.keep
         )
         found = Margins(claim=self, proof=proof, states=states, set_up=set_up)
@@ -86,7 +89,7 @@ class Everywhere(Claim):
 
 @dataclass(frozen=True, kw_only=True)
 class Margins:
-    """What is proved of c on [0, T] × D."""
+    """The result of a proof that c ≤ 0 on [0, T] × D."""
 
     claim: Everywhere
     proof: Proof
@@ -100,7 +103,7 @@ class Margins:
 
 
 class EverywhereCertificate(Certificate):
-    """c ≤ 0 on all of [0, T] × D, or where it is not."""
+    """A proof of c ≤ 0 on [0, T] × D, or a point where it fails."""
 
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
@@ -132,17 +135,21 @@ class EverywhereCertificate(Certificate):
             return f"Nothing is proved. The claim was: {self.claim.claim.in_words()}"
         return (
             f"{self.claim.claim.in_words()} It is proved for every t up to T = {self.controller.horizon.duration:g} s "
-            f"and every x ∈ D, for the operations that these functions were traced to, of this fingerprint; {FROZEN}"
+            f"and every x ∈ D, for the traced operations of these functions, which have this fingerprint; {FROZEN}"
         )
 
     def in_formulas(self) -> list[str]:
         return self.claim.claim.in_formulas()
 
-    def of_the_verdict(self) -> str:
+    def verdict_text(self) -> str:
         found = self.claim.proof.counterexample
         if found is not None:
-            return f"At t = {found.t:.6g} s, x = {listed(found.x)} it fails by {found.condition:.3g}."
-        return "Bounds say so on boxes that cover all of it." if self.verdict == "certified" else "Boxes are undecided."
+            return f"At t = {found.t:.6g} s, x = {format_state(found.x)} it fails by {found.condition:.3g}."
+        return (
+            "Bounds prove it on boxes that cover [0, T] × D."
+            if self.verdict == "certified"
+            else "Some boxes are undecided."
+        )
 
     def figure(self) -> figures.Figure:
         D, T = self.claim.states, self.controller.horizon.duration

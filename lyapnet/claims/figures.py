@@ -24,63 +24,63 @@ from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 
-Slices = ProvedFunnel | ProvedRegion  # what is drawn in slices
+Sliced = ProvedFunnel | ProvedRegion  # claims that are drawn in slices
 
-NEAR = 0.02  # of D's widths: how far from a slice a point is still shown as one of it
+NEAR = 0.02  # of D's widths: a point this close to a slice is drawn as a point of it
 
 
 # Sampled states
 
 
 def sampled_states(claim: CountedSuccesses, initial_states: Box, labels: Sequence[str], headline: str) -> Figure:
-    """Which sampled states of X₀ succeed, and in what the others fail, in the plane of its two widest components.
+    """The sampled states of X₀ by their outcome, projected onto the plane of the two widest components of X₀.
 
-    The other components of the states are left out: a projection. With one free component, numbers of states in bins.
+    If only one component has a width, a histogram.
 
     Args:
         labels: names of the states with their units.
-        headline: what is claimed.
+        headline: the claim in a few words.
     """
-    axes_shown = widest_axes(initial_states)
+    axes = widest_axes(initial_states)
     figure = Figure(figsize=(5.6, 4.6), layout="constrained")
     panel = figure.subplots()
     parts = _outcomes(claim)
-    if len(axes_shown) == 1:
-        x = [numpy_of(states[:, axes_shown[0]]) for states, _, _, _ in parts]
-        low, high = (float(side[axes_shown[0]]) for side in (initial_states.lower, initial_states.upper))
+    if len(axes) == 1:
+        x = [numpy_of(states[:, axes[0]]) for states, _, _, _ in parts]
+        low, high = (float(side[axes[0]]) for side in (initial_states.lower, initial_states.upper))
         colours = [colour for _, _, colour, _ in parts]
         panel.hist(x, 40, range=(low, high) if high > low else None, stacked=True, color=colours)
         panel.set_ylabel("states")
     else:
         size = 2 + 60 / len(claim.states) ** 0.5
         for states, _, colour, marker in parts:
-            x, y = (numpy_of(states[:, i]) for i in axes_shown)
+            x, y = (numpy_of(states[:, i]) for i in axes)
             panel.plot(
                 x, y, marker, color=colour, markersize=size if marker == "." else 4, markeredgewidth=0.8,
                 alpha=0.5 if marker == "." else 0.9, rasterized=True,
             )  # fmt: skip
-        panel.add_patch(_rectangle(initial_states, axes_shown, linewidth=0.8))
-        panel.set_ylabel(labels[axes_shown[1]])
-    panel.set_xlabel(labels[axes_shown[0]])
-    shape = "s" if len(axes_shown) == 1 else None
+        panel.add_patch(_rectangle(initial_states, axes, linewidth=0.8))
+        panel.set_ylabel(labels[axes[1]])
+    panel.set_xlabel(labels[axes[0]])
+    shape = "s" if len(axes) == 1 else None
     handles = [
         Line2D([], [], color=colour, marker=shape or marker, linestyle="none", label=f"{name}: {len(states)}")
         for states, name, colour, marker in parts
     ]
     legend_below(figure, handles, columns=2)
-    hidden = [_name(labels[i]) for i in range(len(labels)) if initial_states.widths[i] > 0 and i not in axes_shown]
+    hidden = [_name(labels[i]) for i in range(len(labels)) if initial_states.widths[i] > 0 and i not in axes]
     projected = f"\nprojected along {', '.join(hidden)}" if hidden else ""
     panel.set_title(f"{headline}{projected}", fontsize=8)
     return figure
 
 
 def _outcomes(claim: CountedSuccesses) -> list[tuple[Tensor, str, str, str]]:
-    """(states, what became of them, colour, marker), successes first so that failures are drawn over them.
+    """(states, outcome, colour, marker) for each outcome; successes come first, so that failures are drawn over them.
 
-    A state that fails in more than one event counts for the first of them.
+    A state that fails in several ways is counted for the first of them.
     """
     decrease, terminal, cost, constraints, success = claim.held.unbind(-1)
-    parts, left = [(claim.states[success], "success", SKY, ".")], ~success
+    parts, remaining = [(claim.states[success], "success", SKY, ".")], ~success
     limits = claim.tolerances
     failed = (
         ("violates a constraint", GREY, "D"),
@@ -89,8 +89,8 @@ def _outcomes(claim: CountedSuccesses) -> list[tuple[Tensor, str, str, str]]:
         (f"J > {1 + limits.cost:g} V(0, x₀)", VERMILION, "x"),
     )
     for style, held in zip(failed, (constraints, terminal, decrease, cost), strict=True):
-        parts.append((claim.states[left & ~held], *style))
-        left = left & held
+        parts.append((claim.states[remaining & ~held], *style))
+        remaining = remaining & held
     return [part for part in parts if len(part[0])]
 
 
@@ -105,17 +105,18 @@ def funnel(
     labels: Sequence[str],
     constraints: Constraints | None = None,
 ) -> Figure:
-    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and what was left undecided.
+    """The proved funnel {V(t, ·) ≤ ρ + δt} with X₀, D, the counterexample and the undecided boxes.
 
-    One state is drawn over time; two at five times; more at t = 0 and t = T in slices through the goal, along the pairs
-    of the four widest states of X₀, all other states as there. States that the claim leaves out are not shown.
+    A funnel of one state is drawn over time, and one of two states at five times. A funnel of more states is drawn at
+    t = 0 and t = T in slices through the goal: one slice for each pair of the four widest states of X₀, with the other
+    states at the goal. Ignorable states are not shown.
 
     Args:
-        V, initial_states, goal, labels: of the states that the claim is about.
-        constraints: what they exclude is hatched.
+        labels: names of the states with their units.
+        constraints: the states that they exclude are hatched.
     """
-    seen = _seen(claim)
-    figure, panels = _slices(claim, initial_states)
+    seen = _shown_states(claim)
+    figure, panels = _panels_of(claim, initial_states)
     handles: dict[str, Artist] = {}
     for panel, pair in panels:
         if len(seen) == 1:
@@ -143,30 +144,30 @@ def region(
     constraints: Constraints | None = None,
     paths: Tensor | None = None,
 ) -> Figure:
-    """The proved region {V(0, ·) ≤ ρ} in D with X₀, the counterexample and what was left undecided.
+    """The proved region {V(0, ·) ≤ ρ} in D with X₀, the counterexample and the undecided boxes.
 
-    More than two states are drawn in slices through the goal, as those of a funnel.
+    More than two states are drawn in slices through the goal, like a funnel.
 
     Args:
-        V, initial_states, goal, labels, constraints: as of a funnel.
-        paths: (times, k, n), closed loops that begin in the region, where it is one of two states.
+        labels, constraints: as in funnel.
+        paths: closed loops that begin in the region, (times, k, n), for a region of two states.
     """
-    figure, panels = _slices(claim, initial_states)
+    figure, panels = _panels_of(claim, initial_states)
     handles: dict[str, Artist] = {}
     levels = _levels_of_region(claim)
     for panel, pair in panels:
-        if len(_seen(claim)) == 1:
+        if len(_shown_states(claim)) == 1:
             _draw_over_state(panel, claim, V, initial_states, goal, labels, levels, handles)
             continue
         _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
         if paths is not None:
             x, y = (numpy_of(paths[..., k]) for k in pair)
-            name = f"closed loops under u(0, x){', not pushed' if claim.disturbance is not None else ''}"
+            name = f"closed loops under u(0, x){', undisturbed' if claim.disturbance is not None else ''}"
             name += "" if claim.plants is None else ", each of another plant"
             line, *_ = panel.plot(x, y, color=GREY, linewidth=0.7, label=name)
             handles.setdefault("closed loops", line)
     legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
-    what = "region of attraction" if claim.disturbance is None else "region, however pushed"
+    what = "region of attraction" if claim.disturbance is None else "region under disturbances"
     what += "" if claim.plants is None else " of each plant"
     share = f"{floored(claim.region_share)} of D, {floored(claim.volume_share)} of X₀ in the {what}"
     proved = claim.rho > -float("inf")
@@ -178,8 +179,8 @@ def _draw_over_state(
     panel: Axes, claim: ProvedRegion, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
     levels: Sequence["Level"], handles: dict[str, Artist],
 ) -> None:  # fmt: skip
-    """V(0, ·) over the one state that a claim is about, with levels and X₀."""
-    (i,) = _seen(claim)
+    """V(0, ·) over the only state, with levels and X₀."""
+    (i,) = _shown_states(claim)
     states = goal.repeat(401, 1)
     states[:, i] = torch.linspace(float(claim.states.lower[i]), float(claim.states.upper[i]), 401).to(goal)
     with torch.no_grad():
@@ -195,7 +196,7 @@ def _draw_over_state(
 
 
 def _levels_of_region(claim: ProvedRegion) -> list["Level"]:
-    """The region, where it ends with a disturbance, and the level that is wanted where it is higher."""
+    """The levels to draw: ρ; c, if there is a disturbance; and the level for all of X₀, if it is higher than ρ."""
     name = "V(0, x) ≤ ρ: never left" + (", and attracted" if claim.disturbance is None else "")
     proved = [Level(0.0, claim.rho, BLUE, name, proved=True)] if claim.rho > -float("inf") else []
     if proved and claim.disturbance is not None:
@@ -211,12 +212,12 @@ def two_sided(
     value: Tensor, guaranteed: Tensor | None, least: Tensor, optimum: Tensor | None, headline: str,
     whose: str = "any control",
 ) -> Figure:  # fmt: skip
-    """Both bounds over V(0, x₀), relative to it, with the optima between them.
+    """Both bounds of the cost divided by V(0, x₀), over V(0, x₀), with the optima.
 
     Args:
-        value, guaranteed, least: V(0, x₀) of some states and the bounds there, (k,); None where there is none.
-        optimum: of the first few of them.
-        whose: of which controls the bound from below is.
+        value, guaranteed, least: V(0, x₀) and the two bounds for some states, (k,); None without a bound from above.
+        optimum: the optimal costs of the first of these states.
+        whose: the controls for which the bound from below holds.
     """
     figure = Figure(figsize=(5.6, 4.2), layout="constrained")
     panel = figure.subplots()
@@ -232,7 +233,7 @@ def two_sided(
         some, best = numpy_of(value[first]), numpy_of(optimum[first])
         panel.plot(some, best / some, ".", color="black", markersize=3, label="optimum of the steps of Δt")
     panel.axhline(1, color=GREY, linewidth=0.6)
-    middle = len(V) // 4  # cheaper states, where δT and κ weigh most, may leave the picture
+    middle = len(V) // 4  # states of smaller V, where δT and κ dominate the bounds, may lie outside of the picture
     if len(V):
         panel.set_ylim(min(0.9, lower[middle] / V[middle]), max(1.1, upper[middle] / V[middle]))
         panel.set_xlim(0, V[-1])
@@ -243,7 +244,7 @@ def two_sided(
 
 
 def margins(t: Tensor, c: Tensor, found: Counterexample | None, headline: str) -> Figure:
-    """c over time at random points (t, x), with 0, which it must not exceed, and where it does."""
+    """c at random points (t, x) over time, the limit 0, and the counterexample if there is one."""
     figure = Figure(figsize=(5.6, 4.2), layout="constrained")
     panel = figure.subplots()
     panel.plot(numpy_of(t), numpy_of(c), ".", color=BLUE, markersize=2, rasterized=True)
@@ -255,11 +256,11 @@ def margins(t: Tensor, c: Tensor, found: Counterexample | None, headline: str) -
     return figure
 
 
-# Slices
+# Sliced
 
 
 class Level(NamedTuple):
-    """A sublevel set of V(t, ·) that is drawn."""
+    """A sublevel set of V(t, ·) to draw."""
 
     t: float
     level: float
@@ -268,15 +269,15 @@ class Level(NamedTuple):
     proved: bool
 
 
-def _seen(claim: Slices) -> list[int]:
-    """The states that a claim is about."""
+def _shown_states(claim: Sliced) -> list[int]:
+    """The indices of the states that are not ignorable."""
     return [k for k in range(claim.states.dimension) if k not in claim.left_out]
 
 
-def _slices(claim: Slices, initial_states: Box) -> tuple[Figure, list[tuple[Axes, tuple[int, int]]]]:
-    """A figure, and a panel for each pair of states that is shown."""
-    seen = _seen(claim)
-    pairs = [(seen[0], seen[-1])] if len(seen) <= 2 else list(combinations(_telling(initial_states, seen), 2))
+def _panels_of(claim: Sliced, initial_states: Box) -> tuple[Figure, list[tuple[Axes, tuple[int, int]]]]:
+    """A figure with one panel for each pair of states to show."""
+    seen = _shown_states(claim)
+    pairs = [(seen[0], seen[-1])] if len(seen) <= 2 else list(combinations(_widest_states(initial_states, seen), 2))
     columns = min(3, len(pairs))
     rows = -(-len(pairs) // columns)
     size = (5.6, 5.2) if len(pairs) == 1 else (3.6 * columns, 3.1 * rows + 0.7)
@@ -285,10 +286,10 @@ def _slices(claim: Slices, initial_states: Box) -> tuple[Figure, list[tuple[Axes
 
 
 def _draw_slice(
-    panel: Axes, claim: Slices, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
+    panel: Axes, claim: Sliced, V: Value, initial_states: Box, goal: State, labels: Sequence[str],
     pair: tuple[int, int], levels: Sequence[Level], handles: dict[str, Artist], constraints: Constraints | None,
 ) -> None:  # fmt: skip
-    """One slice; what is new in it is added to the handles of the legend."""
+    """Draw one slice, and add new entries to the handles of the legend."""
     i, j = pair
     others = [k for k in range(len(labels)) if k not in (*pair, *claim.left_out)]
     grid = [torch.linspace(float(claim.states.lower[k]), float(claim.states.upper[k]), 201) for k in pair]
@@ -312,16 +313,16 @@ def _draw_slice(
         (points,) = panel.plot(x, y, ".", color=GREY, markersize=2, alpha=0.5, label=name, linestyle="none")
         handles.setdefault(name, points)
     if claim.counterexample is not None:
-        _mark(panel, claim.counterexample, claim.states, goal, pair, handles)
+        _draw_counterexample(panel, claim.counterexample, claim.states, goal, pair, handles)
     (star,) = panel.plot(*goal[[i, j]].tolist(), "*", color=GREEN, markersize=6, label="goal", linestyle="none")
     handles.setdefault("goal", star)
     panel.set(xlim=axes[0][[0, -1]], ylim=axes[1][[0, -1]], xlabel=labels[i], ylabel=labels[j])
     if others:
-        panel.set_title(f"slice: {_held([_name(labels[k]) for k in others], goal[others])}", fontsize=8)
+        panel.set_title(f"slice: {_fixed_values([_name(labels[k]) for k in others], goal[others])}", fontsize=8)
 
 
 def _draw_excluded(panel: Axes, grid: Sequence[np.ndarray], worst: np.ndarray, handles: dict[str, Artist]) -> None:
-    """Where some h > 0, hatched."""
+    """Hatch {x: some h_j(x) > 0}."""
     if worst.max() > 0:
         levels = [0, max(1.0, 2 * float(worst.max()))]
         panel.contourf(*grid, worst, levels=levels, colors=["none"], hatches=["////"])
@@ -331,7 +332,7 @@ def _draw_excluded(panel: Axes, grid: Sequence[np.ndarray], worst: np.ndarray, h
 
 
 def _draw_violation(panel: Axes, claim: ProvedFunnel, pair: tuple[int, int], handles: dict[str, Artist]) -> None:
-    """Where the closed loop begins that violates a constraint."""
+    """Mark the initial state of a closed loop that violates a constraint."""
     if claim.violation is not None:
         name = f"a closed loop from here violates one, t = {claim.violation.t:.3g} s"
         x, y = (claim.violation.x0[k] for k in pair)
@@ -340,7 +341,7 @@ def _draw_violation(panel: Axes, claim: ProvedFunnel, pair: tuple[int, int], han
 
 
 def _levels(claim: ProvedFunnel, fine: bool) -> list[Level]:
-    """The funnel at some times, and the level that is wanted."""
+    """The funnel at some times; and the level for all of X₀, if it is higher than ρ."""
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
     funnel = [
@@ -354,10 +355,10 @@ def _levels(claim: ProvedFunnel, fine: bool) -> list[Level]:
 def _draw_sublevel(
     panel: Axes, grid: Sequence[np.ndarray], excess: np.ndarray, colour: str, filled: bool, style: str = "-"
 ) -> None:
-    """The set in which the excess is at most 0."""
+    """Draw the set {excess ≤ 0}."""
     if filled and excess.min() <= 0:
         panel.contourf(*grid, excess, levels=[excess.min() - 1, 0], colors=[colour], alpha=0.25)
-    if excess.min() < 0 < excess.max():  # else matplotlib warns that there is no line to draw
+    if excess.min() < 0 < excess.max():  # otherwise matplotlib warns that there is no line to draw
         panel.contour(*grid, excess, levels=[0], colors=[colour], linewidths=1.2, linestyles=style)
 
 
@@ -379,27 +380,27 @@ def _draw_over_time(
     panel.set(xlim=(0, claim.duration), ylim=(low, high), xlabel="time (s)", ylabel=label)
 
 
-def _held(names: Sequence[str], values: State) -> str:
-    """Where a slice holds the states that it does not show: a = b = 0, or a = 1, b = 2."""
+def _fixed_values(names: Sequence[str], values: State) -> str:
+    """The values of the states that a slice does not show, such as "a = b = 0" or "a = 1, b = 2"."""
     if not values.any():
         return f"{' = '.join(names)} = 0"
     return ", ".join(f"{name} = {value:.3g}" for name, value in zip(names, values.tolist(), strict=True))
 
 
-def _mark(
+def _draw_counterexample(
     panel: Axes, found: Counterexample, states: Box, goal: State, pair: tuple[int, int], handles: dict[str, Artist]
 ) -> None:
-    """The counterexample: filled near the slice, hollow where only its projection lies in it."""
-    widths, away = states.widths.tolist(), (torch.tensor(found.x).to(goal) - goal).abs().tolist()
-    near = all(x <= NEAR * widths[k] for k, x in enumerate(away) if k not in pair)
+    """Mark the counterexample: filled near the slice, hollow if only its projection lies in it."""
+    widths, distances = states.widths.tolist(), (torch.tensor(found.x).to(goal) - goal).abs().tolist()
+    near = all(distance <= NEAR * widths[k] for k, distance in enumerate(distances) if k not in pair)
     name = f"condition fails, t = {found.t:.3g} s" + ("" if near else " (projected onto the slice)")
     style = {"markerfacecolor": VERMILION if near else "none", "color": VERMILION, "markersize": 6}
     (point,) = panel.plot(found.x[pair[0]], found.x[pair[1]], "X", label=name, linestyle="none", **style)
     handles.setdefault(name, point)
 
 
-def _telling(initial_states: Box, seen: Sequence[int]) -> list[int]:
-    """The four widest states of X₀ among some, in their order."""
+def _widest_states(initial_states: Box, seen: Sequence[int]) -> list[int]:
+    """The four widest states of X₀ among `seen`, in their order."""
     widest = initial_states.widths.argsort(descending=True, stable=True).tolist()
     return sorted([i for i in widest if i in seen][:4])
 

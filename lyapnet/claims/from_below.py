@@ -1,4 +1,4 @@
-"""Certificates of what any control costs at least, alone or beside a bound of the controller's cost from above."""
+"""Certificates of a lower bound of the cost of any control, alone or beside an upper bound of the controller's cost."""
 
 import math
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from torch import Tensor
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.claims import figures
 from lyapnet.claims.arguments import COMPARED
-from lyapnet.claims.certificates import FROZEN, Certificate, listed
+from lyapnet.claims.certificates import FROZEN, Certificate, format_state
 from lyapnet.claims.costs import Inside, optima_of
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.evaluation.optimality import ratio_of_means
@@ -19,7 +19,7 @@ from lyapnet.prover.verdict import Verdict, time_spent
 
 
 class LowerBoundCertificate(Certificate):
-    """What any control costs at least, and how far what is guaranteed of a controller lies above it."""
+    """A lower bound of the cost of any control, and its distance from an upper bound of the controller's cost."""
 
     kind: str = "lower"
     picture: str = "lower_bound.png"
@@ -46,12 +46,12 @@ class LowerBoundCertificate(Certificate):
 
     @property
     def holds_for(self) -> str:
-        """Which controls the bound from below is about."""
+        """The controls for which the bound holds."""
         return "every control" if self.claim.everywhere else "controls that keep the state in D"
 
     @property
     def whose(self) -> str:
-        """The same, in a figure."""
+        """The same in the words of a figure."""
         return "any control" if self.claim.everywhere else "any control that stays in D"
 
     def numbers(self) -> dict[str, Any]:
@@ -59,12 +59,12 @@ class LowerBoundCertificate(Certificate):
         optimum = optima_of(self.controller, inside.x0, max(1.0, 0.1 * self.options["seconds"]))
         return {
             "beta": claim.beta, "delta": claim.delta, **self.proved(), "seconds": claim.seconds,
-            **self.around(inside, optimum),
+            **self.compare_optima(inside, optimum),
         }  # fmt: skip
 
     @cached_property
     def inside(self) -> Inside:
-        """States of X₀, with no bound from above."""
+        """Random states of X₀, with ∞ as the bound from above."""
         x0 = self.controller.initial_states.sample(COMPARED, stream(1, CERTIFICATION))
         value = self.controller.value(0.0, x0).double()
         return Inside(x0, value, torch.full_like(value, torch.inf))
@@ -75,13 +75,13 @@ class LowerBoundCertificate(Certificate):
             "lower_set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
             "lower_level": claim.level if proved else None, "lower_level_wanted": claim.wanted,
             "lower_excess": claim.excess if proved else None, "holds_for": self.holds_for if proved else None,
-            "lower_reason": self._why_not(), "lower_boxes": claim.boxes,
+            "lower_reason": self._reason, "lower_boxes": claim.boxes,
             "lower_remaining_volume": claim.remaining_volume, "lower_fingerprint": claim.fingerprint,
             "lower_counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
         }  # fmt: skip
 
-    def against(self, inside: Inside) -> dict[str, Any]:
-        """What the two bounds say of some states; nothing where one of them says nothing."""
+    def compare_bounds(self, inside: Inside) -> dict[str, Any]:
+        """Ratio and gap of the two bounds for some states; empty if one bound is missing."""
         least, guaranteed = self.claim.least_cost(inside.value), inside.guaranteed
         if not len(least) or not bool(least.isfinite().all()) or not (mean := float(least.mean())) > 0:
             return {}
@@ -90,33 +90,35 @@ class LowerBoundCertificate(Certificate):
             "certified_gap": float((guaranteed - least).max()) / mean,
         }
 
-    def around(self, inside: Inside, optimum: Tensor | None) -> dict[str, Any]:
-        """How the two bounds lie around the optima of the first of these states, as far as an oracle knows them."""
+    def compare_optima(self, inside: Inside, optimum: Tensor | None) -> dict[str, Any]:
+        """A comparison of both bounds with the optimal costs of the first of these states; empty without optima."""
         least, guaranteed = self.claim.least_cost(inside.value), inside.guaranteed
         if optimum is None or not len(least) or not bool(least.isfinite().all()):
             return {}
-        some, known = slice(len(optimum)), optimum.isfinite()
-        between = (least[some] <= optimum) & (optimum <= guaranteed[some])
+        first, known = slice(len(optimum)), optimum.isfinite()
+        between = (least[first] <= optimum) & (optimum <= guaranteed[first])
         return {
             "optima_between": float(between[known].double().mean()) if known.any() else None,
-            "lower_cost_ratio": ratio_of_means(least[some], optimum),
+            "lower_cost_ratio": ratio_of_means(least[first], optimum),
         }
 
-    def _why_not(self) -> str | None:
+    @property
+    def _reason(self) -> str | None:
+        """The reason why the bound is not certified."""
         claim = self.claim
         if claim.verdict == "certified":
             return None
         if claim.level >= claim.wanted:
-            return "e, what βV(T, ·) has beyond φ, or q below 0, leaves nothing: allow more seconds, or lower V there"
+            return "e is as large as the bound: βV(T, ·) exceeds φ, or q < 0; allow more seconds, or lower V(T, ·)"
         if claim.verdict == "falsified" or claim.counterexample is not None:
-            return "V rises faster than a control pays for: claim less of V, allow more --delta, or train its residual"
+            return "V rises faster than ℓ along some control: choose a smaller beta or a larger delta, or train on"
         return f"{time_spent(claim.set_up)}: allow more"
 
     def in_words(self, before: str = "") -> str:
-        """The same as of any certificate.
+        """As Certificate.in_words.
 
         Args:
-            before: how it goes on from a bound from above.
+            before: the words that join it to a bound from above.
         """
         claim = self.claim
         if claim.level == -math.inf:
@@ -124,7 +126,7 @@ class LowerBoundCertificate(Certificate):
         return (
             f"{before}{self.holds_for} cost at least min(β V(0, x₀) − δT, c) − e, with "
             f"β = {claim.beta!r}, c = {claim.level!r} and e = {claim.excess!r}, from each x₀ ∈ D. It is about the "
-            f"operations that f, g, ℓ, R and V were traced to; {FROZEN}"
+            f"traced operations of f, g, ℓ, R and V; {FROZEN}"
         )
 
     def in_formulas(self) -> list[str]:
@@ -137,16 +139,16 @@ class LowerBoundCertificate(Certificate):
             f"∫ℓ dt + φ(x(T)) ≥ min({beta} V(0, x₀) − {delta} · {T}, {c}) − {e}  for {self.holds_for}",
         ]
 
-    def of_the_verdict(self, before: str = "The verdict is") -> str:
+    def verdict_text(self, before: str = "The verdict is") -> str:
         found = self.claim.counterexample
-        where = "" if found is None else f" At t = {found.t:.6g} s, x = {listed(found.x)} the second fails."
+        where = "" if found is None else f" At t = {found.t:.6g} s, x = {format_state(found.x)} the second fails."
         below = {"certified": "it does", "falsified": "it does not", "unknown": "undecided within the budget"}
         return (
             f"{before} on the claim that the bound from below holds on all of X₀: {below[self.claim.verdict]}.{where}"
         )
 
     def headline(self, verdict: Verdict, ratio: float | None, numbers: str) -> str:
-        """The title of a figure of both sides."""
+        """The title of a figure of both bounds."""
         means = "" if ratio is None else f": from above / from below {ratio:.3f}, means over states of X₀"
         whose = f"; {self.holds_for}" if self.claim.level > -math.inf else ""
         return f"{verdict}{means}\n{numbers}{whose}"

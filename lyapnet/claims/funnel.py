@@ -1,4 +1,4 @@
-"""The sound claim: a funnel that closed loops do not leave, and the cost that it guarantees."""
+"""The sound claim: a funnel that no closed loop leaves, and the cost that it guarantees."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from lyapnet.claims.preconditions import (
     freeze,
     over_time,
     require_continuous,
-    without,
+    slice_at_zero,
 )
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
@@ -39,11 +39,13 @@ from lyapnet.task.constraints import names_of
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
-LEVELS = 60.0  # seconds for max V(0, ·) on X₀ and min W on the boundary of D, and at constraints, at the most …
-LEAST, SHARE_OF_LEVELS = 1.0, 0.3  # … in seconds at the least, and of the budget
-SHARE_OF_FINISH = 0.15  # of what is left, for the share of X₀ and κ
-KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command goes on."
-NOT_KEPT = "Stopped while certifying: nothing is kept without --keep FILE."
+# a level is max V(0, ·) on X₀, or min W on the boundary of D or at a constraint; the time for each of them:
+LEVELS = 60.0  # seconds at most
+LEAST = 1.0  # seconds at least
+SHARE_OF_LEVELS = 0.3  # share of the remaining budget
+SHARE_OF_FINISH = 0.15  # share of the remaining budget that is reserved for the share of X₀ and κ
+KEPT = "Stopped while certifying: the proof so far is kept in {}, and the same command resumes it."
+NOT_KEPT = "Stopped while certifying: the proof is lost; the option keep writes it to a file."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,49 +54,49 @@ class ProvedFunnel:
 
         V_t + V_xᵀ(f + g u) + α ℓ(x, u) ≤ δ,     that is Ẇ ≤ −αℓ,
 
-    and W > ρ on the boundary of D. With constraints that is so where h(x) ≤ 0, and W > ρ wherever h_j(x) = 0 and
-    ∇h_jᵀ(f + gu) ≥ 0, so that no closed loop with W ≤ ρ comes to violate one. Hence each closed loop that starts in D
-    with h(x₀) ≤ 0 and V(0, x₀) ≤ ρ keeps h(x(t)) ≤ 0 and V(t, x(t)) ≤ ρ + δt, stays in D up to T, and has
+    and W > ρ on the boundary of D. With constraints the inequality holds where h(x) ≤ 0, and W > ρ wherever h_j(x) = 0
+    and ∇h_jᵀ(f + gu) ≥ 0, so that no closed loop with W ≤ ρ begins to violate one. Hence each closed loop that starts
+    in D with h(x₀) ≤ 0 and V(0, x₀) ≤ ρ keeps h(x(t)) ≤ 0 and V(t, x(t)) ≤ ρ + δt, stays in D up to T, and has
 
         α ∫ℓ dt ≤ V(0, x₀) − V(T, x(T)) + δT,
         J(x₀) = ∫ℓ dt + φ(x(T)) ≤ (V(0, x₀) + δT)/α + κ,   κ = max of φ(x) − V(T, x)/α where W(T, x) ≤ ρ.
 
-    States that neither f, g, ℓ, φ nor V and u depend on are left out: D is all of ℝ along them. There {W ≤ ρ} is a
-    cylinder whose points are all alike, a closed loop can leave it through its side only, and what is proved on the
-    slice at 0 holds on every slice. (Such a state does not escape: its derivative is bounded along with the others.)
-    The parameters of a family stay what they are: along them D is their range, and no closed loop leaves it there.
+    States on which none of f, g, ℓ, φ, V and u depends are ignorable: D is all of ℝ along them. {W ≤ ρ} is then a
+    cylinder along these states, a closed loop can leave it only through its side, and a proof on the slice where they
+    are 0 holds on every slice. (Such a state cannot go to infinity in finite time: its derivative is bounded.)
+    The parameters of a family are constant: along them D is their range, and no closed loop leaves it there.
 
-    The verdict is about the funnel of ρ = `wanted`, which holds all of X₀. Whatever the verdict, `rho` is the largest
-    level that was proved, a funnel of its own, and `volume_share` how much of X₀ it holds.
+    The verdict is about the funnel of ρ = `wanted`, which contains all of X₀. For every verdict, `rho` is the largest
+    proved level, and {V(0, ·) ≤ rho} contains the share `volume_share` of X₀.
     """
 
     alpha: float
     delta: float  # in cost per second
     duration: float  # T in s
     states: Box  # D
-    rho: float  # the largest level proved; −∞ where there is none
-    wanted: float  # max V(0, ·) on X₀, or up to 0.1 % more: the ρ that does for all of it
-    least: float  # the largest V(0, ·) that was seen on X₀: no lower ρ does
-    volume_share: float  # of X₀ with V(0, ·) ≤ ρ; a lower bound
-    terminal_excess: float  # κ; an upper bound
+    rho: float  # the largest proved level; −∞ if none is proved
+    wanted: float  # an upper bound of max V(0, ·) on X₀, at most 0.1 % above it: the ρ of a funnel with all of X₀
+    least: float  # the largest V(0, ·) among samples of X₀: a lower bound of this ρ
+    volume_share: float  # a lower bound of the share of X₀ with V(0, ·) ≤ ρ
+    terminal_excess: float  # an upper bound of κ
     counterexample: Counterexample | None
     boxes: int
     seconds: float
-    remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above the funnel
-    undecided: Points  # centres (t, x) of boxes that remain
-    left_out: list[int]  # ignorable states, on which nothing depends: D has no bounds for them, and is drawn at 0
-    fingerprint: str = ""  # of (V̇ + αℓ − δ, W) as it was traced: the operations and numbers that the claim is about
-    proof_seconds: float = 0.0  # those of the boxes alone
-    constraints: Sequence[str] = ()  # what h(x) ≤ 0 asks for
-    crossing: float = float("inf")  # a lower bound of W where a closed loop could come to violate one
-    violation: Violation | None = None  # of a closed loop from X₀
-    disturbance: State | None = None  # w: it is so for ẋ = f + gu + w(t), |w_i(t)| ≤ w_i, then with Ẇ at its worst
+    remaining_volume: float  # undecided share of [0, T] × D; all of it lies above the funnel
+    undecided: Points  # centres (t, x) of undecided boxes
+    left_out: list[int]  # the ignorable states; D has no bounds along them
+    fingerprint: str = ""  # of the traced operations and numbers of (V̇ + αℓ − δ, W)
+    proof_seconds: float = 0.0  # for the boxes, without set-up and levels
+    constraints: Sequence[str] = ()  # the constraints h(x) ≤ 0 in words
+    crossing: float = float("inf")  # a lower bound of W where a closed loop could begin to violate a constraint
+    violation: Violation | None = None  # a closed loop from X₀ that violates a constraint, if one was found
+    disturbance: State | None = None  # w: the claim holds for all ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i
     set_up: float = 0.0  # seconds of the budget before the first box
-    assumed: str = ""  # of u, beside what is proved
+    assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that a funnel holds all of X₀, and that no closed loop from there violates a constraint."""
+        """The verdict on the claim that a funnel contains X₀ and that no closed loop from X₀ violates a constraint."""
         if self.violation is not None:
             return "falsified"
         found = self.counterexample
@@ -102,19 +104,19 @@ class ProvedFunnel:
 
     @property
     def reason(self) -> str | None:
-        """Why the verdict is unknown, and what may help."""
+        """The reason for the verdict unknown, and advice."""
         if self.verdict != "unknown":
             return None
         if self.remaining_volume > 0:
-            return f"{time_spent(self.set_up)}: allow more, or go on with a kept proof"
+            return f"{time_spent(self.set_up)}: allow more, or resume a kept proof"
         if self.counterexample is not None:
-            return "the condition fails close to what X₀ needs"
+            return "the condition fails close to the level that X₀ needs"
         if self.crossing <= self.wanted:
-            return "closed loops of the funnel that X₀ needs may cross a constraint or begin beyond it, as time allowed"
+            return "it is not proved in time that closed loops of the funnel around X₀ satisfy the constraints"
         return "the funnel meets the boundary of D: choose a larger set"
 
     def guaranteed_cost(self, value: PerState) -> PerState:
-        """The bound of J(x₀) from V(0, x₀), (*batch,); infinite outside the funnel."""
+        """The upper bound of J(x₀) as a function of V(0, x₀), (*batch,); ∞ outside of the funnel."""
         bound = (value + self.delta * self.duration) / self.alpha + self.terminal_excess
         return torch.where(value <= self.rho, bound, torch.inf)
 
@@ -133,50 +135,50 @@ def prove_funnel(
     degree: int = 2,
     disturbance: State | None = None,
 ) -> ProvedFunnel:
-    """The largest funnel that can be proved within a budget; it is not sought beyond what X₀ needs.
+    """Prove the largest funnel that a budget allows, up to the one that contains X₀.
 
     Args:
-        closed_loop: with the law of a V; its float64 copy is what the claim is about.
-        problem: whose X₀, T and goal are meant.
-        states: D; by default a box around where samples of V are low enough.
-        report, keep, replay, degree: of prove.
+        closed_loop: a closed loop with a V; the claim is about its float64 copy.
+        problem: gives X₀, T, the goal and the constraints.
+        states: D; by default a box around {W ≤ max V(0, ·) on X₀}, estimated from samples.
+        report, keep, replay, degree: as in prove.
         disturbance: w, (n,): the claim is about every closed loop ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i.
 
     Raises:
-        UsageError: α, δ or D do not fit; or the closed loop has an operator without a rule.
-        Interrupted: Ctrl-C or SIGTERM; says what is kept.
+        UsageError: α, δ or D are unsuitable; or the closed loop has an operator without a bound.
+        Interrupted: Ctrl-C or SIGTERM; the message says whether the proof was kept.
     """
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     if disturbance is not None:
-        _require_pushed(disturbance, problem)
+        _require_usable_disturbance(disturbance, problem)
     condition = DecreaseCondition(
         copied(closed_loop).requires_grad_(False), alpha, delta, problem.constraints, disturbance
     )
     duration = problem.horizon.duration
-    left_out, initial_states, wanted, D, domain, sides, levels, assumed = setting_of(
+    left_out, initial_states, wanted, D, domain, sides, levels, assumed = find_setting(
         condition, problem, duration, states, budget, report
     )
     x_low, x_high = initial_states.lower, initial_states.upper
     needed = just_above(wanted)
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
-    begin = beginning_level(condition, at_time(0.0, x_low, x_high), for_levels(budget), just_above(needed))
-    crossing = min(begin, crossing_level(condition, domain, for_levels(budget), just_above(needed)))
+    begin = beginning_level(condition, at_time(0.0, x_low, x_high), budget_for_level(budget), just_above(needed))
+    crossing = min(begin, crossing_level(condition, domain, budget_for_level(budget), just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
     level = min(needed, just_below(min(rim, crossing)))
-    proof = proof_within(
+    proof = prove_within(
         condition, domain, level, budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=degree,
     )  # fmt: skip
     rho = wanted if proof.level >= needed else proof.level
     found = proof.counterexample
-    if found is None and rim <= needed and budget.left:  # proved, and so searched, was less than what X₀ needs
+    if found is None and rim <= needed and budget.left:  # the proof went only up to a level below the one that X₀ needs
         found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
     share = 1.0 if rho >= wanted else share_of(condition.V, x_low, x_high, rho, budget)
     excess = _terminal_excess(condition, D, duration, rho, budget)
     return ProvedFunnel(
         alpha=alpha, delta=delta, duration=duration, states=D, rho=rho, wanted=wanted,
-        least=largest_seen(condition.V, initial_states), volume_share=share, terminal_excess=excess,
+        least=largest_sample(condition.V, initial_states), volume_share=share, terminal_excess=excess,
         counterexample=found, boxes=proof.boxes, seconds=set_up + proof.seconds,
         remaining_volume=proof.remaining_volume, undecided=proof.undecided, left_out=left_out,
         fingerprint=proof.fingerprint, proof_seconds=proof.seconds, constraints=names, crossing=crossing,
@@ -185,37 +187,39 @@ def prove_funnel(
 
 
 def require_disturbance(w: State, n: int) -> None:
-    """Refuse what is no largest push on each of n states."""
+    """Refuse a w that is not n finite numbers ≥ 0."""
     if w.shape != (n,) or not bool(((w >= 0) & w.isfinite()).all()):
         raise UsageError(
             f"Expected disturbances ≥ 0 of {n} states, got {w.tolist()}; give the largest |w| in units of ẋ."
         )
 
 
-def _require_pushed(w: State, problem: Problem) -> None:
-    """Refuse a disturbance that is none, or that nothing is proved about."""
+def _require_usable_disturbance(w: State, problem: Problem) -> None:
+    """Refuse a disturbance that is malformed, or for which no funnel can be proved."""
     require_disturbance(w, problem.system.n)
     if problem.constraints is not None:
-        raise UsageError("Expected no state constraints beside disturbances, got some; their crossing is not bounded.")
+        raise UsageError("Expected no state constraints with disturbances, got some; leave one of the two out.")
     moved = [problem.system.state_names[i] for i in problem.system.constants if w[i] > 0]
     if moved:
-        raise UsageError(f"Expected parameters of a family that stay what they are, got pushes on {', '.join(moved)}.")
+        raise UsageError(
+            f"Expected no disturbance of the parameters of a family, got {', '.join(moved)}; leave them out."
+        )
 
 
 class Setting(NamedTuple):
-    """Where a claim is about, without the states that nothing depends on."""
+    """The sets and levels of a claim, with ignorable states fixed at 0."""
 
     left_out: list[int]
     initial_states: Box  # X₀
-    wanted: float  # max W(0, ·) on X₀, or up to 0.1 % more
+    wanted: float  # an upper bound of max W(0, ·) on X₀, at most 0.1 % above it
     states: Box  # D
     domain: tuple[Corner, Corner]  # [0, T] × D
     sides: tuple[Corners, Corners]  # [0, T] × the boundary of D
-    levels: Budget  # what is left of the one for levels
-    assumed: str  # of u, beside what is proved
+    levels: Budget  # for the levels
+    assumed: str  # a sentence on what is assumed of u; empty if nothing is
 
 
-def setting_of(
+def find_setting(
     condition: DecreaseCondition,
     problem: Problem,
     duration: float,
@@ -223,28 +227,28 @@ def setting_of(
     budget: Budget,
     report: Callable[[Progress], None] | None = None,
 ) -> Setting:
-    """The setting of a claim about a condition, whose V and h are traced for it, once.
+    """Trace V and h of a condition once, check the condition, and find the sets and levels of a claim about it.
 
     Args:
-        duration: T, or 0 for what holds at t = 0 alone.
-        states: D; by default a box around where samples of W are low enough.
-        budget: of the claim; a share of it is for levels.
-        report: is told what is done.
+        duration: T; or 0 for a claim about t = 0 only.
+        states: D; by default a box around {W ≤ max W(0, ·) on X₀}, estimated from samples.
+        budget: the budget of the claim; a share of it is for levels.
+        report: called with the name of each stage.
 
     Raises:
-        UsageError: D does not fit; or the condition is none that bounds can speak of.
+        UsageError: D is unsuitable; or the condition cannot be bounded.
     """
     tell(report, budget, "calling and tracing f, g, the cost, V and u")
     memory = freeze(condition, over_time(problem.initial_states, duration))
     constants, goal = condition.closed_loop.system.constants, problem.goal.double()
     left_out = ignorable_states(condition.closed_loop, problem.constraints)
-    X0 = without(problem.initial_states, left_out)
+    X0 = slice_at_zero(problem.initial_states, left_out)
     require_continuous(condition.V, X0.lower, X0.upper)
-    levels = for_levels(budget)
+    levels = budget_for_level(budget)
     tell(report, budget, "the largest V on X₀")
     wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
-    tell(report, budget, "the set D, and whether the law and the condition are as they should be on it")
-    states = without(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
+    tell(report, budget, "the set D; checks of the law and the condition on it")
+    states = slice_at_zero(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
@@ -255,42 +259,45 @@ def setting_of(
     return Setting(left_out, X0, wanted, states, domain, faces(*domain, axes), levels, assumed)
 
 
-def for_levels(budget: Budget) -> Budget:
-    """The share of a budget for levels."""
+def budget_for_level(budget: Budget) -> Budget:
+    """The budget for one level: a share of what is left, within limits."""
     return Budget(min(LEVELS, max(LEAST, SHARE_OF_LEVELS * budget.left)), chunk=budget.chunk)
 
 
-def proof_within(
+def prove_within(
     condition: DecreaseCondition,
     domain: tuple[Corner, Corner],
     level: float,
     budget: Budget,
     **options: Any,
 ) -> Proof:
-    """What is proved of the condition, in what a budget leaves but for a share of it, unless someone stops it.
+    """Prove the condition within the remaining budget, without the share that is reserved for what follows.
 
     Args:
         options: of prove.
+
+    Raises:
+        Interrupted: Ctrl-C or SIGTERM.
     """
     search = replace(budget, seconds=(1 - SHARE_OF_FINISH) * budget.left, started=time.monotonic())
-    tell(options.get("report"), budget, "tracing the condition, and seeking where it fails")
+    tell(options.get("report"), budget, "tracing the condition, and searching for a counterexample")
     with signals_taken(search.stop.ask):
         proof = prove(condition, domain, level, search, stop_at_counterexample=False, **options)
     if search.stop.asked:
         keep = options.get("keep")
         raise Interrupted(KEPT.format(keep) if keep else NOT_KEPT, 130)
-    tell(options.get("report"), budget, "what follows from the proof")
+    tell(options.get("report"), budget, "volumes and bounds that follow from the proof")
     return proof
 
 
 def enclosing_box(
     W: Value, initial_states: Box, goal: State, duration: float, level: float, constants: Sequence[int] = ()
 ) -> Box:
-    """A box around X₀ and around {W(t, ·) ≤ level}, as far as rays from the goal show it; a guess, checked afterwards.
+    """A box around X₀ and {W(t, ·) ≤ level}, estimated along rays from the goal; the proof checks it later.
 
-    Along 400 rays at 9 times the first radius is sought at which W exceeds the level; twice, the second time in units
-    of what the first gave. No ray is followed further than 30 times the largest component of X₀. Along the constants
-    the box is X₀.
+    Along 400 rays at 9 times, the first radius with W > level is found. This is done twice: the second time each axis
+    is scaled by the first result. Rays end at 30 times the largest distance of X₀ from the goal along an axis. Along
+    the constants the box is X₀.
     """
     generator = torch.Generator().manual_seed(0)
     lower, upper = initial_states.lower.double(), initial_states.upper.double()
@@ -299,7 +306,7 @@ def enclosing_box(
     inner = initial_states.reach_from(goal).double()
     largest = inner.max() if inner.max() > 0 else torch.ones(())
     reach = torch.full_like(inner, float(largest))
-    times = torch.linspace(0, duration, 9, dtype=torch.float64).unique()  # one, where T = 0
+    times = torch.linspace(0, duration, 9, dtype=torch.float64).unique()  # one time if T = 0
     radii = torch.logspace(-2, 1.5, 71, dtype=torch.float64)
     for _ in range(2):
         rays = torch.randn(400, len(reach), generator=generator, dtype=torch.float64)
@@ -313,20 +320,20 @@ def enclosing_box(
 
 
 def _reach_below(W: Value, t: Tensor, goal: State, points: Tensor, level: float) -> State:
-    """How far rays of points (radii, rays, n) go from the goal, component by component, before W(t, ·) > level."""
+    """The largest distance from the goal along each axis before W(t, ·) > level, on rays of points (radii, rays, n)."""
     reach, below = torch.zeros_like(goal), torch.arange(points.shape[1])
     for some in points.split(8):
         if not len(below):
             break
         with torch.no_grad():
             above = W(t.expand(len(some), len(below)), goal + some[:, below]) > level
-        still = above.cumsum(0) == 0
-        reach = torch.maximum(reach, torch.where(still[..., None], some[:, below].abs(), 0.0).amax((0, 1)))
-        below = below[still[-1]]
+        inside = above.cumsum(0) == 0
+        reach = torch.maximum(reach, torch.where(inside[..., None], some[:, below].abs(), 0.0).amax((0, 1)))
+        below = below[inside[-1]]
     return reach
 
 
-def largest_seen(V: Value, initial_states: Box) -> float:
+def largest_sample(V: Value, initial_states: Box) -> float:
     """The largest V(0, ·) among the corners of X₀ and 10 000 of its states."""
     states = torch.cat([initial_states.corners(), initial_states.sample(10_000, torch.Generator().manual_seed(0))])
     with torch.no_grad():
@@ -334,7 +341,7 @@ def largest_seen(V: Value, initial_states: Box) -> float:
 
 
 def share_of(V: Value, x_low: State, x_high: State, rho: float, budget: Budget) -> float:
-    """A lower bound of the share by volume of a box of states with V(0, ·) ≤ ρ."""
+    """A lower bound of the share of a box of states, by volume, in which V(0, ·) ≤ ρ."""
     if rho == -float("inf"):
         return 0.0
     lower, upper = at_time(0.0, x_low, x_high)
@@ -342,7 +349,7 @@ def share_of(V: Value, x_low: State, x_high: State, rho: float, budget: Budget) 
 
 
 def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
-    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ; infinite where there is no ρ."""
+    """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ; ∞ if ρ = −∞."""
     if rho == -float("inf"):
         return float("inf")
     budget = Budget(budget.left, chunk=budget.chunk)

@@ -1,4 +1,4 @@
-"""What the file of a region's proof proposes to prove again."""
+"""Reads the file of a region's proof: the numbers that are to be proved again."""
 
 import math
 from collections.abc import Sequence
@@ -13,29 +13,29 @@ from lyapnet.base.types import State
 from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.task.sets import Box
 
-NEW_FILE = "take another file"
+NEW_FILE = "choose another file"
 REMEDY = f"allow more seconds, or {NEW_FILE}"
 
 
 class KeptRegion(NamedTuple):
-    """What a file proposes to prove again of a region, and what it says is proved."""
+    """The numbers of a region in a file: those to prove again, and the result that it records."""
 
     path: Path
     decay: float  # λ in 1/s
-    states: Box  # D; without width along states that nothing depends on
-    parameters: dict[str, list[float]]  # the ends of P by name; empty where it is about one plant
-    contracting: tuple[Box, Tensor] | None  # (B, Y); none with a disturbance
+    states: Box  # D; of width 0 along ignorable states
+    parameters: dict[str, list[float]]  # the bounds of P by name; empty for one plant
+    contracting: tuple[Box, Tensor] | None  # (B, Y); None with a disturbance
     disturbance: State | None  # w
     hole: float  # c
-    wanted: float  # the level that was tried
-    rho: float  # the level that is proved, as it says
+    wanted: float  # the level up to which the proof searched
+    rho: float  # the proved level, as recorded
     seconds: float  # of the search
 
     def require(self, decay: float, disturbance: State | None, n: int, parameters: Sequence[str] = ()) -> None:
-        """Refuse another λ, w or other parameters than those of the file: before anything is traced.
+        """Refuse λ, w or names of parameters that differ from those of the file.
 
         Args:
-            disturbance: of n states, beside zeros.
+            disturbance: w of n states, followed by zeros for parameters.
             parameters: their names.
         """
         if self.parameters.keys() != {*parameters}:
@@ -47,10 +47,10 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the disturbance of {str(self.path)!r}, got another; {NEW_FILE}.")
 
     def require_set(self, states: Box, parameters: Sequence[str] = ()) -> None:
-        """Refuse another D or P than those of the file.
+        """Refuse D or P that differ from those of the file.
 
         Args:
-            states: beside the ends of P.
+            states: D × P.
             parameters: their names, in order.
         """
         n = states.dimension - len(parameters)
@@ -62,22 +62,22 @@ class KeptRegion(NamedTuple):
             raise UsageError(f"Expected the λ and D of {str(self.path)!r}, got others; {NEW_FILE}.")
 
     def level(self, contracts: bool, rim: float) -> float:
-        """The level that was tried, where V is above it on the boundary of D.
+        """The level up to which the proof searched, if V is above it on the boundary of D.
 
         Args:
-            contracts: whether the law is seen to contract on B, where it has to.
+            contracts: whether contraction on B was proved again, or is not needed.
         """
-        where = f"V > ρ = {self.wanted!r} on the boundary of D" if contracts else "F that contracts on B"
+        fact = f"V > ρ = {self.wanted!r} on the boundary of D" if contracts else "F that contracts on B"
         if not contracts or not self.wanted < rim:
-            raise UsageError(f"Expected {where} of {str(self.path)!r}, got no bounds that say so; {REMEDY}.")
+            raise UsageError(f"Expected {fact} of {str(self.path)!r}, got bounds that do not prove it; {REMEDY}.")
         return self.wanted
 
 
 def kept_region(path: Path) -> KeptRegion:
-    """What the file of a region's proof says; nothing is bounded.
+    """Read the file of a region's proof; nothing is bounded.
 
     Raises:
-        UsageError: it is another file.
+        UsageError: the file is not one of a region's proof.
     """
     content = part_of(read_proofs(path), "region", path, NEW_FILE)
     with refusing(path):
@@ -91,7 +91,7 @@ def kept_region(path: Path) -> KeptRegion:
         if "disturbance" in of:
             w = torch.tensor(of["disturbance"], dtype=torch.float64)[:n]
             if not bool((w > 0).any()):
-                raise ValueError("a disturbance that is none")
+                raise ValueError("a disturbance of zeros")
         else:
             lowest, highest, Y = (torch.tensor(side, dtype=torch.float64) for side in (*of["box"], of["Y"]))
             contracting = Box(lowest, highest), Y
@@ -100,14 +100,14 @@ def kept_region(path: Path) -> KeptRegion:
 
 
 def _ranges(names: object, lower: list[float], upper: list[float]) -> dict[str, list[float]]:
-    """The ends of P by name.
+    """The bounds of P by name.
 
     Raises:
-        ValueError: they are none.
+        ValueError: names or bounds are invalid.
     """
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError("names that are none")
+        raise ValueError("invalid names of parameters")
     ranges = {name: [low, high] for name, low, high in zip(names, lower, upper, strict=True)}
     if len(ranges) < len(names) or not all(-math.inf < low <= high < math.inf for low, high in ranges.values()):
-        raise ValueError("parameters that are none")
+        raise ValueError("invalid bounds of parameters")
     return ranges

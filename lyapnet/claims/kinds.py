@@ -1,15 +1,23 @@
-"""The kinds of claim that lyapnet makes: their options, and what establishes them, which is imported when it is asked.
+"""The kinds of claims: their options and `establish`, which imports torch and the proof only when it is called.
 
-A kind of your own is a class like these, with its certificate beside it; nothing else has to know it.
+A new kind is a class like these with a certificate of its own; no other code needs to know it.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from lyapnet.base.errors import UsageError
-from lyapnet.claims.claim import Claim, Run, flag_of, is_same, option
+from lyapnet.claims.claim import (
+    Claim,
+    Run,
+    check_disturbance,
+    check_parameters,
+    flag_of,
+    is_same,
+    option,
+    sides_of,
+)
 
 if TYPE_CHECKING:  # as in claim.py
     from lyapnet.claims.certificates import Certificate
@@ -21,13 +29,13 @@ if TYPE_CHECKING:  # as in claim.py
 RADIUS = "Success at T needs ‖x(T) − goal‖ within it; not asked for if none."
 SLACK = "Slack in cost per second; 0.5 % of the mean ℓ on X₀ if none."
 SET = "The set D, as lower:upper,…; found if none."
-PUSH = "The largest push on the derivative of a state; may be given again."
-NORM, RATE = "give it in the norm of x", "give it in cost per second"  # what to do about another number
+DISTURBANCE = "The largest push on the derivative of a state; may be given again."
+NORM, RATE = "give it in the norm of x", "give it in cost per second"  # remedies in error messages
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sampled(Claim):
-    """The share of some states of X₀ whose closed loop succeeds. It proves no more."""
+    """The share of sampled states of X₀ whose closed loop succeeds; nothing is said of other states."""
 
     kind: ClassVar[str] = "sampled"
     means: ClassVar[Sequence[str]] = ()
@@ -48,7 +56,7 @@ class Sampled(Claim):
 
 @dataclass(frozen=True, kw_only=True)
 class Statistical(Claim):
-    """A share of X₀ whose closed loops succeed, with a confidence."""
+    """A lower bound of the share of X₀ whose closed loops succeed, with a confidence."""
 
     kind: ClassVar[str] = "statistical"
     means: ClassVar[Sequence[str]] = ()
@@ -77,9 +85,9 @@ class Statistical(Claim):
 
 @dataclass(frozen=True, kw_only=True)
 class Funnel(Claim):
-    """A funnel that no closed loop leaves up to T, and a bound of the cost of each that starts in it: proved.
+    """A funnel that no closed loop leaves up to T, and a bound of the cost from each state in it: proved.
 
-    The conditions are those of lyapnet.claims.funnel.ProvedFunnel.
+    lyapnet.claims.funnel.ProvedFunnel states the conditions.
     """
 
     kind: ClassVar[str] = "sound"
@@ -90,11 +98,11 @@ class Funnel(Claim):
         remedy="V can pay for no more than the whole running cost",
     )  # fmt: skip
     delta: float | None = option(None, SLACK, at_least=0, remedy=RATE)
-    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX")
-    disturbance: Mapping[str, float] | None = option(None, PUSH, metavar="STATE=W")
+    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
+    disturbance: Mapping[str, float] | None = option(None, DISTURBANCE, metavar="STATE=W", check=check_disturbance)
 
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, pushes_of, slack_of
+        from lyapnet.claims.arguments import box_of, disturbance_of, slack_of
         from lyapnet.claims.funnel import prove_funnel
         from lyapnet.claims.least_cost import DEGREE
         from lyapnet.claims.preconditions import require_goal
@@ -104,18 +112,18 @@ class Funnel(Claim):
         found = prove_funnel(
             controller.closed_loop, controller.problem, self.alpha, slack_of(self.delta, controller),
             box_of(self.states), run.budget, run.generator, run.report, run.keep, degree=DEGREE if run.two_sided else 2,
-            disturbance=pushes_of(self.disturbance, controller),
+            disturbance=disturbance_of(self.disturbance, controller),
         )  # fmt: skip
         return SoundCertificate(controller, found, run.options(self))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Region(Claim):
-    """A region of attraction of the receding law u(0, x), for ever: proved.
+    """A region of attraction of the receding law u(0, x), for all times: proved.
 
-    With a disturbance it is a set that no closed loop leaves, and a smaller one that each comes to; with parameters it
-    is so for every plant whose constant parameters lie between these ends. The conditions are those of
-    lyapnet.claims.region.ProvedRegion.
+    With a disturbance, it is a set that no closed loop leaves, and a smaller set that each closed loop enters and never
+    leaves. With parameters, it holds for every plant whose constant parameters lie in the given intervals.
+    lyapnet.claims.region.ProvedRegion states the conditions.
     """
 
     kind: ClassVar[str] = "region"
@@ -123,30 +131,22 @@ class Region(Claim):
     decay: float | None = option(
         None, "λ, at which V(0, ·) has to fall, in 1/s; 1 % of 1/T if none.", above=0, remedy="give it in 1/s"
     )  # fmt: skip
-    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX")
-    disturbance: Mapping[str, float] | None = option(None, PUSH, metavar="STATE=W")
+    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
+    disturbance: Mapping[str, float] | None = option(None, DISTURBANCE, metavar="STATE=W", check=check_disturbance)
     parameters: Mapping[str, Sequence[float]] | None = option(
         None, "A parameter of the plant that may lie anywhere between; u and V stay. May be given again.",
-        flag="parameter", metavar="NAME=LOWER:UPPER",
+        flag="parameter", metavar="NAME=LOWER:UPPER", check=check_parameters,
     )  # fmt: skip
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name, ends in (self.parameters or {}).items():
-            if len(ends) != 2 or not -math.inf < ends[0] <= ends[1] < math.inf:
-                raise UsageError(
-                    f"Expected --parameter {name}=LOWER:UPPER, LOWER ≤ UPPER and finite, got {ends}; correct it."
-                )
-
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
-        from lyapnet.claims.arguments import box_of, pushes_of
+        from lyapnet.claims.arguments import box_of, disturbance_of
         from lyapnet.claims.plants import plants_of
         from lyapnet.claims.region import prove_region
         from lyapnet.claims.region_certificate import RegionCertificate
 
         found = prove_region(
             controller.closed_loop, controller.problem, self.decay, box_of(self.states), run.budget, run.generator,
-            run.report, run.keep, disturbance=pushes_of(self.disturbance, controller),
+            run.report, run.keep, disturbance=disturbance_of(self.disturbance, controller),
             plants=plants_of(controller, self.parameters) if self.parameters else None,
         )  # fmt: skip
         return RegionCertificate(controller, found, run.options(self))
@@ -154,9 +154,9 @@ class Region(Claim):
 
 @dataclass(frozen=True, kw_only=True)
 class Tube(Claim):
-    """Where all closed loops from X₀ go up to T, and what they cost: proved.
+    """A tube around all closed loops from X₀ up to T, and bounds of their costs: proved.
 
-    The conditions are those of lyapnet.claims.tubes.tube.ProvedTube.
+    lyapnet.claims.tubes.tube.ProvedTube states the conditions.
     """
 
     kind: ClassVar[str] = "tube"
@@ -175,15 +175,15 @@ class Tube(Claim):
 
 
 SHARED = {"beta": "alpha", "delta": "delta", "states": "states"}
-"""A field of a bound from below ↦ the same of a claim from above, where that has it."""
+"""Field of LowerBound ↦ the matching field of the claim from above, if it has one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LowerBound(Claim):
-    """What any control costs at least, from each state of X₀: proved by V.
+    """A lower bound of the cost of any control from each state of X₀: proved by V.
 
-    Beside a funnel or a tube it makes a certificate from two sides; there β, δ and D are those of the funnel where none
-    are given. The conditions are those of lyapnet.claims.least_cost.ProvedLowerBound.
+    Together with a funnel or a tube it gives a two-sided certificate; there β, δ and D are those of the funnel, unless
+    they are given. lyapnet.claims.least_cost.ProvedLowerBound states the conditions.
     """
 
     kind: ClassVar[str] = "lower"
@@ -193,34 +193,34 @@ class LowerBound(Claim):
         remedy="more than V is no bound from below",
     )  # fmt: skip
     delta: float | None = option(None, SLACK, at_least=0, remedy=RATE)
-    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX")
+    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
 
     def beside(self, above: Claim) -> "LowerBound":
-        """The same with the share, the slack and the set of a claim from above that has them.
+        """A copy with β, δ and D of a claim from above, if that claim has them.
 
         Raises:
-            UsageError: it was given others than that claim, or some where that claim finds its own.
+            UsageError: this claim has other values than the claim from above.
         """
-        taken = {mine: getattr(above, its) for mine, its in self._shared_with(above).items()}
-        for name, value in taken.items():
+        shared = {own: getattr(above, other) for own, other in self._shared_with(above).items()}
+        for name, value in shared.items():
             own = getattr(self, name)
             if own is not None and not is_same(own, value):
                 raise UsageError(f"Expected the {name} of the {above.kind} claim beside it, got another; leave it out.")
-        return replace(self, **taken)
+        return replace(self, **shared)
 
     def options_beside(self, above: Claim) -> dict[str, Any]:
-        """Its options that the claim from above has not."""
+        """The options that the claim from above does not have."""
         shared = {flag_of(f) for f in fields(self) if f.name in self._shared_with(above)}
         return {flag: value for flag, value in self.options.items() if flag not in shared}
 
     def _shared_with(self, above: Claim) -> dict[str, str]:
-        return {mine: its for mine, its in SHARED.items() if hasattr(above, its)}
+        return {own: other for own, other in SHARED.items() if hasattr(above, other)}
 
     def require_fitting(self, controller: "Controller") -> None:
-        """Refuse at once a cost, limits or a set D that do not fit.
+        """Check the cost, the control limits and D before the claim from above is proved.
 
         Raises:
-            UsageError: they do not.
+            UsageError: they do not suit a bound from below.
         """
         from lyapnet.claims.arguments import box_of
         from lyapnet.claims.least_cost import require_bound_from_below

@@ -1,4 +1,4 @@
-"""The optimum from below: V that rises no faster than any control can pay for proves what no control goes below."""
+"""A lower bound of the optimal cost: a V that along no control rises faster than ℓ proves it."""
 
 import time
 from collections.abc import Callable
@@ -12,9 +12,9 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply, solve
 from lyapnet.base.types import Control, Corner, PerState, Points, State, Time, Value
-from lyapnet.claims.funnel import for_levels, largest_seen, proof_within, setting_of
+from lyapnet.claims.funnel import budget_for_level, find_setting, largest_sample, prove_within
 from lyapnet.claims.ignorable_states import ignorable_states
-from lyapnet.claims.preconditions import at_time, domain_around, require_goal, require_still, without
+from lyapnet.claims.preconditions import at_time, domain_around, require_goal, require_still, slice_at_zero
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget, just_above, minimum
 from lyapnet.prover.condition import DecreaseCondition
@@ -27,8 +27,8 @@ from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, ControlSet
 from lyapnet.value.calculus import drift_lie_derivative, gradients, input_lie_derivative
 
-FINE = 5e-5  # of the level: how close the excess at T is bounded
-DEGREE = 3  # of the forms: what cancels between V_t and the Hamiltonian is of third order, t·x²
+FINE = 5e-5  # accuracy of the bound of e, as a share of the level
+DEGREE = 3  # of the Taylor forms: V_t and the Hamiltonian cancel in terms of third order, t·x²
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,18 +37,18 @@ class ProvedLowerBound:
 
         β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)] ≥ −δ,
 
-    and min(W, c) ≤ φ + e' at T on D. Then m = min(W, c) falls along any trajectory in D, under any control, by no more
-    than ∫ℓ + e'': where W < c by the condition, where W ≥ c since m is constant and ℓ ≥ −e''/T, as q is bounded from
-    below and R is positive definite on all of D. Hence, with e = e' + e'',
+    and min(W, c) ≤ φ + e' at T on D. Under any control, m = min(W, c) then falls along a trajectory in D by at most
+    ∫ℓ + e'': where W < c, by the condition; where W ≥ c, since m is constant and ℓ ≥ −e''/T, because q is bounded from
+    below and R is positive definite on D. Hence, with e = e' + e'',
 
         J(x₀) = ∫ℓ dt + φ(x(T)) ≥ min(β V(0, x₀) − δT, c) − e
 
-    for every control that keeps the state in D. Where also W > c on the boundary of D and φ ≥ c outside of D, m goes on
-    as c outside, and it is so for every control (`everywhere`); that is looked at where q and φ are quadratic forms
-    about a target in D, so that φ rises along each ray from it. Outside of D, ℓ ≥ 0 is what a cost has to be.
+    for every control that keeps the state in D. If also W > c on the boundary of D and φ ≥ c outside of D, then m = c
+    continues m outside, where every cost has ℓ ≥ 0, and the bound holds for every control (`everywhere`). This is
+    checked if q and φ are quadratic forms about a target in D, because φ then increases along each ray from it.
 
-    State constraints only make the optimum dearer. States that nothing depends on are left out, and D is all of ℝ along
-    them; the parameters of a family stay what they are.
+    State constraints can only increase the optimum. Along ignorable states D is all of ℝ. The parameters of a family
+    are constant.
 
     Source: the verification theorem of Bellman's equation for subsolutions, e.g. Bardi, Capuzzo-Dolcetta, Optimal
     Control and Viscosity Solutions of Hamilton-Jacobi-Bellman Equations, 1997, § III.3.
@@ -58,38 +58,39 @@ class ProvedLowerBound:
     delta: float  # in cost per second
     duration: float  # T in s
     states: Box  # D
-    level: float  # c: the largest one proved, as far as X₀ needs; −∞ where there is none
-    wanted: float  # max W(0, ·) on X₀, or up to 0.1 % more
-    least: float  # the largest W(0, ·) that was seen on X₀: no lower c does
-    excess: float  # e ≥ 0; an upper bound
-    everywhere: bool  # whether it is so for every control, not only for those that keep the state in D
+    level: float  # c: the largest proved level, at most `wanted`; −∞ if none is proved
+    wanted: float  # an upper bound of max W(0, ·) on X₀, at most 0.1 % above it: the c for all of X₀
+    least: float  # the largest W(0, ·) among samples of X₀: a lower bound of this c
+    excess: float  # an upper bound of e ≥ 0
+    everywhere: bool  # whether the bound holds for every control, not only for those that keep the state in D
     counterexample: Counterexample | None
     boxes: int
     seconds: float
-    remaining_volume: float  # share of [0, T] × D left undecided; all of it lies above c
+    remaining_volume: float  # undecided share of [0, T] × D; all of it lies above c
     undecided: Points
     left_out: list[int]
     fingerprint: str
-    proof_seconds: float = 0.0  # those of the boxes alone
+    proof_seconds: float = 0.0  # for the boxes, without set-up and levels
     set_up: float = 0.0  # seconds of the budget before the first box
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that c does for all of X₀, and that e leaves something of it."""
+        """The verdict on the claim that c ≥ W(0, ·) on X₀ and e < c."""
         found = self.counterexample
         verdict = verdict_on(self.level, self.wanted, None if found is None else found.height, self.least)
         return "unknown" if verdict == "certified" and not self.excess < self.wanted < float("inf") else verdict
 
     def least_cost(self, value: PerState) -> PerState:
-        """The bound of the optimum from V(0, x₀), (*batch,); −∞ where nothing is proved."""
+        """The lower bound of the optimum as a function of V(0, x₀), (*batch,); −∞ if nothing is proved."""
         return (self.beta * value - self.delta * self.duration).clamp(max=self.level) - self.excess
 
 
 class RiseCondition(DecreaseCondition):
-    """c(t, x) = −(β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)]) − δ; W rises no faster than ℓ where c ≤ 0.
+    """c(t, x) = −(β V_t + min over u ∈ U of [ℓ(x, u) + β V_xᵀ(f + g u)]) − δ. Where c ≤ 0, W falls by
+    at most ∫ℓ dt under any control.
 
-    The third part is minus the least pivot of R(x), so that R is proved positive definite where c is proved: without
-    that the minimum is none.
+    The third part is minus the least pivot of R(x), so that the proof of c also proves that R is positive definite;
+    otherwise the minimum would not exist.
     """
 
     proves = "below"
@@ -97,14 +98,14 @@ class RiseCondition(DecreaseCondition):
     def __init__(self, closed_loop: ClosedLoop, beta: float, delta: float, problem: Problem):
         super().__init__(closed_loop, beta, delta)
         cost, limits = closed_loop.cost, problem.controls.limits
-        if any(getattr(getattr(cost, name), "__func__", None) is not getattr(Cost, name) for name in OF_EVERY_COST):
+        if any(getattr(getattr(cost, name), "__func__", None) is not getattr(Cost, name) for name in FIXED_METHODS):
             raise UsageError(
-                f"Expected ℓ = q + (u − u*)ᵀR(u − u*), got {type(cost).__name__} with another running or control; "
-                "leave them as they are, and put what there is of x into state."
+                f"Expected ℓ = q + (u − u*)ᵀR(u − u*), got {type(cost).__name__} with its own `running` or `control`; "
+                "leave these methods as they are, and put terms in x into `state`."
             )
         if limits is None or (problem.controls.limited and not all(bool(side.isfinite().all()) for side in limits)):
             raise UsageError(
-                "Expected controls without limits, or with a lower and an upper one each, for a bound from below, got "
+                "Expected controls without limits, or with two finite limits each, for a bound from below, got "
                 f"{type(problem.controls).__name__}{'' if limits is None else ' with ∓∞'}; give both limits."
             )
         self.duration, self.controls = problem.horizon.duration, problem.controls
@@ -122,17 +123,17 @@ class RiseCondition(DecreaseCondition):
         return self.alpha * self.V(t, x) - self.delta * (self.duration - t)
 
 
-OF_EVERY_COST = ("running", "control")
+FIXED_METHODS = ("running", "control")
 
 
 def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: ControlSet) -> PerState:
     """min over u ∈ U of h(u) = (u − u*)ᵀR(u − u*) + bᵀu for symmetric positive definite R, or less.
 
-    Without limits it is bᵀu* − ¼ bᵀR⁻¹b. With them, h lies above its tangent at any û, the one of the control law here:
+    Without limits it is bᵀu* − ¼ bᵀR⁻¹b. With limits, h lies above its tangent at any û, here that of the control law:
 
         h(u) ≥ h(û) + Σ_i min over lower_i ≤ u_i ≤ upper_i of h_i (u_i − û_i),   h_i = (2R(û − u*) + b)_i,
 
-    which is h(û) where û is the minimiser, and a lower bound whatever it is.
+    which is h(û) if û is the minimiser, and a lower bound for any û.
     """
     u0 = b.new_zeros(()) if rest is None else rest.to(b)
     if not controls.limited:
@@ -146,12 +147,12 @@ def least_over_controls(R: Tensor, b: Control, rest: Tensor | None, controls: Co
 
 
 def symmetric(R: Tensor) -> Tensor:
-    """What counts of R in uᵀRu."""
+    """The symmetric part of R, which alone matters in uᵀRu."""
     return (R + R.mT) / 2
 
 
 def least_pivot(R: Tensor) -> PerState:
-    """The least pivot of symmetric R (*batch, m, m) in Gauss's elimination; R is positive definite where it is > 0."""
+    """The least pivot of symmetric R, (*batch, m, m), in Gaussian elimination; R is positive definite if it is > 0."""
     least = R[..., 0, 0]
     for _ in range(R.shape[-1] - 1):
         R = R[..., 1:, 1:] - R[..., 1:, :1] * R[..., :1, 1:] / R[..., :1, :1]
@@ -171,38 +172,39 @@ def prove_lower_bound(
     keep: Path | None = None,
     replay: bool = False,
 ) -> ProvedLowerBound:
-    """The bound of the optimum from below that V proves within a budget, for as much of X₀ as it can.
+    """Prove a lower bound of the optimal cost by V within a budget, for as much of X₀ as possible.
 
     Args:
-        closed_loop: whose V, system and cost are meant; its control law takes no part.
-        problem: whose X₀, U, T and goal are meant.
-        states: D; by default a box around where samples of W are low enough.
-        report, keep, replay: of prove.
+        closed_loop: gives V, the system and the cost; its control law is not used.
+        problem: gives X₀, U, T and the goal.
+        states: D; by default a box around {W ≤ max W(0, ·) on X₀}, estimated from samples.
+        report, keep, replay: as in prove.
 
     Raises:
-        UsageError: β, δ or D do not fit, ℓ is not quadratic in u, or V, f, g, q or R have an operator without a rule.
+        UsageError: β, δ or D are unsuitable, ℓ is not quadratic in u, or V, f, g, q or R have an operator without a
+            bound.
         Interrupted: Ctrl-C or SIGTERM.
     """
     require_goal(problem, "two-sided")
     started, budget, problem = time.monotonic(), budget or Budget(), copied(problem)
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, delta, problem)
     cost, duration = condition.closed_loop.cost, condition.duration
-    left_out, X0, wanted, D, domain, sides, *_ = setting_of(condition, problem, duration, states, budget, report)
+    left_out, X0, wanted, D, domain, sides, *_ = find_setting(condition, problem, duration, states, budget, report)
     _require_still(condition, domain)
     needed = just_above(wanted)
     excess = _excess(condition, D, needed, budget)
-    everywhere, levels = False, for_levels(budget)
+    everywhere, levels = False, budget_for_level(budget)
     if rises_along_rays(cost, problem.goal.double(), D, left_out):
         outside = minimum(lambda t, x: cost.terminal(x), *sides, levels, enough=just_above(needed))
         rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
         everywhere = min(outside, rim) >= needed
     set_up = budget.elapsed
-    proof = proof_within(
+    proof = prove_within(
         condition, domain, needed, budget,
         generator=generator, report=report, keep=keep, replay=replay, degree=DEGREE,
     )  # fmt: skip
     level = wanted if proof.level >= needed else proof.level
-    seen = beta * largest_seen(condition.V, X0) - delta * duration
+    seen = beta * largest_sample(condition.V, X0) - delta * duration
     return ProvedLowerBound(
         beta=beta, delta=delta, duration=duration, states=D, level=level, wanted=wanted, least=seen, excess=excess,
         everywhere=everywhere, counterexample=proof.counterexample, boxes=proof.boxes,
@@ -212,33 +214,33 @@ def prove_lower_bound(
 
 
 def require_bound_from_below(closed_loop: ClosedLoop, problem: Problem, beta: float, states: Box | None) -> None:
-    """Refuse at once what prove_lower_bound would refuse: a cost, limits or a set D that do not fit."""
+    """Refuse a cost, limits or a set D that prove_lower_bound would refuse."""
     condition = RiseCondition(copied(closed_loop).requires_grad_(False), beta, 0.0, copied(problem))
     if states is not None:
         left_out = ignorable_states(condition.closed_loop, problem.constraints)
-        X0, constants = without(problem.initial_states, left_out), condition.closed_loop.system.constants
-        domain_around(without(states, left_out), X0, condition.duration, left_out, list(constants))
+        X0, constants = slice_at_zero(problem.initial_states, left_out), condition.closed_loop.system.constants
+        domain_around(slice_at_zero(states, left_out), X0, condition.duration, left_out, list(constants))
 
 
 def _excess(condition: RiseCondition, states: Box, level: float, budget: Budget) -> float:
-    """An upper bound of e; infinite where R is not seen to be positive definite on all of D.
+    """An upper bound of e; ∞ if R is not proved to be positive definite on D.
 
-    Where q is a quadratic form by its matrix, it is not below 0.
+    If q is a quadratic form, q ≥ 0 and e'' = 0.
     """
     cost, T, beta = condition.closed_loop.cost, condition.duration, condition.alpha
     end, unit = at_time(T, states.lower, states.upper), max(abs(level), 1e-12)
 
     def least(function: Value) -> float:
-        return minimum(function, *end, for_levels(budget), unit=unit, tolerance=FINE, enough=0.0)
+        return minimum(function, *end, budget_for_level(budget), unit=unit, tolerance=FINE, enough=0.0)
 
     excess = -least(lambda t, x: cost.terminal(x) - (beta * condition.V(t, x)).clamp(max=level))
     below = 0.0 if is_quadratic_about_target(cost) else -least(lambda t, x: T * cost.state(x))
-    definite = minimum(lambda t, x: least_pivot(symmetric(cost.R(x))), *end, for_levels(budget), enough=0.0) >= 0
+    definite = minimum(lambda t, x: least_pivot(symmetric(cost.R(x))), *end, budget_for_level(budget), enough=0.0) >= 0
     return max(0.0, excess) + max(0.0, below) if definite else float("inf")
 
 
 def _require_still(condition: RiseCondition, domain: tuple[Corner, Corner]) -> None:
-    """Refuse constants that some control moves."""
+    """Refuse constants that some control changes."""
     system = condition.closed_loop.system
     constants = list(system.constants)
     if constants:
@@ -246,7 +248,7 @@ def _require_still(condition: RiseCondition, domain: tuple[Corner, Corner]) -> N
 
 
 def rises_along_rays(cost: Cost, goal: State, states: Box, left_out: list[int]) -> bool:
-    """Whether φ is known to rise along each ray from a target in D: a quadratic form, about it, does."""
+    """Whether φ is known to increase along each ray from a target in D, since it is a quadratic form about it."""
     inside = ((states.lower < goal) & (goal < states.upper)).index_fill(
         0, torch.tensor(left_out, dtype=torch.long), True
     )

@@ -1,4 +1,4 @@
-"""One law, made for one plant, on all plants of a box of parameters: as one closed loop, whose parameters stay."""
+"""One control law on all plants of a box of parameters, as one closed loop with the parameters as constant states."""
 
 import inspect
 import math
@@ -23,34 +23,33 @@ from lyapnet.task.systems import ControlAffineSystem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import PolicyOutput, ValuePolicy
 
-OPTION = "--parameter"
-TRIED = 8  # states at which plants are held against systems built with their parameters
+OPTION = "parameters"
+TRIED = 8  # random states at which plants are compared with systems built with their parameters
 
 
 @dataclass(frozen=True)
 class Plants:
-    """ẋ = f(x; p) + g(x; p)u(x) for each constant p of a box P, where u and V were made for one plant, the nominal one.
+    """ẋ = f(x; p) + g(x; p)u(x) for each constant p in a box P, where u and V were made for one nominal plant.
 
-    With z = (x, p) and ṗ = 0 that is one closed loop of a system with constants, as a family is. Unlike those of a
-    family, u and V are told x alone: what the law knows of f, g and R is the nominal plant's, another object than the
-    one that p is read in.
+    With z = (x, p) and ṗ = 0 it is one closed loop with constants, like that of a family. Unlike those of a family, u
+    and V depend on x alone: the law uses f, g and R of the nominal plant, which is a separate object.
     """
 
     system: FamilySystem  # in z
-    nominal: Mapping[str, float]  # what each parameter is in the plant that u and V were made for
-    box: Box  # P, (k,), in the order of the nominal ones
+    nominal: Mapping[str, float]  # the parameters of the plant that u and V were made for
+    box: Box  # P, (k,), in the order of `nominal`
 
     @property
     def ranges(self) -> dict[str, list[float]]:
-        """The ends of P by name."""
+        """The bounds of P by name."""
         ends = torch.stack([self.box.lower, self.box.upper], -1).tolist()
         return dict(zip(self.nominal, ends, strict=True))
 
     def around(self, states: Box) -> Box:
-        """A box of states beside P.
+        """states × P.
 
         Raises:
-            UsageError: it has another number of states.
+            UsageError: the box has another number of states.
         """
         n = self.system.system.n
         if states.dimension != n:
@@ -59,15 +58,15 @@ class Plants:
             torch.cat([states.lower.double(), self.box.lower]), torch.cat([states.upper.double(), self.box.upper])
         )
 
-    def pushed(self, w: Tensor) -> Tensor:
-        """Pushes on ẋ as pushes on ż: none on ṗ."""
+    def disturbance_of_all(self, w: Tensor) -> Tensor:
+        """A disturbance w of ẋ as one of ż, with zeros for ṗ."""
         return torch.cat([w, w.new_zeros(self.box.dimension)])
 
     def all_of(self, loop: ClosedLoop, problem: Problem) -> tuple[ClosedLoop, Problem]:
-        """The closed loop of the nominal plant and its problem, as those of all plants in z."""
+        """The closed loop of all plants in z and its problem, from those of the nominal plant."""
         assert isinstance(loop.policy, ValuePolicy)
-        inside = self.problem(problem)
-        return ClosedLoop(inside, NominalLaw(inside, loop.policy)), inside
+        joint = self.problem(problem)
+        return ClosedLoop(joint, NominalLaw(joint, loop.policy)), joint
 
     def problem(self, problem: Problem) -> Problem:
         """The problem in z: the cost, the controls and the constraints of the nominal plant, and X₀ × P."""
@@ -81,7 +80,7 @@ class Plants:
 
 
 class NominalValue(ValueFunction):
-    """V(t, x) as a function of (t, z), z = (x, p), that no p changes."""
+    """V(t, x) as a function of (t, z) with z = (x, p), independent of p."""
 
     def __init__(self, V: ValueFunction, n: int):
         super().__init__()
@@ -92,14 +91,14 @@ class NominalValue(ValueFunction):
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         value, slope = self.V.value_and_state_gradient(t, x[..., : self.n])
-        return value, beside_zeros(slope, x)
+        return value, append_zeros(slope, x)
 
 
 class NominalLaw(ValuePolicy):
-    """u(t, x) as a function of (t, z) that no p changes.
+    """u(t, x) as a function of (t, z), independent of p.
 
     Args:
-        problem: in z.
+        problem: the problem in z.
         policy: the law of the nominal plant.
     """
 
@@ -112,28 +111,28 @@ class NominalLaw(ValuePolicy):
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
         u, value, slope = self.policy.with_value(t, x[..., : self.n])
-        return PolicyOutput(u, value, beside_zeros(slope, x))
+        return PolicyOutput(u, value, append_zeros(slope, x))
 
 
-def beside_zeros(slope: Tensor, z: Tensor) -> Tensor:
-    """A gradient in x as one in z of what no p changes."""
+def append_zeros(slope: Tensor, z: Tensor) -> Tensor:
+    """The gradient in z of a function that is independent of p, from its gradient in x."""
     return torch.cat([slope, torch.zeros_like(z[..., slope.shape[-1] :])], -1)
 
 
 def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> Plants:
-    """The plants of a controller's system whose parameters lie between these ends, held against what the constructor
-    builds with them.
+    """The plants of a controller's system with parameters in these ranges; compared with systems that the constructor
+    builds.
 
     Args:
-        ranges: name of a constructor's argument, which f and g read as self.NAME ↦ [lower, upper].
+        ranges: name of a constructor argument that f and g read as self.NAME ↦ [lower, upper].
 
     Raises:
-        UsageError: it is about a family already; or a parameter is none of the system, is derived from in the
-            constructor or read by neither f nor g; or the constructor refuses one of its values.
+        UsageError: the system is a family; or the constructor has no such argument, uses it in another way than as
+            self.NAME, or refuses one of its values; or neither f nor g reads it.
     """
     if controller.system.constants:
-        raise UsageError("Expected one system, got a family; choose a member with --at NAME=VALUE.")
-    system = copied(controller.system)  # of its own: nothing that is set in it reaches the law
+        raise UsageError("Expected one system, got a family; choose one member of it (option at).")
+    system = copied(controller.system)  # a copy, so that changes of its parameters do not reach the law
     _require_arguments(system, ranges)
     lower, upper = (torch.tensor([ends[i] for ends in ranges.values()], dtype=torch.float64) for i in (0, 1))
     plants = Plants(
@@ -148,7 +147,7 @@ def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> 
 
 
 def _builder(controller: Controller) -> Callable[[Mapping[str, float]], ControlAffineSystem]:
-    """How the constructor of a controller's system builds it with other parameters, in the controller's precision."""
+    """A function that builds the controller's system with other parameters, in the controller's precision."""
     cls, given, dtype = type(controller.system), controller.parameters, controller.initial_states.lower.dtype
 
     def build(values: Mapping[str, float]) -> ControlAffineSystem:
@@ -159,7 +158,7 @@ def _builder(controller: Controller) -> Callable[[Mapping[str, float]], ControlA
 
 
 def _require_arguments(system: ControlAffineSystem, names: Mapping[str, Any]) -> None:
-    """Refuse what is no argument of a system's constructor."""
+    """Refuse names that are not arguments of the system's constructor."""
     cls = type(system)
     known = [name for name in inspect.signature(cls).parameters if not name.startswith(PREFIX)]
     for name in names:

@@ -1,4 +1,4 @@
-"""What a closed loop and its V have to be before bounds speak of them; and boxes of states as boxes of (t, x)."""
+"""Checks of a closed loop and V before a proof; and conversions between boxes of states and boxes of (t, x)."""
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
@@ -19,14 +19,14 @@ from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 
-NOTHING = 1e-200  # bounds of zero have the least room for rounding
+NOTHING = 1e-200  # bounds of 0 differ from 0 by a tiny margin for rounding
 
 
 def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memory:
-    """Trace V and h once, for every question that is asked of them, after a look at what they are.
+    """Check the closed loop, and replace V and h of a condition by their traces, for all later bounds.
 
     Returns:
-        What the closed loop holds, to be held against it once it was called more.
+        A record of the closed loop's attributes; its `check` refuses a loop that later calls have changed.
     """
     loop, h = condition.closed_loop, condition.constraints
     memory = check_loop(loop, h, sample)
@@ -40,9 +40,9 @@ def freeze(condition: DecreaseCondition, sample: tuple[Corner, Corner]) -> Memor
 
 
 def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Corner, Corner]) -> Memory:
-    """Refuse a closed loop with a memory, or one that is another in batches of another size.
+    """Refuse a closed loop that remembers calls, or whose results depend on the size of the batch.
 
-    It is called before it is traced: what it computes lazily is there by then.
+    The loop is called here before it is traced, so that lazily computed attributes exist.
     """
     lower, upper = domain
     points = _points(lower, upper)
@@ -53,7 +53,7 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
         results = [loop.slope(x, policy(t, x)), loop.cost.terminal(x)]
         results += [] if V is None else [V(t, x)]
         results += [] if constraints is None else [constraints(x)]
-        # what their base classes make of V(t, x) and policy(t, x) needs no second look
+        # methods that are inherited from the base class follow from V(t, x) and policy(t, x)
         if V is not None and type(V).value_and_state_gradient is not ValueFunction.value_and_state_gradient:
             results.append(V.value_and_state_gradient(t, x)[1])
         if reaches_own_code(getattr(type(policy), "with_value", None)):
@@ -69,20 +69,18 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     if reaches_own_code(named):
         why = check_batch_sizes("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
         if why is not None:
-            logging.getLogger(__name__).warning(
-                "note: batches of 1, 2 and %d states are tried, no others: %s", TRIED, why
-            )
+            logging.getLogger(__name__).warning("note: only batches of 1, 2 and %d states are tested: %s", TRIED, why)
     return memory
 
 
 def _points(lower: Corner, upper: Corner) -> Tensor:
-    """Points of a box at random."""
+    """Random points of a box."""
     share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
     return lower + (upper - lower) * share
 
 
 def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) -> None:
-    """Refuse a condition of which the graph at one point says nothing about batches: closed loops are run in these."""
+    """Refuse a condition that is another function on batches, on which closed loops run, than on one point."""
     lower, upper = domain
     _require_constant(condition.closed_loop, domain)
     points = _points(lower, upper)
@@ -101,13 +99,13 @@ def check_states(condition: DecreaseCondition, domain: tuple[Corner, Corner]) ->
         own = torch.stack([condition.V(*point) for point in zip(t, x, strict=True)])
         if not _close(own, condition.V(t, x)):
             raise UsageError(
-                "Expected V to be one function of (t, x), got another one than at first; read nothing else."
+                "Expected V to be a function of (t, x) alone, got other values than at first; let it read nothing else."
             )
         check_parts(condition.closed_loop, t, x)
 
 
 def check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
-    """Refuse a closed loop that runs as another one than its parts say, and a cost below 0, at some states."""
+    """Refuse a closed loop that differs from its parts f, g, ℓ and u, and a cost ℓ < 0, at some states."""
     system, u = loop.system, loop.policy(t, x)
     parts = torch.cat([system.f(x) + apply(system.g(x), u), loop.cost.running(x, u)[..., None]], -1)
     if not _close(loop.slope(x, u), parts) or not _close(loop.control(t, x).u, u):
@@ -120,19 +118,19 @@ def check_parts(loop: ClosedLoop, t: Tensor, x: Tensor) -> None:
     least = int(cost.argmin())
     if cost[least] < -1e-9 * cost.abs().max():
         raise UsageError(
-            f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there: "
+            f"Expected ℓ(x, u) ≥ 0, got {float(cost[least]):.6g} at x = {x[least].tolist()}; V need not fall there; "
             "correct the cost, or choose a smaller set."
         )
 
 
 def require_goal(problem: Problem, claim: str) -> None:
-    """Refuse a claim that is about a goal, for a task that has none.
+    """Refuse a task without a goal.
 
     Args:
-        claim: the name of the certificate, for the message.
+        claim: the kind of the certificate, for the message.
 
     Raises:
-        UsageError: the task has no goal; says why.
+        UsageError: the task has no goal; with the reason.
     """
     if not problem.has_goal:
         raise UsageError(
@@ -146,68 +144,70 @@ def _close(one: Tensor, other: Tensor) -> bool:
 
 
 def require_continuous(V: Value, x_low: State, x_high: State) -> None:
-    """Refuse a V that may jump: its gradient would not tell, and W could rise along closed loops where c ≤ 0."""
+    """Refuse a V that may jump: its gradient does not show jumps, so that W could rise although c ≤ 0."""
     lower, upper = at_time(0.0, x_low, x_high)
     jumps = BoundedFunction(lambda t, x: (V(t, x),), (lower[0], upper[0])).operators & JUMPS.keys()
     if jumps:
         raise UsageError(
-            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write it with "
+            f"Expected a continuous V, got {' and '.join(sorted(map(str, jumps)))}, which may jump; write V with "
             "relu, abs, maximum, minimum or clamp."
         )
 
 
 def at_time(t: float, lower: State, upper: State) -> tuple[Corners, Corners]:
-    """The box {t} × [lower, upper] as one of (t, x)."""
+    """The box {t} × [lower, upper]."""
     time = torch.tensor([t], dtype=lower.dtype)
     return torch.cat([time, lower])[None], torch.cat([time, upper])[None]
 
 
-def without(states: Box, left_out: Sequence[int]) -> Box:
-    """The slice of a box at 0 of the states that are left out, in float64."""
+def slice_at_zero(states: Box, left_out: Sequence[int]) -> Box:
+    """The slice of a box at which the states left_out are 0, in float64."""
     lower, upper = states.lower.double(), states.upper.double()
     seen = torch.tensor([i not in left_out for i in range(states.dimension)])
     return Box(torch.where(seen, lower, 0.0), torch.where(seen, upper, 0.0))
 
 
 def at_centre(states: Box, axes: Iterable[int]) -> Box:
-    """The slice of a box in the middle of some axes."""
+    """The slice of a box in the middle along some axes."""
     chosen = torch.tensor([i in axes for i in range(states.dimension)])
     return Box(*(torch.where(chosen, states.center, side) for side in (states.lower, states.upper)))
 
 
-def first_of(states: Box, n: int) -> Box:
-    """A box of the first n states."""
+def first_states(states: Box, n: int) -> Box:
+    """A box projected onto its first n states."""
     return Box(states.lower[:n], states.upper[:n])
 
 
-def beside(box: Box, states: Box) -> Box:
-    """A box of the first states with the ends of another along all others: the constants of a system."""
+def append_constants(box: Box, states: Box) -> Box:
+    """A box of the first n states, extended by the bounds of `states` along the constants that follow."""
     n = box.dimension
     return Box(torch.cat([box.lower, states.lower[n:]]), torch.cat([box.upper, states.upper[n:]]))
 
 
 def _require_constant(loop: ClosedLoop, domain: tuple[Corner, Corner]) -> None:
-    """Refuse constants that move under the control law."""
+    """Refuse constants that change under the control law."""
     constants = list(loop.system.constants)
     if constants:
         require_still(lambda t, x: (loop.system.dynamics(x, loop.policy(t, x))[constants],), domain)
 
 
 def require_still(
-    moving: Callable[[Time, State], tuple[Tensor, ...]], domain: tuple[Corner, Corner], under: str = ""
+    rates: Callable[[Time, State], tuple[Tensor, ...]], domain: tuple[Corner, Corner], under: str = ""
 ) -> None:
-    """Refuse constants of a system that move, by what would move them: D has no faces along them.
+    """Refuse constants whose rates are not 0; this is needed since the faces of D along them are not checked.
 
     Args:
-        under: which controls may move them, in words.
+        under: the controls in question, in words.
     """
-    bounds = BoundedFunction(moving, domain).bounds(*(end[None] for end in domain))
+    bounds = BoundedFunction(rates, domain).bounds(*(end[None] for end in domain))
     if not all(bool(torch.maximum(-low, high).max() <= NOTHING) for low, high in bounds):
-        raise UsageError(f"Expected ẋ = 0 for the constants of a system{under}, got others; leave them out.")
+        raise UsageError(
+            f"Expected ẋ = 0 for the constants of a system{under}, got other rates; declare only constant states."
+        )
 
 
 def require_dimension(states: Box, initial_states: Box) -> None:
-    """Refuse a set D of another number of states."""
+    """Refuse a set D with another number of states than X₀."""
     if states.dimension != initial_states.dimension:
         raise UsageError(
             f"Expected a set of {initial_states.dimension} states, got {states.dimension}; give bounds for each state."
@@ -217,7 +217,11 @@ def require_dimension(states: Box, initial_states: Box) -> None:
 def domain_around(
     states: Box, initial_states: Box, duration: float, left_out: Sequence[int], constants: Sequence[int]
 ) -> tuple[Corner, Corner]:
-    """[0, T] × D as (lower, upper), or a UsageError that says what is wrong with D."""
+    """[0, T] × D as (lower, upper).
+
+    Raises:
+        UsageError: D does not contain X₀ in its interior.
+    """
     require_dimension(states, initial_states)
     outside = (states.lower >= initial_states.lower) | (states.upper <= initial_states.upper)
     for i in constants:
@@ -233,6 +237,6 @@ def domain_around(
 
 
 def over_time(states: Box, duration: float) -> tuple[Corner, Corner]:
-    """[0, T] × a box as (lower, upper)."""
+    """[0, T] × states as (lower, upper)."""
     time = torch.tensor([0.0, duration], dtype=torch.float64)
     return torch.cat([time[:1], states.lower.double()]), torch.cat([time[1:], states.upper.double()])

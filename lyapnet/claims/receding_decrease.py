@@ -1,4 +1,4 @@
-"""What a region of attraction asks of V and the receding law u(0, x), as a condition that boxes prove."""
+"""The condition of a region of attraction on V and the receding law u(0, x), to be proved on boxes."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.types import PerState, State, Time
 from lyapnet.claims.contraction import Contraction
 from lyapnet.claims.kept_regions import REMEDY
-from lyapnet.claims.preconditions import beside, over_time
+from lyapnet.claims.preconditions import append_constants, over_time
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_below, minimum
@@ -24,7 +24,7 @@ from lyapnet.task.sets import Box
 class RecedingDecrease(DecreaseCondition):
     """V̇ + λ max(V, c) ≤ 0 with V = V(0, ·) and V̇ = V_xᵀ(f + g u(0, x)), outside a hole: V falls exponentially.
 
-    With a disturbance V̇ is at its worst, V_xᵀ(f + g u(0, x)) + Σ_i w_i |∂V/∂x_i|.
+    With a disturbance V̇ is replaced by its largest value, V_xᵀ(f + g u(0, x)) + Σ_i w_i |∂V/∂x_i|.
 
     Args:
         parameters: names of the constants of the system, on which neither V nor u depends.
@@ -47,10 +47,10 @@ class RecedingDecrease(DecreaseCondition):
     @property
     def facts(self) -> dict[str, Any]:
         B, w = self.around, self.disturbance
-        around = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
-        pushed = {} if w is None else {"disturbance": w.tolist()}
-        of_plants = {"parameters": self.parameter_names} if self.parameter_names else {}
-        return {"decay": self.decay, "hole": self.hole, **around, **pushed, **of_plants}
+        hole = {} if B is None else {"box": [B.box.lower.tolist(), B.box.upper.tolist()], "Y": B.coordinates.tolist()}
+        disturbance = {} if w is None else {"disturbance": w.tolist()}
+        parameters = {"parameters": self.parameter_names} if self.parameter_names else {}
+        return {"decay": self.decay, "hole": self.hole, **hole, **disturbance, **parameters}
 
     def open_hole(
         self,
@@ -61,32 +61,34 @@ class RecedingDecrease(DecreaseCondition):
         budget: Budget,
         proposed: float | None = None,
     ) -> None:
-        """Ask nothing in {x ∈ B: V < c}, with c below V on the boundary of B, and at most a level.
+        """Exclude {x ∈ B: V < c} from the condition, where c ≤ level is below V on the boundary of B.
 
         Args:
-            states: D, beside the ends of the constants.
-            proposed: the c that alone is tried.
+            states: D, extended by the bounds of the constants.
+            proposed: the only c to test; None to choose the largest.
         """
-        rim = minimum(self.V, *faces(*over_time(beside(around.box, states), 0.0), [1 + i for i in seen]), budget)
+        rim = minimum(
+            self.V, *faces(*over_time(append_constants(around.box, states), 0.0), [1 + i for i in seen]), budget
+        )
         self.around, self.hole = around, min(level, just_below(rim) if proposed is None else proposed)
         if proposed is not None and not self.hole < rim:
             raise UsageError(f"Expected V > c = {self.hole!r} on the boundary of B, got V ≥ {rim:g}; {REMEDY}.")
         self.constraints = OutsideTheHole(self.V, around.box, self.hole)
 
     def open_everywhere(self, level: float) -> None:
-        """Ask nothing in {x ∈ D: V < c}, where pushes may lift V."""
+        """Exclude {x ∈ D: V < c} from the condition, where disturbances may increase V."""
         self.hole, self.constraints = level, OutsideTheHole(self.V, None, level)
 
     def parts(self, t: Time, x: State) -> tuple[PerState, PerState, PerState]:
         value, slope = self.V.value_and_state_gradient(t, x)
-        fall = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
+        rate = (slope * self.closed_loop.system.dynamics(x, self.closed_loop.policy(t, x))).sum(-1)
         if self.disturbance is not None:
-            fall = fall + self.worst_push(slope)
-        return fall + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), fall
+            rate = rate + self.worst_push(slope)
+        return rate + self.decay * torch.clamp(value, min=self.hole), self.V(t, x), rate
 
 
 class OutsideTheHole(Constraints):
-    """h(x) > 0 where x ∈ B, or D without one, and V(0, x) < c: there V need not fall."""
+    """h(x) > 0 on the hole {x ∈ B: V(0, x) < c}, or {x ∈ D: V(0, x) < c} without B: there V need not fall."""
 
     names = ("outside the hole",)
 

@@ -1,4 +1,4 @@
-"""Certificates by proof of the receding law: a region of attraction."""
+"""Certificates of a region of attraction of the receding law, by proof."""
 
 import math
 from collections.abc import Mapping
@@ -12,7 +12,14 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import Corner
 from lyapnet.claims import figures
-from lyapnet.claims.certificates import FROZEN, NOT_PROVED, Certificate, however_pushed, listed, named_pushes
+from lyapnet.claims.certificates import (
+    FROZEN,
+    NOT_PROVED,
+    Certificate,
+    disturbance_text,
+    format_state,
+    named_disturbance,
+)
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import OutsideTheHole, RecedingDecrease
 from lyapnet.claims.region import ProvedRegion
@@ -21,13 +28,13 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.value.policy import ValuePolicy
 
-NEARLY = 0.999  # of the least V on the boundary of D: a region that comes so close is as large as D lets it be
-PATHS, EDGE = 16, 0.03  # closed loops that are drawn, and how far inside the region they begin
+NEARLY = 0.999  # of the least V on the boundary of D: a larger D is needed for a region with such a ρ to grow
+PATHS, EDGE = 16, 0.03  # number of closed loops to draw; they begin where 1 − EDGE < V/ρ ≤ 1
 
 
 class RegionCertificate(Certificate):
-    """A set that no closed loop of the receding law leaves, for ever, and from which all go to one equilibrium; with a
-    disturbance, to a smaller set around the goal, which none leaves. With plants, that is so for each of them.
+    """A set that no closed loop of the receding law leaves and from which all converge to one equilibrium. With a
+    disturbance, all enter a smaller set around the goal, which none leaves.
     """
 
     kind: str = "region"
@@ -50,12 +57,12 @@ class RegionCertificate(Certificate):
         "ultimate_volume": "volume of {V(0, ·) ≤ c}, at most",
         "ultimate_extent": "box around {V(0, ·) ≤ c}",
         "entered_within": "seconds to {V(0, ·) ≤ c}, at most",
-        "hole": "c, below which the contraction speaks",
+        "hole": "c, below which contraction is used",
         "contraction_box": "B",
         "contraction_rate": "κ, 1/s",
         "equilibrium_offset": "distance of the equilibrium from the goal, at most",
         "precision": "u is computed in",
-        "distance_left": "distance from the goal that rounding leaves in the end, at most",
+        "distance_left": "distance from the goal as t → ∞, due to rounding, at most",
         "constraints": "constraints that no closed loop of the region violates",
         "counterexample": "counterexample of lowest V",
         "remaining_volume": "share of D undecided",
@@ -68,15 +75,15 @@ class RegionCertificate(Certificate):
 
     @property
     def complete(self) -> bool:
-        """Whether there is nothing more to prove in D: the region holds all of X₀, or comes up to the boundary."""
+        """Whether no larger region is needed or possible in D: it contains X₀, or almost reaches the boundary of D."""
         return self.verdict == "certified" or self.claim.rho >= NEARLY * self.claim.rim
 
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
-        """The condition in plain arithmetic, {0} × D, and the level up to which it was to hold."""
+        """The condition in plain arithmetic, {0} × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop, states, w = self._loop, claim.states, claim.disturbance
         if claim.plants is not None:
-            states, w = claim.plants.around(states), None if w is None else claim.plants.pushed(w)
+            states, w = claim.plants.around(states), None if w is None else claim.plants.disturbance_of_all(w)
         condition = RecedingDecrease(loop, claim.decay, w)
         if claim.hole > 0:
             around = None if claim.contraction is None else claim.contraction.box
@@ -85,32 +92,32 @@ class RegionCertificate(Certificate):
 
     @property
     def _loop(self) -> ClosedLoop:
-        """The closed loop in float64; of all plants, where the claim is about several."""
+        """The closed loop in float64; for several plants, their joint closed loop."""
         own, plants = copied(self.controller.closed_loop), self.claim.plants
         return own if plants is None else plants.all_of(own, copied(self.controller.problem))[0]
 
     def numbers(self) -> dict[str, Any]:
         claim, names, found = self.claim, self.controller.system.state_names, self.claim.counterexample
         proved, B, proof = claim.rho > -float("inf"), claim.contraction, claim.proof
-        around = {} if B is None else {
+        contraction = {} if B is None else {
             "hole": claim.hole, "contraction_box": [B.box.lower.tolist(), B.box.upper.tolist()],
             "contraction_rate": B.rate, "equilibrium_offset": B.offset,
             "contraction_coordinates": B.coordinates.tolist(), "contraction_fingerprint": B.fingerprint,
         }  # fmt: skip
         plants = claim.plants
-        pushed = {} if claim.disturbance is None else {"disturbance": self.pushes}
+        further = {} if claim.disturbance is None else {"disturbance": self.disturbance}
         if plants is not None:
-            pushed |= {"parameters": plants.ranges, "nominal_parameters": dict(plants.nominal)}
+            further |= {"parameters": plants.ranges, "nominal_parameters": dict(plants.nominal)}
         if claim.extent is not None:
-            pushed |= {
+            further |= {
                 "ultimate_level": claim.hole, "ultimate_volume": claim.ultimate_volume,
                 "entered_within": claim.entered_within,
                 "ultimate_extent": [claim.extent.lower.tolist(), claim.extent.upper.tolist()],
             }  # fmt: skip
         if claim.precision is not None:
-            around |= {"precision": claim.precision}
-            around |= {} if math.isnan(claim.distance_left) else {"distance_left": claim.distance_left}
-        searched = {} if proof is None else {
+            contraction |= {"precision": claim.precision}
+            contraction |= {} if math.isnan(claim.distance_left) else {"distance_left": claim.distance_left}
+        search = {} if proof is None else {
             "remaining_volume": proof.remaining_volume, "boxes": proof.boxes, "fingerprint": proof.fingerprint,
         }  # fmt: skip
         return {
@@ -122,7 +129,7 @@ class RegionCertificate(Certificate):
             "counterexample": found and {
                 "x": found.x, **claim.failing_plant, "condition": found.condition, "V": found.height
             },
-            "seconds": claim.seconds, **around, **pushed, **searched,
+            "seconds": claim.seconds, **contraction, **further, **search,
             **({"origin": self._origin} if self._origin else {}),
         }  # fmt: skip
 
@@ -135,59 +142,60 @@ class RegionCertificate(Certificate):
         kept = f" or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         origin = f" {self._origin}" * bool(self._origin)
         return (
-            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)}{self._of_plants} The "
+            f"{{x ∈ D: V(0, x) ≤ ρ}} with ρ = {claim.rho!r} {self._end(kept)}{self._nominal_text} The "
             f"volume of the region is at least {claim.volume:.6g}, in the units of the states; it holds at "
             f"least {floored(claim.volume_share)} of X₀."
-            f"{f' Nothing is said of where these go: {left_out}.' if left_out else ''}{origin} "
-            f"It is about the operations that f, g, V and u were traced to in float64, of these fingerprints; {FROZEN}"
+            f"{f' It does not bound these states: {left_out}.' if left_out else ''}{origin} "
+            f"It is about the traced operations of f, g, V and u in float64, which have these fingerprints; {FROZEN}"
         )
 
     def _end(self, kept: str) -> str:
-        """What the region is, and where closed loops end."""
-        claim, B, pushed = self.claim, self.claim.contraction, however_pushed(self.pushes)
-        plants, equilibrium = "for this model", "one equilibrium exponentially, for ever,"
+        """What is proved of closed loops in the region.
+
+        Args:
+            kept: the words on constraints.
+        """
+        claim, B = self.claim, self.claim.contraction
+        plants, equilibrium = "for this model", "one equilibrium exponentially,"
         if claim.plants is not None:
             ends = ", ".join(f"{name} ∈ [{low!r}, {high!r}]" for name, (low, high) in claim.plants.ranges.items())
             plants = f"for each plant of this model with constant {ends}"
-            equilibrium = "one equilibrium of their plant exponentially, for ever,"
+            equilibrium = "one equilibrium of their plant exponentially,"
         if B is not None:
-            end = f"all go to {equilibrium} which is within {B.offset:.3g} of the goal (in the norm of x)"
+            end = f"all converge to {equilibrium} which is within {B.offset:.3g} of the goal (in the norm of x)"
             if claim.precision is not None:
                 end = (
-                    f"all come within {claim.distance_left:.3g} of the goal (in the norm of x) as t → ∞, "
-                    f"exponentially, and stay so close, however each operation of u is rounded in {claim.precision}"
+                    f"all converge exponentially to within {claim.distance_left:.3g} of the goal (in the norm of x) as "
+                    f"t → ∞, for every rounding of the operations of u in {claim.precision}"
                 )
             return (
                 f"is a region of attraction of the receding law u(0, x), proved in continuous time {plants}: no "
                 f"closed loop that starts in it leaves it{kept}, and {end}."
             )
         assert claim.extent is not None
-        names, (lower, upper) = (
-            self.controller.system.state_names,
-            (side.tolist() for side in (claim.extent.lower, claim.extent.upper)),
-        )
+        names, disturbances = self.controller.system.state_names, disturbance_text(self.disturbance)
+        lower, upper = (side.tolist() for side in (claim.extent.lower, claim.extent.upper))
         seen = [i for i in range(len(names)) if i not in claim.left_out]
         within = ", ".join(f"{names[i]} ∈ [{lower[i]!r}, {upper[i]!r}]" for i in seen)
         return (
-            f"is never left under the receding law u(0, x), proved in continuous time {plants}, {pushed}: no "
-            f"closed loop that starts in it leaves it{kept}, and each comes to {{x ∈ D: V(0, x) ≤ c}}, c = "
+            f"is invariant under the receding law u(0, x), proved in continuous time {plants}, {disturbances}: no "
+            f"closed loop that starts in it leaves it{kept}, and each enters {{x ∈ D: V(0, x) ≤ c}}, c = "
             f"{claim.hole!r}, within {claim.entered_within!r} s and stays there (practical stability; c is the "
-            f"ultimate bound). That set lies in {within}. That closed loops come closer to the goal, or to rest, is "
-            f"not claimed."
+            f"ultimate bound). That set lies in {within}. Convergence to the goal or to rest is not claimed."
         )
 
     @property
-    def _of_plants(self) -> str:
-        """What u and V know of the plants."""
+    def _nominal_text(self) -> str:
+        """A sentence on the nominal plant; empty for a claim about one plant."""
         if self.claim.plants is None:
             return ""
         made_for = ", ".join(f"{name} = {value!r}" for name, value in self.claim.plants.nominal.items())
-        return f" u and V are those made for {made_for}: they are not told which plant it is."
+        return f" u and V are those made for {made_for}: they do not depend on the plant."
 
     @property
-    def pushes(self) -> dict[str, float]:
-        """The disturbed states and how much their derivatives are pushed at most."""
-        return named_pushes(self.claim.disturbance, self.controller.system.state_names)
+    def disturbance(self) -> dict[str, float]:
+        """The bound w_i of each disturbed state, by its name."""
+        return named_disturbance(self.claim.disturbance, self.controller.system.state_names)
 
     @property
     def _origin(self) -> str:
@@ -198,19 +206,19 @@ class RegionCertificate(Certificate):
     def in_formulas(self) -> list[str]:
         claim, B = self.claim, self.claim.contraction
         rho = repr(claim.rho) if claim.rho > -float("inf") else "ρ"
-        each = ""
+        plants = ""
         if claim.plants is not None:
-            each = f", for each p = ({', '.join(claim.plants.nominal)}) ∈ P = {[*claim.plants.ranges.values()]}"
+            plants = f", for each p = ({', '.join(claim.plants.nominal)}) ∈ P = {[*claim.plants.ranges.values()]}"
         inside = f"V > {rho} on the boundary of D{' and wherever h_j(x) ≥ 0' if claim.constraints else ''}"
         rounded = ""
         if claim.precision is not None:
             rounded = f", whatever u(0, x) is within its rounding in {claim.precision}"
-        if self.pushes:
+        if self.disturbance:
             c = repr(claim.hole) if claim.hole > 0 else "c"
-            w = ", ".join(f"w({name}) = {w!r}" for name, w in self.pushes.items())
+            w = ", ".join(f"w({name}) = {w!r}" for name, w in self.disturbance.items())
             return [
                 f"V_xᵀ(f + g u) + Σ w_i |∂V/∂x_i| ≤ −{claim.decay!r} max(V, {c})  with V = V(0, x), u = u(0, x), {w}, "
-                f"at each x ∈ D with {c} ≤ V ≤ {rho}{each}{rounded}",
+                f"at each x ∈ D with {c} ≤ V ≤ {rho}{plants}{rounded}",
                 inside,
             ]
         hole, rate = ("c", "κ") if B is None else (repr(claim.hole), repr(B.rate))
@@ -218,26 +226,24 @@ class RegionCertificate(Certificate):
         Y = "Y" if B is None else f"Y = {B.coordinates.tolist()}"
         return [
             f"V_xᵀ(f + g u) ≤ −{claim.decay!r} max(V, {hole})  with V = V(0, x), u = u(0, x), "
-            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{each}{rounded}",
+            f"at each x ∈ D with V ≤ {rho} that is not in B with V < {hole}{plants}{rounded}",
             f"{inside},  V > {hole} > 0 on the boundary of {box}",
             f"½(P J + JᵀP) ≤ −{rate} P  with P = YᵀY, J the Jacobian of f + g u, at each x ∈ B, where f + g u is "
-            f"continuous{each}{', without rounding' * bool(rounded)}; {Y}",
+            f"continuous{plants}{', without rounding' * bool(rounded)}; {Y}",
         ]
 
-    def of_the_verdict(self) -> str:
+    def verdict_text(self) -> str:
         found = self.claim.counterexample
         why = {
             "certified": "it does",
-            "falsified": "V does not fall so in the set that this would take "
-            f"(closed loops may {'stay in it' if self.pushes else 'go to the goal'} even so)",
+            "falsified": "V does not fall so in the sublevel set around X₀ "
+            f"(closed loops may still {'stay in it' if self.disturbance else 'go to the goal'})",
             "unknown": self.claim.reason,
         }[self.verdict]
         plant = "".join(f", {name} = {value:.6g}" for name, value in self.claim.failing_plant.items())
-        where = "" if found is None else f" At x = {listed(found.x)}{plant} it fails by {found.condition:.3g}."
-        but = f" but for {{V < {self.claim.hole!r}}}" if self.pushes and self.claim.hole > 0 else ""
-        return (
-            f"The verdict is on the claim that a sublevel set on which V falls so{but} holds all of X₀: {why}.{where}"
-        )
+        where = "" if found is None else f" At x = {format_state(found.x)}{plant} it fails by {found.condition:.3g}."
+        but = f" but for {{V < {self.claim.hole!r}}}" if self.disturbance and self.claim.hole > 0 else ""
+        return f"The verdict is on the claim that a sublevel set on which V falls so{but} contains X₀: {why}.{where}"
 
     def figure(self) -> figures.Figure:
         controller, problem = self.controller, self.controller.problem
@@ -247,12 +253,13 @@ class RegionCertificate(Certificate):
         )
 
     def _paths(self) -> Tensor | None:
-        """Closed loops of the receding law over T from states just inside a region of two, (times, k, n); each of a
-        plant of its own, where it is about several.
+        """Closed loops over T from states just inside a region of two states, (times, k, n); None for other regions.
+
+        If the claim is about several plants, each closed loop has a random one.
         """
         claim, loop, horizon = self.claim, self.controller.closed_loop, self.controller.horizon
         n, generator = claim.states.dimension, stream(0, CERTIFICATION)
-        if n - len(claim.left_out) != 2:  # elsewhere they would not lie in the slice
+        if n - len(claim.left_out) != 2:  # the closed loops would not lie in the slice
             return None
         x = claim.states.sample(20_000, generator).to(claim.states.lower)
         t = x.new_zeros(())

@@ -1,4 +1,4 @@
-"""Reports of certificates: the claim in words and formulas, its figures, and what it is about; JSON and Markdown."""
+"""Reports of certificates in JSON and Markdown: the claim in words and formulas, its figure, and its subject."""
 
 import io
 import json
@@ -22,42 +22,40 @@ from lyapnet.task.systems import SYSTEMS, ControlAffineSystem
 
 
 def require_writable(figure: Path | None, folder: Path | None, keep: str | None = None) -> None:
-    """Refuse what could not be written after the work; make the report's folder.
+    """Check before the work that outputs can be written; create the folder of the report.
 
     Raises:
-        UsageError: no folder for the figure or the kept proof, a format that cannot be drawn, or no report folder.
+        UsageError: a folder does not exist or cannot be created, or the format of the figure is unknown.
     """
     if keep is not None and not Path(keep).parent.is_dir():
-        raise UsageError(
-            f"Expected --keep in a folder that exists, got {keep!r}; make {str(Path(keep).parent)!r} first."
-        )
+        raise UsageError(f"Expected keep in a folder that exists, got {keep!r}; make {str(Path(keep).parent)!r} first.")
     if figure is not None:
         formats = Figure().canvas.get_supported_filetypes()
         if figure.suffix.removeprefix(".") not in formats:
             known = ", ".join(sorted(formats))
-            raise UsageError(f"Expected --figure as a file of {known}, got {str(figure)!r}; for example claim.png.")
+            raise UsageError(f"Expected figure as a file of {known}, got {str(figure)!r}; for example claim.png.")
         if not figure.parent.is_dir():
             raise UsageError(
-                f"Expected --figure in a folder that exists, got {str(figure)!r}; make {str(figure.parent)!r} first."
+                f"Expected figure in a folder that exists, got {str(figure)!r}; make {str(figure.parent)!r} first."
             )
     if folder is not None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(
-                f"Expected --report as a folder, got {str(folder)!r} ({error.strerror}); choose another."
+                f"Expected report as a folder, got {str(folder)!r} ({error.strerror}); choose another."
             ) from error
 
 
 def write_outputs(
     certificate: Any, checkpoint: Path | None, command: str, figure: Path | None, folder: Path | None
 ) -> Iterator[Path]:
-    """Write the figure and the report that are asked for, each whole or not at all; their paths, as they are written.
+    """Write the figure and the report, each file completely or not at all; yield the path of each file.
 
     Args:
         certificate: a lyapnet.Certificate.
-        checkpoint: of the controller; None where it was made from parts.
-        command: that makes the certificate again, or the call.
+        checkpoint: of the controller; None if it has none.
+        command: the command line or the Python call that repeats the certificate.
     """
     targets = [path for path in (figure, folder and folder / certificate.picture) if path]
     picture = certificate.figure() if targets else Figure()
@@ -76,14 +74,14 @@ def write_outputs(
 
 
 def write_figure(picture: Figure, path: Path) -> None:
-    """Write a figure whole or not at all, in the format that the file's name says."""
+    """Write a figure completely or not at all, in the format of the file name's suffix."""
     buffer = io.BytesIO()
     picture.savefig(buffer, dpi=150, format=path.suffix.removeprefix("."))
     write_atomically(path, buffer.getbuffer())
 
 
 def report_of(certificate: Any, checkpoint: Path | None, command: str) -> dict[str, Any]:
-    """Everything about a certificate as plain data."""
+    """The content of a report as plain data."""
     controller, result = certificate.controller, certificate.result
     box, horizon = controller.initial_states, controller.horizon
     return {
@@ -91,7 +89,7 @@ def report_of(certificate: Any, checkpoint: Path | None, command: str) -> dict[s
         "verdict": result["verdict"],
         "claim": {
             "words": certificate.in_words(), "formula": certificate.in_formulas(),
-            "verdict": certificate.of_the_verdict(),
+            "verdict": certificate.verdict_text(),
         },
         "certificate": result,
         "numbers": certificate.rows,
@@ -110,7 +108,7 @@ def report_of(certificate: Any, checkpoint: Path | None, command: str) -> dict[s
 
 
 def _parts(controller: Controller) -> dict[str, Any]:
-    """What a controller is made of, as the config of its run says; by their classes where there was none."""
+    """System, cost, controls and network of a controller, from its config; without a config, their classes."""
     try:
         config = controller.config
     except UsageError:
@@ -138,7 +136,7 @@ def _parts(controller: Controller) -> dict[str, Any]:
 
 
 def markdown(report: dict[str, Any]) -> str:
-    """The report for a reader."""
+    """The report as Markdown."""
     claim, horizon = report["claim"], report["horizon"]
     parameters = ", ".join(f"{name} = {value}" for name, value in report["system"]["parameters"].items())
     given, network = report["checkpoint"], report["network"]
@@ -161,22 +159,22 @@ def markdown(report: dict[str, Any]) -> str:
         claim["words"],
         "\n".join(["```text", *claim["formula"], "```"]),
         f"**{report['verdict'].capitalize()}.** {claim['verdict']}",
-        f"![The claim, drawn]({report['figure']})",
+        f"![Figure of the claim]({report['figure']})",
         "## Numbers",
         "Rounded to nearest, shares downwards; in full in [report.json](report.json).",
         _table(("", ""), report["numbers"]),
         "## States",
         _table(*_boxes(report)),
-        "## What it is about",
+        "## Subject",
         _table(("", ""), list(about.items())),
-        "## Again",
+        "## To repeat it",
         f"```bash\n{report['command']}\n```",
     ]
     return "\n\n".join(sections)
 
 
 def _boxes(report: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """X₀, and D where there is one, state by state."""
+    """The heading and rows of a table of X₀, and of D if there is one; a row for each state."""
     boxes = {"X₀": list(report["initial_states"].values())}
     D = report["certificate"].get("set")
     if D is not None and len(D[0]) == len(report["states"]):
@@ -195,7 +193,7 @@ def _table(heading: Any, rows: Any) -> str:
 
 
 def _system(controller: Controller, config: Config) -> dict[str, Any]:
-    """Its name and its parameters, but for those of which there is a family."""
+    """Name and parameters of the system, without the parameters of a family."""
     system = controller.system
     if not isinstance(system, FamilySystem):
         return {"name": _name(system), "parameters": controller.parameters}
@@ -205,25 +203,25 @@ def _system(controller: Controller, config: Config) -> dict[str, Any]:
 
 
 def _name(system: ControlAffineSystem) -> str:
-    """The name of a registered system, module:Class of any other."""
+    """The name of a registered system, else module:Class."""
     cls = type(system)
     return next((name for name, known in SYSTEMS.items() if known is cls), f"{cls.__module__}:{cls.__qualname__}")
 
 
 def _controls(controller: Controller, config: Config) -> dict[str, Any]:
-    """The limits of U, None for none; of a set of the user's own its name; nothing where U is all of ℝᵐ."""
+    """The limits of U with None for ∞; the class and parameters of another set; empty if U = ℝᵐ."""
     controls = controller.controls
     if controls.limits is None:
         return {"name": f"{type(controls).__module__}:{type(controls).__qualname__}", **config.controls.parameters}
     if not controls.limited:
         return {}
     sides = (side.expand(controller.system.m).tolist() for side in controls.limits)
-    listed = ([limit if math.isfinite(limit) else None for limit in side] for side in sides)
-    return dict(zip(("lower", "upper"), listed, strict=True))
+    finite = ([limit if math.isfinite(limit) else None for limit in side] for side in sides)
+    return dict(zip(("lower", "upper"), finite, strict=True))
 
 
 def _cost(controller: Controller, config: Config) -> dict[str, Any]:
-    """The cost's matrices as the config has them, or its name and parameters; and what it is about."""
+    """The matrices of the cost in the config, or its class and parameters; and its target, in words."""
     cost, words = controller.cost, list[str]()
     while isinstance(cost, MadeOfAnother | FamilyCost):
         moving = ", ".join(name for name in config.family if name.startswith(PREFIX))

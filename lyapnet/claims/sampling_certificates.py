@@ -1,4 +1,4 @@
-"""Certificates from sampled closed loops: a share of the samples, or a bound of the share of X₀."""
+"""Certificates from sampled closed loops: the share of successes, or a bound of the share of X₀ that succeeds."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -13,7 +13,7 @@ from lyapnet.task.constraints import names_of
 
 
 class SampledCertificate(Certificate):
-    """The share of some states whose closed loop succeeds."""
+    """The share of sampled states whose closed loop succeeds."""
 
     kind: str = "sampled"
     picture: str = "states.png"
@@ -24,7 +24,7 @@ class SampledCertificate(Certificate):
         "terminal_share": "‖x(T)‖ within the radius",
         "cost_share": "cost ≤ V(0, x₀), up to the tolerance",
         "constraints_share": "constraints kept",
-        "all_share": "all that is asked for",
+        "all_share": "all conditions hold",
         "confidence": "confidence",
         "draws": "draws of this checkpoint, other seeds included",
         "confidence_over_draws": "confidence over all of them",
@@ -32,7 +32,7 @@ class SampledCertificate(Certificate):
         "terminal_lower_bound": "‖x(T)‖ within the radius on at least",
         "cost_lower_bound": "cost ≤ V(0, x₀), up to the tolerance, on at least",
         "constraints_lower_bound": "constraints kept on at least",
-        "probability_lower_bound": "all that is asked for on at least",
+        "probability_lower_bound": "all conditions hold on at least",
         "required_share": "share of X₀ that the verdict is about",
         "failure": "a state that fails",
         "caveat": "this draw",
@@ -42,22 +42,23 @@ class SampledCertificate(Certificate):
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
-        asked = (*claim.tolerances.asked, "all")
+        events = (*claim.tolerances.asked, "all")
         return {
             "samples": claim.samples,
-            **{f"{event}_share": share for event, share in claim.shares.items() if event in asked},
+            **{f"{event}_share": share for event, share in claim.shares.items() if event in events},
             "tolerances": {name: value for name, value in asdict(claim.tolerances).items() if name != "constraints"},
             "failure": claim.failures[0].tolist() if len(claim.failures) else None,
         }
 
     def in_words(self) -> str:
         return (
-            f"Of {self._drawn}, {self.claim.successes['all']} succeed: their closed loops keep the conditions below on "
-            f"the nodes of the horizon. About the other states of X₀ this proves nothing.{self.of_parameters}"
+            f"Of {self._sample}, {self.claim.successes['all']} succeed: their closed loops satisfy the conditions "
+            f"below at the nodes of the horizon. This proves nothing about other states of X₀.{self.parameters_text}"
         )
 
     @property
-    def _drawn(self) -> str:
+    def _sample(self) -> str:
+        """The sample, in words."""
         return f"{self.claim.samples} states drawn uniformly from X₀ (seed {self.options['seed']})"
 
     def in_formulas(self) -> list[str]:
@@ -68,11 +69,11 @@ class SampledCertificate(Certificate):
             "cost": "J(x₀) ≤ {:g} V(0, x₀)",
         }
         numbers, constraints = {**limits, "cost": 1 + limits["cost"]}, names_of(self.controller.problem.constraints)
-        asked = [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
-        return [*asked, *([f"h(xₙ) ≤ 0: {'; '.join(constraints)}"] if constraints else [])]
+        formulas = [line.format(numbers[name]) for name, line in lines.items() if limits[name] is not None]
+        return [*formulas, *([f"h(xₙ) ≤ 0: {'; '.join(constraints)}"] if constraints else [])]
 
-    def of_the_verdict(self) -> str:
-        why = "one that fails was found" if self.verdict == "falsified" else "no sample fails, which proves nothing"
+    def verdict_text(self) -> str:
+        why = "one that fails was found" if self.verdict == "falsified" else "no sample fails, which is no proof"
         return f"The verdict is on the claim that every state of X₀ succeeds: {why}."
 
     def figure(self) -> figures.Figure:
@@ -83,16 +84,16 @@ class SampledCertificate(Certificate):
 
     @property
     def headline(self) -> str:
-        """The claim in the title of its figure."""
+        """The claim as the title of its figure."""
         return f"sampled, {self.verdict}: {self.claim.successes['all']} of {self.claim.samples} states succeed"
 
 
 class StatisticalCertificate(SampledCertificate):
-    """A share of X₀ that succeeds, with a confidence."""
+    """A lower bound of the share of X₀ that succeeds, with a confidence."""
 
     kind: str = "statistical"
     claim: BoundedShare
-    caveat: str | None = None  # why the draw is not on record
+    caveat: str | None = None  # the reason if the draw could not be recorded
 
     def numbers(self) -> dict[str, Any]:
         claim = self.claim
@@ -100,33 +101,33 @@ class StatisticalCertificate(SampledCertificate):
             "confidence": claim.confidence, "draws": claim.draws,
             "confidence_over_draws": claim.confidence_over_draws, "required_share": claim.share, **claim.named_bounds,
         }  # fmt: skip
-        said = {"caveat": self.caveat, "advice": self._advice}
-        return {**super().numbers(), **bounds, **{key: text for key, text in said.items() if text}}
+        notes = {"caveat": self.caveat, "advice": self._advice}
+        return {**super().numbers(), **bounds, **{key: text for key, text in notes.items() if text}}
 
     @property
     def _advice(self) -> str | None:
-        """What to do where V is no bound, as that of the value program need not be."""
+        """Advice if the cost exceeds V too often, and V was trained by the value program, which allows this."""
         estimate, share = isinstance(self.controller.program, ValueProgram), self.claim.shares["cost"]
         if self.verdict == "certified" or not estimate or share >= self.claim.share:
             return None
         return (
-            "V of the value program estimates the cost and need not bound it; for a bound train on with --finetune and "
-            "program.name=lyapunov"
+            "V of the value program estimates the cost and need not be an upper bound; for a bound, train on (option "
+            "finetune) with program.name=lyapunov"
         )
 
     def in_words(self) -> str:
         bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]
         return (
-            f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop keeps the "
-            "conditions below on the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound of "
-            f"{successes} successes in {self._drawn}. The confidence is over the draw{self._others}. Like the rollouts "
-            f"the claim speaks of this model, this Δt and this integrator.{self.of_parameters}"
+            f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop satisfies "
+            "the conditions below at the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound for "
+            f"{successes} successes in {self._sample}. The confidence is over the draw{self._other_draws}. Like the "
+            f"rollouts, the claim is about this model, this Δt and this integrator.{self.parameters_text}"
         )
 
     @property
-    def _others(self) -> str:
-        """What there is to say of further draws."""
-        chosen = f", one of {self.claim.draws} of this checkpoint, from which it may have been chosen"
+    def _other_draws(self) -> str:
+        """Words on further draws of this checkpoint."""
+        chosen = f", which may have been chosen among {self.claim.draws} draws of this checkpoint"
         return (chosen if self.claim.draws > 1 else "") + (f"; {self.caveat}" if self.caveat else "")
 
     @property
@@ -137,11 +138,11 @@ class StatisticalCertificate(SampledCertificate):
         bound = floored(self.claim.probability_lower_bound)
         return [*super().in_formulas(), f"P(x₀ succeeds) ≥ {bound}  for x₀ uniform on X₀"]
 
-    def of_the_verdict(self) -> str:
+    def verdict_text(self) -> str:
         why = {
-            "certified": "the bound is not below it",
-            "falsified": "the share is below it at the same confidence",
-            "unknown": "these samples do not tell",
+            "certified": "the lower bound is at least that",
+            "falsified": "the share is smaller, at the same confidence",
+            "unknown": "these samples do not decide it",
         }[self.verdict]
         return f"The verdict is on the claim that at least {self.claim.share:.6g} of X₀ succeeds: {why}."
 

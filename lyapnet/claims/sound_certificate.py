@@ -1,4 +1,4 @@
-"""Certificates by proof: a funnel, and the cost that it guarantees."""
+"""Certificates of a funnel and the cost that it guarantees, by proof."""
 
 from collections.abc import Mapping
 from functools import cached_property
@@ -9,7 +9,7 @@ from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import Corner
 from lyapnet.claims import figures
 from lyapnet.claims.arguments import COMPARED
-from lyapnet.claims.certificates import FROZEN, NOT_PROVED, however_pushed, listed, named_pushes
+from lyapnet.claims.certificates import FROZEN, NOT_PROVED, disturbance_text, format_state, named_disturbance
 from lyapnet.claims.costs import CostCertificate, Inside
 from lyapnet.claims.funnel import ProvedFunnel
 from lyapnet.claims.least_cost import ProvedLowerBound
@@ -19,7 +19,7 @@ from lyapnet.prover.condition import DecreaseCondition
 
 
 class SoundCertificate(CostCertificate):
-    """A funnel that no closed loop leaves, and its cost."""
+    """A funnel that no closed loop leaves, and the cost that it guarantees."""
 
     kind: str = "sound"
     picture: str = "funnel.png"
@@ -49,11 +49,11 @@ class SoundCertificate(CostCertificate):
 
     @property
     def complete(self) -> bool:
-        """Whether there is nothing more to prove: a funnel holds all of X₀."""
+        """Whether no larger funnel is needed: it contains X₀."""
         return self.verdict == "certified"
 
     def sought(self) -> tuple[DecreaseCondition, tuple[Corner, Corner], float]:
-        """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to hold."""
+        """The condition in plain arithmetic, [0, T] × D, and the level up to which it was to be proved."""
         claim = self.claim
         loop = copied(self.controller.closed_loop)
         condition = DecreaseCondition(loop, claim.alpha, claim.delta, disturbance=claim.disturbance)
@@ -69,25 +69,25 @@ class SoundCertificate(CostCertificate):
 
     def proved(self) -> dict[str, Any]:
         claim, names = self.claim, self.controller.system.state_names
-        kept = {
+        constraints = {
             "constraints": list(claim.constraints) if claim.volume_share else [], "crossing_level": claim.crossing,
             "violation": None if claim.violation is None else claim.violation._asdict(),
         } if claim.constraints else {}  # fmt: skip
         return {
-            "alpha": claim.alpha, "delta": claim.delta, "disturbance": self.pushes, "duration": claim.duration,
+            "alpha": claim.alpha, "delta": claim.delta, "disturbance": self.disturbance, "duration": claim.duration,
             "rho": claim.rho if claim.volume_share else None, "rho_wanted": claim.wanted,
             "set": [claim.states.lower.tolist(), claim.states.upper.tolist()],
             "states_left_out": [names[i] for i in claim.left_out], "volume_share": claim.volume_share,
             "terminal_excess": claim.terminal_excess if claim.volume_share else None, "reason": claim.reason,
             "boxes": claim.boxes, "seconds": claim.seconds, "remaining_volume": claim.remaining_volume,
             "counterexample": None if claim.counterexample is None else claim.counterexample._asdict(),
-            "fingerprint": claim.fingerprint, **kept,
+            "fingerprint": claim.fingerprint, **constraints,
         }  # fmt: skip
 
     @property
-    def pushes(self) -> dict[str, float]:
-        """The disturbed states and how much their derivatives are pushed at most."""
-        return named_pushes(self.claim.disturbance, self.controller.system.state_names)
+    def disturbance(self) -> dict[str, float]:
+        """The bound w_i of each disturbed state, by its name."""
+        return named_disturbance(self.claim.disturbance, self.controller.system.state_names)
 
     def in_words(self) -> str:
         claim = self.claim
@@ -96,51 +96,51 @@ class SoundCertificate(CostCertificate):
         return (
             f"{{V(0, ·) ≤ ρ}} with ρ = {claim.rho!r} is the mouth of a funnel, proved in continuous time for this "
             f"model: no closed loop that starts in it leaves the funnel, or D,{self._or_violates} up to "
-            f"T = {claim.duration:g} s, {self._however_pushed}and its cost is bounded as below. It holds at least "
-            f"{floored(claim.volume_share)} of X₀ by volume. It is about the operations that f, g, ℓ, V and u were "
-            f"traced to, of this fingerprint; {FROZEN}{self.of_parameters}"
+            f"T = {claim.duration:g} s, {self._under_disturbances}and its cost is bounded as below. It holds at least "
+            f"{floored(claim.volume_share)} of X₀ by volume. It is about the traced operations of f, g, ℓ, V and u, "
+            f"which have this fingerprint; {FROZEN}{self.parameters_text}"
             f"{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 
     @property
-    def _however_pushed(self) -> str:
-        """What the claim adds about disturbances."""
-        return f"{however_pushed(self.pushes)}, " if self.pushes else ""
+    def _under_disturbances(self) -> str:
+        """Words on disturbances; empty without any."""
+        return f"{disturbance_text(self.disturbance)}, " if self.disturbance else ""
 
     @property
     def _or_violates(self) -> str:
-        """What else no closed loop of the funnel does."""
+        """Words on constraints; empty without any."""
         return f" or violates a constraint ({'; '.join(self.claim.constraints)})," if self.claim.constraints else ""
 
     def in_formulas(self) -> list[str]:
         claim = self.claim
-        # unrounded, as proved
+        # not rounded, since the proof is about these numbers
         alpha, delta, T = (f"{value!r}".removesuffix(".0") for value in (claim.alpha, claim.delta, claim.duration))
         rho, kappa = (repr(claim.rho), repr(claim.terminal_excess)) if claim.volume_share else ("ρ", "κ")
-        kept = ("  and  h(x) ≤ 0", "  and  h(x(t)) ≤ 0", "  and  h(x₀) ≤ 0") if self.claim.constraints else [""] * 3
+        h = ("  and  h(x) ≤ 0", "  and  h(x(t)) ≤ 0", "  and  h(x₀) ≤ 0") if self.claim.constraints else [""] * 3
         return [
-            f"V_t + V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if self.pushes else ''} + {alpha} ℓ(x, u) ≤ {delta}  "
-            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{kept[0]}",
-            f"V(t, x(t)) ≤ {rho} + {delta} t{kept[1]}  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}{kept[2]}",
+            f"V_t + V_xᵀ(f + g u){' + Σ w_i |∂V/∂x_i|' if self.disturbance else ''} + {alpha} ℓ(x, u) ≤ {delta}  "
+            f"at each (t, x) ∈ [0, {T}] × D with V(t, x) ≤ {rho} + {delta} t{h[0]}",
+            f"V(t, x(t)) ≤ {rho} + {delta} t{h[1]}  and  x(t) ∈ D  from each x₀ ∈ D with V(0, x₀) ≤ {rho}{h[2]}",
             f"J(x₀) ≤ (V(0, x₀) + {delta} · {T}) / {alpha} + {kappa}  from the same x₀",
         ]
 
-    def of_the_verdict(self) -> str:
+    def verdict_text(self) -> str:
         found, violation = self.claim.counterexample, self.claim.violation
         if violation is not None:
             return (
                 "The verdict is on the claim that no closed loop from X₀ violates a constraint: the one from "
-                f"x₀ = {listed(violation.x0)} does at t = {violation.t:.6g} s, {violation.constraint}, by h = "
+                f"x₀ = {format_state(violation.x0)} does at t = {violation.t:.6g} s, {violation.constraint}, by h = "
                 f"{violation.h:.3g} (Runge-Kutta steps of a quarter of Δt)."
             )
         why = {
             "certified": "it does",
-            "falsified": "the condition fails inside the funnel that this would take",
+            "falsified": "the condition fails inside this funnel",
             "unknown": "undecided within the budget",
         }[self.verdict]
         where = ""
         if found is not None:
-            where = f" At t = {found.t:.6g} s, x = {listed(found.x)} it fails by {found.condition:.3g}."
+            where = f" At t = {found.t:.6g} s, x = {format_state(found.x)} it fails by {found.condition:.3g}."
         return f"The verdict is on the claim that a funnel holds all of X₀: {why}.{where}"
 
     def in_short(self, lower: ProvedLowerBound) -> str:

@@ -1,4 +1,4 @@
-"""Claims about a controller from closed-loop rollouts of sampled initial states: a share, and an exact bound of it."""
+"""Claims from closed loops of sampled initial states: the share of successes, and an exact bound of it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,18 +20,18 @@ from lyapnet.task.problem import Problem
 
 @dataclass(frozen=True)
 class CountedSuccesses:
-    """On `successes["all"]` of `samples` states drawn uniformly from X₀ the closed loop succeeded. It proves no more.
+    """The closed loop succeeded from `successes["all"]` of `samples` states drawn uniformly from X₀.
 
-    The claim that every state of X₀ succeeds is falsified by one that fails, and else unknown.
+    The claim that every state of X₀ succeeds is falsified by one that fails, and otherwise unknown.
     """
 
     states: State  # the samples, (samples, n)
-    held: Bool[Tensor, "samples events"]  # which of EVENTS, from each of them
+    held: Bool[Tensor, "samples events"]  # which of EVENTS hold from each of them
     tolerances: Tolerances
 
     @property
     def samples(self) -> int:
-        """How many states were drawn."""
+        """The number of states that were drawn."""
         return len(self.states)
 
     @property
@@ -46,7 +46,7 @@ class CountedSuccesses:
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that every state of X₀ succeeds."""
+        """The verdict on the claim that every state of X₀ succeeds."""
         return "falsified" if len(self.failures) else "unknown"
 
     @property
@@ -60,18 +60,18 @@ class BoundedShare(CountedSuccesses):
     """With this confidence, at least `probability_lower_bound` of X₀ by volume succeeds.
 
     The confidence is over the draw of the samples: of many such claims, at most a share 1 − confidence is false. It
-    holds for each event by itself. Like the rollouts it speaks of this model, this Δt and this integrator. Where one of
-    K draws was chosen, the bounds hold with confidence 1 − K(1 − confidence) alone (Bonferroni), and the verdict takes
-    bounds that keep the confidence, each at 1 − (1 − confidence)/K.
+    holds for each event separately. Like the rollouts, the claim is about this model, this Δt and this integrator. If
+    one of K draws was chosen, the bounds hold only with confidence 1 − K(1 − confidence) (Bonferroni). The verdict
+    therefore uses bounds with confidence 1 − (1 − confidence)/K each, which together have the confidence.
     """
 
     confidence: float
-    share: float  # of X₀, about which there is a verdict
-    draws: int = 1  # K, this one included
+    share: float  # the share of X₀ in the claim of the verdict
+    draws: int = 1  # K, including this one
 
     @property
     def confidence_over_draws(self) -> float:
-        """With which the bounds hold, whichever of the draws this is."""
+        """The confidence of the bounds if this draw was chosen among K."""
         return max(0.0, 1 - self.draws * (1 - self.confidence))
 
     @property
@@ -81,7 +81,7 @@ class BoundedShare(CountedSuccesses):
 
     @property
     def named_bounds(self) -> dict[str, float]:
-        """The bounds by the names they are printed under: of success, and of each event that is asked for."""
+        """The bounds by their keys in `result`: of success, and of each event that the tolerances require."""
         bounds = self.lower_bounds
         single = {f"{event}_lower_bound": bounds[event] for event in self.tolerances.asked}
         return {"probability_lower_bound": bounds["all"], **single}
@@ -93,7 +93,7 @@ class BoundedShare(CountedSuccesses):
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that at least `share` of X₀ succeeds, at this confidence either way."""
+        """The verdict on the claim that at least `share` of X₀ succeeds; certified or falsified with the confidence."""
         each, failures = 1 - (1 - self.confidence) / self.draws, len(self.failures)
         if lower_bound(self.successes["all"], self.samples, each) >= self.share:
             return "certified"
@@ -103,12 +103,12 @@ class BoundedShare(CountedSuccesses):
 def lower_bound(successes: int, samples: int, confidence: float) -> float:
     """The exact one-sided Clopper-Pearson bound of a probability.
 
-    It is the p at which so many successes or more have probability 1 − confidence,
-    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1), the regularised incomplete beta function, solved for p. (The
-    binomtest of scipy finds the same p by a search for a root.)
+    It is the p for which k = successes or more have probability 1 − confidence. It solves
+    P(Binomial(samples, p) ≥ k) = I_p(k, samples − k + 1) = 1 − confidence, where I_p is the regularised incomplete beta
+    function. (scipy.stats.binomtest gives the same p by root finding.)
 
     Raises:
-        ValueError: successes do not lie between 0 and samples, or the confidence not strictly between 0 and 1.
+        ValueError: successes are not between 0 and samples, or the confidence is not strictly between 0 and 1.
 
     Source: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
     Biometrika 1934.
@@ -128,12 +128,12 @@ def count_successes(
     generator: torch.Generator | None = None,
     batch: int = 1000,
 ) -> CountedSuccesses:
-    """Count successes among fresh states of X₀; K = 100 as in the paper.
+    """Count successes among fresh random states of X₀; the paper takes 100.
 
     Args:
-        rollout: under a control law that a V defines.
-        problem: whose X₀, goal and constraints are meant.
-        batch: states that are rolled out at once, which bounds the memory.
+        rollout: closed loops under the control law of a V.
+        problem: gives X₀, the goal and the constraints.
+        batch: the number of states that are rolled out at once, to limit the memory.
 
     Raises:
         ValueError: less than one sample or state at once.
@@ -160,21 +160,21 @@ def bound_share(
 ) -> BoundedShare:
     """Bound the share of X₀ on which the closed loop succeeds, from fresh states.
 
-    The states must be fresh, drawn by a generator on which nothing was trained or chosen, and their number fixed in
-    advance: drawing until the bound pleases voids it, unless all the draws are counted.
+    The states must be fresh: nothing was trained or chosen on them. Their number must be fixed in advance. If the draw
+    is repeated until the bound is good, the bound is invalid, unless all draws are counted.
 
     Args:
-        draws: from which this one may be chosen, itself included.
+        draws: the number of draws from which this one was chosen, itself included.
 
     Raises:
         ValueError: as count_successes and lower_bound.
     """
-    lower_bound(0, samples, confidence)  # refuse before the work
+    lower_bound(0, samples, confidence)  # refuse wrong arguments before the work
     sampled = count_successes(rollout, problem, tolerances, samples, generator, batch)
     return BoundedShare(**vars(sampled), confidence=confidence, share=share, draws=draws)
 
 
-FEWEST = 16  # states that are counted as failures together where one of them diverges
+FEWEST = 16  # a batch of so many states, one of which diverges, is not divided further: all count as failures
 
 
 def _events(
@@ -182,8 +182,8 @@ def _events(
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
-    One divergent closed loop ends its whole batch: it is sought by halves. Its last few neighbours count as failures
-    with it, which can only lower a share.
+    One divergent closed loop stops its whole batch, which is then halved to find it. The FEWEST states around it count
+    as failures too; this can only lower a share.
     """
     try:
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""What certificates show in a terminal."""
+"""Tables and progress messages of certificates for a terminal."""
 
 import io
 import math
@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 
-def progress_told_to(stages: Callable[..., None], kind: str) -> Callable[[Any], None]:
-    """Tells stages of Progress: what is done, and how much of [0, T] × D, of D or of X₀ a proof has left undecided."""
+def progress_reporter(stages: Callable[..., None], kind: str) -> Callable[[Any], None]:
+    """A callback for Progress that passes on the stage and the undecided share of [0, T] × D, D or X₀."""
     domain = {"region": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(kind, "[0, T] × D")
 
     def report(progress: Any) -> None:
@@ -21,7 +21,7 @@ def progress_told_to(stages: Callable[..., None], kind: str) -> Callable[[Any], 
 
 
 def table_of(title: str, rows: Iterable[tuple[str, str]]) -> Table:
-    """The numbers of a claim."""
+    """A table of the numbers of a claim."""
     table = Table("", "", title=title, show_header=False)
     for label, value in rows:
         table.add_row(label, value)
@@ -29,7 +29,7 @@ def table_of(title: str, rows: Iterable[tuple[str, str]]) -> Table:
 
 
 def text_of(table: Table) -> str:
-    """A table as it is printed."""
+    """A table as text."""
     console = Console(file=io.StringIO(), width=100, highlight=False, markup=False)
     with console.capture() as printed:
         console.print(table)
@@ -37,14 +37,14 @@ def text_of(table: Table) -> str:
 
 
 def rows_of(result: Mapping[str, Any], labels: Mapping[str, str]) -> list[tuple[str, str]]:
-    """What the numbers of a claim are called, and the numbers; without those that are not known."""
+    """(label, number as text) for each number of a claim that is known."""
     known = {key: label for key, label in labels.items() if result.get(key) not in (None, [], {})}
-    return [(label, _shown(key, result[key])) for key, label in known.items()]
+    return [(label, _format_value(key, result[key])) for key, label in known.items()]
 
 
-def _shown(key: str, value: Any) -> str:
+def _format_value(key: str, value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_shown('', entry)}" for name, entry in value.items() if entry is not None)
+        return ", ".join(f"{name} {_format_value('', entry)}" for name, entry in value.items() if entry is not None)
     if isinstance(value, str):
         return value[:16] if key.endswith("fingerprint") else value
     if key == "states_left_out":
@@ -52,7 +52,7 @@ def _shown(key: str, value: Any) -> str:
     if isinstance(value, int):
         return f"{value:,}"
     if isinstance(value, list):
-        return f"[{', '.join(_shown('', entry) for entry in value)}]"
+        return f"[{', '.join(_format_value('', entry) for entry in value)}]"
     if key == "ultimate_volume":
         return f"{value:.4g}"
     if key.startswith("confidence"):
@@ -63,5 +63,5 @@ def _shown(key: str, value: Any) -> str:
 
 
 def floored(share: float) -> str:
-    """A lower bound of a share in percent, rounded down so that it stays one."""
+    """A lower bound of a share in percent, rounded down so that it stays a lower bound."""
     return f"{math.floor(1e5 * share) / 1e3:.3f}%"

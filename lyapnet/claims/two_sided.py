@@ -1,4 +1,4 @@
-"""Certificates from two sides: what the controller costs at most, and what any control costs at least."""
+"""Two-sided certificates: an upper bound of the controller's cost, and a lower bound of the cost of any control."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,37 +12,41 @@ from lyapnet.prover.verdict import Verdict
 
 
 class TwoSidedCertificate(Certificate):
-    """What the controller costs at most, and what any control costs at least."""
+    """An upper bound of the controller's cost, and a lower bound of the cost of any control."""
 
     def __init__(self, above: CostCertificate, below: LowerBoundCertificate, options: Mapping[str, Any]):
         super().__init__(above.controller, above.claim, options)
         self.above, self.below, self.kind = above, below, above.kind
         self.picture = above.picture_of_both
-        above.options = options  # the seconds are those of both
+        above.options = options  # with the seconds of both proofs
 
     @property
     def verdict(self) -> Verdict:
-        """On both sides: each holds for all of X₀, and both are about the controller."""
+        """The verdict on the claim that both bounds hold for this controller on all of X₀."""
         both = self.above.verdict, self.below.verdict
         if "falsified" in both:
             return "falsified"
-        return "unknown" if "unknown" in both or self._apart else "certified"
+        return "unknown" if "unknown" in both or self._mismatch else "certified"
 
     @property
-    def _apart(self) -> str:
-        return self.above.why_apart(self.below.claim)
+    def _mismatch(self) -> str:
+        return self.above.mismatch(self.below.claim)
 
     def proved(self) -> dict[str, Any]:
-        """The numbers of both claims, without the optimum."""
+        """The numbers of both claims, without a comparison with the optimum."""
         above, below = self.above, self.below
         return {
             **above.proved(), **above.beside(below.claim), **below.proved(),
-            **below.against(above.inside), "seconds": above.claim.seconds + below.claim.seconds,
+            **below.compare_bounds(above.inside), "seconds": above.claim.seconds + below.claim.seconds,
         }  # fmt: skip
 
     def numbers(self) -> dict[str, Any]:
         above, below = self.above, self.below
-        return {**self.proved(), "guaranteed_cost_ratio": above.cost_ratio, **below.around(above.inside, above.optimum)}
+        return {
+            **self.proved(),
+            "guaranteed_cost_ratio": above.cost_ratio,
+            **below.compare_optima(above.inside, above.optimum),
+        }
 
     @property
     def rows(self) -> list[tuple[str, str]]:
@@ -54,8 +58,8 @@ class TwoSidedCertificate(Certificate):
     def in_formulas(self) -> list[str]:
         return [*self.above.in_formulas(), *self.below.in_formulas()]
 
-    def of_the_verdict(self) -> str:
-        both = self.above.of_the_verdict(), self.below.of_the_verdict("And"), self._apart
+    def verdict_text(self) -> str:
+        both = self.above.verdict_text(), self.below.verdict_text("And"), self._mismatch
         return " ".join(filter(None, both))
 
     def figure(self) -> figures.Figure:
@@ -65,7 +69,7 @@ class TwoSidedCertificate(Certificate):
 
 
 def labels_of_both(above: type[CostCertificate]) -> dict[str, str]:
-    """The labels of both sides; those of seconds and fingerprints at the end."""
+    """The table labels of both bounds, with seconds and fingerprints at the end."""
     below = LowerBoundCertificate.labels
     others = {key: label for key, label in {**above.labels, **above.labels_beside}.items() if key not in below}
     return {**others, **below}

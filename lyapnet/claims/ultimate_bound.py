@@ -1,4 +1,4 @@
-"""Where pushes that do not fade keep closed loops: the level of V above which it falls whatever they are."""
+"""The ultimate bound under disturbances: the level above which V falls under every disturbance."""
 
 from collections.abc import Sequence
 
@@ -13,35 +13,34 @@ from lyapnet.prover.branch_and_bound import Budget, Question, axis_to_cut, minim
 from lyapnet.prover.condition import DecreaseCondition
 from lyapnet.task.sets import Box
 
-SAMPLES, SCALES = 5_000, 10  # states of D, and boxes that are drawn from, each half as large around the goal
-ROOM = 0.01  # above the highest level at which V may rise, and around a hull: bounds decide nothing on the very edge
-FEW = 0.003  # of what is below the highest level: what falls between two levels by chance
-PIECES = 16  # of the box of the constants, about
-LEAST = 1e-6  # of the levels that are tried, where V rises nowhere
+SAMPLES, SCALES = 5_000, 10  # samples in each box, and number of boxes around the goal, each half as large
+ROOM = 0.01  # relative margin above the highest level at which V may rise, and around a hull, where bounds are too wide
+FEW = 0.003  # a smaller share of D between two levels may be due to chance
+PIECES = 16  # pieces into which the box of the constants is cut, about
+LEAST = 1e-6  # the smallest c, as a share of the middle level
 
 
 def ultimate_level(
     condition: DecreaseCondition, domain: tuple[Corner, Corner], goal: State, level: float, budget: Budget
 ) -> float:
-    """The least c that is found with V̇ + λV ≤ 0 at c ≤ V ≤ some ρ, 1 % above it; 0 where there is none.
+    """An estimate of the least c with V̇ + λV ≤ 0 on {c ≤ V ≤ ρ} for some ρ, plus 1 %; 0 if none is found.
 
-    Samples say between which two levels the condition is to hold. Under the middle of these, the highest V at which it
-    may fail is bounded from above, on pieces of the constants' box. Whether it holds from there on is for a proof to
-    say.
+    Samples give two levels between which the condition seems to hold. Below the middle of these, the highest V at which
+    the condition may fail is bounded from above, on pieces of the constants' box. The result is not a proof.
 
     Args:
         condition: V̇ + λV, at V > 0.
-        domain: {0} × D, and the box of the constants.
-        level: no ρ is higher.
+        domain: {0} × D, extended by the box of the constants.
+        level: the highest ρ.
     """
     constants = condition.closed_loop.system.constants
-    between = _longest_fall(condition, domain, goal, level, constants)
+    between = _levels_of_fall(condition, domain, goal, level, constants)
     if between is None:
         return 0.0
     V, middle = condition.V, sum(between) / 2
 
     def possible(t: Time, x: State) -> PerState:
-        """At most 0 where the condition fails under the middle, or is 0."""
+        """At most 0 where V ≤ middle and the condition is ≥ 0."""
         return torch.maximum(-condition(t, x), V(t, x) - middle)
 
     lower, upper = pieces(*domain, [1 + i for i in constants], PIECES)
@@ -49,29 +48,29 @@ def ultimate_level(
     return min(middle, max((1 + ROOM) * highest, LEAST * middle))
 
 
-def _longest_fall(
+def _levels_of_fall(
     condition: DecreaseCondition,
     domain: tuple[Corner, Corner],
     goal: State,
     level: float,
     constants: Sequence[int],
 ) -> tuple[float, float] | None:
-    """The two levels between which V falls at all samples and there is most of D; None where that is little."""
+    """The two levels with the most volume of D between them such that V falls at all samples there, or None."""
     x, weight = _samples(*domain, goal, constants)
     with torch.no_grad():
         t = x.new_zeros(len(x))
         value, falls = condition.height(t, x), condition(t, x) < 0
     within = (value > 0) & (value < level)
     rises = torch.cat([value.new_tensor([0.0, level]), value[within & ~falls]]).sort().values
-    of_each = value.new_zeros(len(rises) + 1)
-    of_each.index_add_(0, torch.searchsorted(rises, value[within & falls]), weight[within & falls])
-    above = int(of_each.argmax())  # number of levels at which V rises, below
-    enough = of_each[above] > FEW * weight[within].sum()
+    shares = value.new_zeros(len(rises) + 1)
+    shares.index_add_(0, torch.searchsorted(rises, value[within & falls]), weight[within & falls])
+    above = int(shares.argmax())  # the index of the upper level
+    enough = shares[above] > FEW * weight[within].sum()
     return (float(rises[above - 1]), float(rises[above])) if enough else None
 
 
 def _samples(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """(x, weights): states of D, and of boxes ever smaller around the goal, where levels are close to each other."""
+    """(x, weights): samples of D and of smaller boxes around the goal, where levels are close to each other."""
     share = torch.rand(SAMPLES, len(goal), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     x = lower[1:] + (upper - lower)[1:] * share
     scales = 0.5 ** torch.arange(SCALES, dtype=torch.float64)
@@ -81,7 +80,7 @@ def _samples(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]
 
 
 def extent_of(V: Value, states: Box, level: float, budget: Budget) -> Box:
-    """A box around {x ∈ D: V(0, x) ≤ level}, as tight as the budget allows; D itself where time is short."""
+    """A box around {x ∈ D: V(0, x) ≤ level}, as tight as the budget allows; at worst D."""
     (lower,), (upper,) = at_time(0.0, states.lower, states.upper)
     question = HullBelow(V, BoundedFunction(lambda t, x: (V(t, x),), (lower, upper)), level)
     search = searched(question, single(lower, upper), Budget(budget.left, chunk=budget.chunk))
@@ -92,17 +91,17 @@ def extent_of(V: Value, states: Box, level: float, budget: Budget) -> Box:
 
 
 class HullBelow(Question):
-    """The hull of {V ≤ level} in a box: that of where V is seen so low, a little enlarged, and of all that is left."""
+    """A box around {V ≤ level}: the hull of points with V ≤ level, slightly enlarged, and of all undecided boxes."""
 
     def __init__(self, V: Value, bounded: BoundedFunction, level: float):
         self.V, self.bounded, self.level = V, bounded, level
-        self.hull: tuple[Tensor, Tensor] = torch.tensor(torch.inf), torch.tensor(-torch.inf)  # of what was seen
+        self.hull: tuple[Tensor, Tensor] = torch.tensor(torch.inf), torch.tensor(-torch.inf)  # of points with V ≤ level
 
     def undecided(self, boxes: Boxes) -> tuple[Boxes, Tensor]:
         (form,), x = self.bounded.forms(boxes.lower, boxes.upper), boxes.center
         with torch.no_grad():
             low = x[self.V(x[:, 0], x[:, 1:]) <= self.level]
-        self.hull = _joined(*self.hull, low, low)
+        self.hull = _hull_of(*self.hull, low, low)
         lower, upper = self._enlarged
         within = ((boxes.lower >= lower) & (boxes.upper <= upper)).all(-1)
         chosen = ~(form.interval()[0] > self.level) & ~within
@@ -111,18 +110,18 @@ class HullBelow(Question):
 
     @property
     def _enlarged(self) -> tuple[Tensor, Tensor]:
-        """The hull in which a box needs no more cutting."""
+        """The hull with a margin; boxes inside it need not be cut further."""
         lower, upper = self.hull
         room = ROOM * (upper - lower)
         return lower - room, upper + room
 
-    def around(self, left: Boxes) -> tuple[Tensor, Tensor]:
-        """(lower, upper) of a box around {V ≤ level}, where some boxes are left."""
-        return _joined(*self._enlarged, left.lower, left.upper)
+    def around(self, undecided: Boxes) -> tuple[Tensor, Tensor]:
+        """(lower, upper) of a box around {V ≤ level}, given the undecided boxes."""
+        return _hull_of(*self._enlarged, undecided.lower, undecided.upper)
 
 
-def _joined(lower: Tensor, upper: Tensor, lows: Tensor, highs: Tensor) -> tuple[Tensor, Tensor]:
-    """The hull of a box and of some others."""
+def _hull_of(lower: Tensor, upper: Tensor, lows: Tensor, highs: Tensor) -> tuple[Tensor, Tensor]:
+    """The hull of a box and of other boxes."""
     if not len(lows):
         return lower, upper
     return torch.minimum(lower, lows.amin(0)), torch.maximum(upper, highs.amax(0))

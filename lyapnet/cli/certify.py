@@ -125,11 +125,11 @@ def check(
     """Whether a kept proof proves its claim: its leaves are bounded anew, without a search."""
     from lyapnet.claims.checking import check as checked
     from lyapnet.claims.checking import labels_of
-    from lyapnet.claims.tables import progress_told_to, rows_of, table_of
+    from lyapnet.claims.tables import progress_reporter, rows_of, table_of
 
     given = given.with_functions(value, law)
     controller = given.load()
-    result = checked(controller, proof, workers, progress_told_to(given.report, "check"))
+    result = checked(controller, proof, workers, progress_reporter(given.report, "check"))
     given.report.rest()
     if as_json:
         print(json.dumps(result, allow_nan=False))
@@ -189,7 +189,7 @@ def _prove_for_each(
 ) -> None:
     """A region for each largest push on one state, each within seconds of its own: a table or JSON, and a figure."""
     from lyapnet.claims.certify import certify
-    from lyapnet.claims.disturbances.regions import RegionsUnderPushes
+    from lyapnet.claims.disturbances.regions import DisturbedRegions
     from lyapnet.claims.disturbances.tables import table
     from lyapnet.claims.report import write_figure
 
@@ -200,7 +200,7 @@ def _prove_for_each(
         certify(controller, each, budget=search.budget(time.monotonic()), seed=output.seed, report=progress)
         for each in claims
     ]
-    regions = RegionsUnderPushes(controller, state, list(pushes), made)
+    regions = DisturbedRegions(controller, state, list(pushes), made)
     given.report.rest()
     if output.as_json:
         print(json.dumps(regions.result, allow_nan=False))
@@ -213,6 +213,6 @@ def _prove_for_each(
 
 def _progress(given: Given, claims: Sequence[Claim]) -> Callable[[Any], None]:
     """What tells how far a proof is."""
-    from lyapnet.claims.tables import progress_told_to
+    from lyapnet.claims.tables import progress_reporter
 
-    return progress_told_to(given.report, ("two-sided " if len(claims) > 1 else "") + claims[0].kind)
+    return progress_reporter(given.report, ("two-sided " if len(claims) > 1 else "") + claims[0].kind)

@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor
 
-HALF, THIRD = 1 / 2, 1 / 3  # of the digits of a type
+HALF, THIRD = 1 / 2, 1 / 3  # shares of the digits of a floating-point type
 
 
 def are_close(found: Tensor, expected: Tensor, digits: float = HALF) -> bool:
-    """Whether two results agree in a share of their digits, each or relative to the largest finite one.
+    """Whether two results agree up to a share of their digits, relative to each entry or to the largest finite one.
 
-    They may add in another order. Where one is not a number, the other is none either.
+    The results may differ by rounding, since sums may be taken in another order. A nan must be nan in both.
     """
     if found.shape != expected.shape or found.dtype != expected.dtype:
         return False

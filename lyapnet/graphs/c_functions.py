@@ -1,8 +1,8 @@
-"""Functions of tensors as C99: their traces written again as loops over arrays, operation by operation.
+"""Translates traced functions of tensors to C99: each operation becomes a loop over arrays.
 
-torch computes operations on constants; their results become tables. Views, such as a transposition or a slice, produce
-no code: an array is a place in memory with strides. All other operations become loops, whose inner line is in RULES;
-identical loops are written once. Memory is allocated on the stack only.
+torch computes operations on constants, and their results become tables. Views, such as a transposition or a slice,
+need no code: an array is a place in memory with strides. All other operations become loops, whose inner line RULES
+gives; identical loops are written once. Memory is allocated only on the stack.
 """
 
 import copy
@@ -20,51 +20,51 @@ from lyapnet.graphs.c_text import Array, Tables, Text
 from lyapnet.graphs.tracing import SHAPED, is_view, name_of
 
 aten = torch.ops.aten
-STACK = 1_000_000  # bytes of arrays in one function, at the most
+STACK = 1_000_000  # largest size of the arrays of one function in bytes: stacks have a few megabytes
 
 
 def c_function(
     signature: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: Tables
 ) -> tuple[str, int]:
-    """A trace as the text of a C function, and the bytes of its arrays on the stack.
+    """The text of a C function for a trace, and the size of its arrays on the stack in bytes.
 
     Args:
-        signature: of the function, without its body, as in `void f(const double *x, double *y)`.
-        graph: of `core_trace`, on one state.
-        arguments: the names of the arrays that it takes, and tensors of their shapes.
-        results: the names of the arrays that take its results.
-        tables: takes the constants.
+        signature: of the function, such as `void f(const double *x, double *y)`.
+        graph: a trace by `core_trace`, for one state.
+        arguments: name of each array argument ↦ a tensor of its shape.
+        results: the names of the arrays for the results.
+        tables: collects the constants.
 
     Raises:
-        ExportError: an operator has no rule; names it. Or its arrays take more than STACK bytes.
+        ExportError: an operator has no rule, or the arrays need more than STACK bytes.
     """
     text = Text(tables)
-    for name in arguments:  # not all functions need all of them
-        text.unused(name)
+    for name in arguments:  # a function may not use all of its arguments
+        text.mark_unused(name)
     write_body(text, graph, arguments, results)
     if text.bytes > STACK:
         raise ExportError(
-            f"Expected a law whose arrays fit on a stack, got {text.bytes / 1e6:.3g} MB; take --to torch or onnx."
+            f"Expected a law whose arrays fit on a stack, got {text.bytes / 1e6:.3g} MB; export it to torch or onnx."
         )
     return f"{signature}\n{{\n" + "".join(f"    {line}\n" for line in text.lines) + "}\n", text.bytes
 
 
 def write_body(text: Text, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str]) -> None:
-    """Write what a trace does: from the arrays of its arguments to those of its results.
+    """Write the operations of a trace, from the arrays of its arguments to those of its results.
 
     Raises:
-        ExportError: an operator has no rule; names it.
+        ExportError: an operator has no rule.
     """
-    graph = _without_shapes_alone(graph)
+    graph = _remove_shape_sources(graph)
     inputs = [Array(name, torch.empty(tensor.shape, device="meta")) for name, tensor in arguments.items()]
-    outputs = _Reader(graph, text).run(*inputs)
+    outputs = _Translator(graph, text).run(*inputs)
     for name, output in zip(results, outputs, strict=True):
         text.copy(output, Array(name, torch.empty(tuple(output.shape), device="meta")))
-    text.excuse_unread()
+    text.mark_unread()
 
 
-def _without_shapes_alone(graph: GraphModule) -> GraphModule:
-    """Remove operations of which only the shape is used, as x.sin() in torch.zeros_like(x.sin())."""
+def _remove_shape_sources(graph: GraphModule) -> GraphModule:
+    """Remove operations of which only the shape is used, such as x.sin() in torch.zeros_like(x.sin())."""
     nodes = copy.deepcopy(graph.graph)
     for node in list(nodes.nodes):
         if node.op == "call_function" and name_of(node.target) in SHAPED:
@@ -78,7 +78,7 @@ def _without_shapes_alone(graph: GraphModule) -> GraphModule:
 
 
 def helpers(code: str) -> list[str]:
-    """The functions that some functions call, as text."""
+    """The text of the helper functions that some code calls."""
     return [text for call, text in HELPERS.items() if call in code]
 
 
@@ -95,9 +95,9 @@ static double remainder_of(double a, double b)
     "solve(": """static void exchange(int n, double *a, double *b)
 {
     for (int i = 0; i < n; i++) {
-        double kept = a[i];
+        double old = a[i];
         a[i] = b[i];
-        b[i] = kept;
+        b[i] = old;
     }
 }
 
@@ -133,16 +133,16 @@ static double solve(int n, int k, double *A, double *b)
 }
 
 
-class _Reader(Interpreter):
-    """Runs a trace on values that are tensors where they are constant, else Arrays, and writes down what it does."""
+class _Translator(Interpreter):
+    """Runs a trace with tensors for constants and Arrays for all other values, and writes its operations as text."""
 
     def __init__(self, graph: GraphModule, text: Text):
         super().__init__(graph)
-        self.extra_traceback = False  # the messages below are for users
+        self.extra_traceback = False  # error messages below are for users
         self.text, self.logical = text, False
 
     def get_attr(self, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
-        return _in_double(super().get_attr(target, args, kwargs))
+        return _to_double(super().get_attr(target, args, kwargs))
 
     def run_node(self, n: Node) -> Any:
         value = n.meta.get("val")
@@ -151,34 +151,34 @@ class _Reader(Interpreter):
 
     def call_function(self, target: Any, args: tuple, kwargs: dict[str, Any]) -> Any:
         if not any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
-            return tree_map(_in_double, target(*args, **kwargs))
+            return tree_map(_to_double, target(*args, **kwargs))
         name = name_of(target)
         if name in SHAPED:
-            return _in_double(target(*tree_map(_of_shape, args), **kwargs))
+            return _to_double(target(*tree_map(_zeros_of_shape, args), **kwargs))
         try:
             if name == "as_strided" or (self.logical and name in ("add", "sub")):
                 raise NotImplementedError
             if is_view(target):
-                return self.text.once(lambda: self.text.viewed(target, *args, **kwargs))
+                return self.text.once(lambda: self.text.view(target, *args, **kwargs))
             if name not in RULES:
                 raise NotImplementedError
             return self.text.once(lambda: RULES[name](self.text, *args, **kwargs))
-        except (TypeError, NotImplementedError) as error:  # no rule, or not for these options
+        except (TypeError, NotImplementedError) as error:  # no rule, or no rule for these options
             raise ExportError(
                 f"Expected operations that can be written in {self.text.language}, got {target}; write f, g, the cost "
                 f"or V in others, add it to the table of operators (docs/operators.md), or {self.text.otherwise}."
             ) from error
-        except Exception as error:  # of any kind: shapes that no rule expected
+        except Exception as error:  # a rule may raise anything for shapes that it does not expect
             raise ExportError(
                 f"Expected operations that can be written in {self.text.language}, got {target}, and "
                 f"{type(error).__name__}: {one_line(error)[:200]}; {self.text.otherwise}."
             ) from error
 
 
-def _in_double(value: Any) -> Any:
-    """A constant as C has it."""
+def _to_double(value: Any) -> Any:
+    """A constant in double precision."""
     return value.double() if isinstance(value, Tensor) and value.is_floating_point() else value
 
 
-def _of_shape(leaf: Any) -> Any:
+def _zeros_of_shape(leaf: Any) -> Any:
     return torch.zeros(leaf.shape, dtype=torch.float64) if isinstance(leaf, Array) else leaf

@@ -1,4 +1,4 @@
-"""Torch's core operators in C: (text, *an operator's arguments) ↦ the array that its result is written to."""
+"""Rules that write torch's core operators in C: (text, *arguments of an operator) ↦ the array of its result."""
 
 import itertools
 import math
@@ -31,7 +31,7 @@ def _sum(sign: str) -> Callable[..., Array]:
     )(text, a, b)
 
 
-def _divided(text: Text, a: Any, b: Any, *, rounding_mode: str | None = None) -> Array:
+def _divide(text: Text, a: Any, b: Any, *, rounding_mode: str | None = None) -> Array:
     if rounding_mode == "floor":
         return _elementwise("({0} - remainder_of({0}, {1})) / {1}")(text, a, b)
     return _elementwise("{0} / {1}" if rounding_mode is None else "trunc({0} / {1})")(text, a, b)
@@ -50,18 +50,20 @@ def _clamp(text: Text, x: Array, min: Any = None, max: Any = None) -> Array:
 
 
 def _reduction(start: float, line: str) -> Callable[..., Array]:
-    """A line that takes one entry after another into the result."""
+    """A reduction along axes; the line combines the result with one entry."""
 
     def rule(text: Text, x: Array, dim: Any = None, keepdim: bool = False, *, dtype: Any = None) -> Array:
         every = range(len(x.shape)) if dim is None or dim == [] else [dim] if isinstance(dim, int) else dim
-        gone = {axis % max(1, len(x.shape)) for axis in every}
-        total = text.new([1 if axis in gone else size for axis, size in enumerate(x.shape)])
+        reduced = {axis % max(1, len(x.shape)) for axis in every}
+        total = text.new([1 if axis in reduced else size for axis, size in enumerate(x.shape)])
         text.each(total.shape, [start], "{into} = {0};", total)
         strided = Array(total.name, total.layout.expand(x.shape))
         text.each(x.shape, [x], line, strided)
         if keepdim:
             return total
-        return Array(total.name, total.layout.reshape([size for axis, size in enumerate(x.shape) if axis not in gone]))
+        return Array(
+            total.name, total.layout.reshape([size for axis, size in enumerate(x.shape) if axis not in reduced])
+        )
 
     return rule
 
@@ -79,7 +81,7 @@ def _norm(text: Text, x: Array, ord: float = 2, dim: Any = None, keepdim: bool =
 
 
 def _product(text: Text, A: Any, B: Any) -> Array:
-    """AB, of matrices, vectors or batches of matrices: row by row, so that the innermost loop is over neighbours."""
+    """AB for matrices, vectors or batches of matrices; the innermost loop is along rows of B, which are contiguous."""
     a, b = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
     shape = (torch.empty(a.shape, device="meta") @ torch.empty(b.shape, device="meta")).shape
     left = a.layout if a.layout.ndim > 1 else a.layout[None]
@@ -98,8 +100,8 @@ def _product(text: Text, A: Any, B: Any) -> Array:
     return Array(result.name, result.layout.reshape(shape))
 
 
-def _same(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **options: Any) -> Any:
-    """The value itself: arrays are never written to again. A whole number is a double too."""
+def _identity(text: Text, x: Any, *_: Any, dtype: torch.dtype | None = None, **options: Any) -> Any:
+    """The value itself, since arrays are never written twice. Integers are stored as double too."""
     if dtype is not None and not dtype.is_floating_point:
         raise NotImplementedError
     return x
@@ -124,8 +126,8 @@ def _stack(text: Text, parts: Sequence[Any], dim: int = 0) -> Array:
     return whole
 
 
-def _scattered(view: Any) -> Callable[..., Array]:
-    """A copy, of which what `view` shows is another array."""
+def _scatter_into(view: Any) -> Callable[..., Array]:
+    """A copy of x in which the part given by `view` is replaced by another array."""
 
     def rule(text: Text, x: Any, source: Any, *place: Any) -> Array:
         whole = text.copy(x, text.new(shape_of(x)))
@@ -135,12 +137,12 @@ def _scattered(view: Any) -> Callable[..., Array]:
     return rule
 
 
-def _copied(text: Text, x: Any, source: Any, *_: Any) -> Array:
+def _copy(text: Text, x: Any, source: Any, *_: Any) -> Array:
     return text.copy(source, text.new(shape_of(x)))
 
 
-def _moved(target: Any) -> Callable[..., Array]:
-    """An operation that moves entries by constant indices: done on their places, by torch."""
+def _rearrangement(target: Any) -> Callable[..., Array]:
+    """An operation that moves entries by constant indices; torch applies it to the positions of the entries."""
 
     def rule(text: Text, x: Any, *args: Any, **kwargs: Any) -> Array:
         if any(isinstance(leaf, Array) for leaf in tree_leaves((args, kwargs))):
@@ -156,18 +158,18 @@ def _moved(target: Any) -> Callable[..., Array]:
 
 
 def _extreme(relation: str) -> Callable[..., Any]:
-    """The first entry along an axis that all others are not < or > than, and its index."""
+    """The first smallest or largest entry along an axis, and its index."""
 
     def rule(text: Text, x: Array, dim: int | None = None, keepdim: bool = False) -> Any:
         if dim is None or not x.shape:
             return RULES["amin" if relation == "<" else "amax"](text, x)
         value = text.copy(Array(x.name, x.layout.select(dim, 0)), text.new(x.layout.select(dim, 0).shape))
         index = text.each(value.shape, [0.0], "{into} = {0};", text.new(value.shape))
-        further = f"{{0}} {relation} {{1}} || ({{0}} != {{0}} && {{1}} == {{1}})"  # what is not a number is the extreme
-        line = f"if ({further}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
+        is_better = f"{{0}} {relation} {{1}} || ({{0}} != {{0}} && {{1}} == {{1}})"  # a nan counts as the extreme
+        line = f"if ({is_better}) {{{{ {{1}} = {{0}}; {{into}} = {{2}}; }}}}"
         for k in range(1, x.shape[dim]):
             text.each(value.shape, [Array(x.name, x.layout.select(dim, k)), value, float(k)], line, index)
-        text.unused(index.name)
+        text.mark_unused(index.name)
         found = value, index
         return [Array(y.name, y.layout.unsqueeze(dim)) if keepdim else y for y in found]
 
@@ -184,31 +186,31 @@ def _index_of_extreme(relation: str) -> Callable[..., Array]:
 
 
 def _gather(text: Text, x: Any, dim: int, index: Any, *, sparse_grad: bool = False) -> Array:
-    """Entries at computed places along an axis."""
+    """Entries at computed indices along an axis."""
     if not isinstance(index, Array):
-        return _moved(aten.gather)(text, x, dim, index)
+        return _rearrangement(aten.gather)(text, x, dim, index)
     x = text.contiguous(x)
     first = x.layout.narrow(dim, 0, 1).as_strided(index.shape, [
         0 if axis == dim % len(x.shape) else stride for axis, stride in enumerate(x.layout.stride())
     ])  # fmt: skip
-    line = f"{{into}} = {{0.name}}[{{0.index}} + {x.layout.stride(dim)} * {text.whole}{{1}}];"
+    line = f"{{into}} = {{0.name}}[{{0.index}} + {x.layout.stride(dim)} * {text.to_index}{{1}}];"
     return text.each(index.shape, [Array(x.name, first), index], line, text.new(index.shape))
 
 
 def _scatter(text: Text, x: Any, dim: int, index: Any, source: Any) -> Array:
-    """A copy, with other entries at computed places along an axis."""
+    """A copy with other entries at computed indices along an axis."""
     whole = text.copy(x, text.new(shape_of(x)))
     if not isinstance(index, Array):
         raise NotImplementedError
     steps = [0 if axis == dim % len(whole.shape) else step for axis, step in enumerate(whole.layout.stride())]
     first = Array(whole.name, whole.layout.as_strided(index.shape, steps))
-    place = f"{{into.name}}[{{into.index}} + {whole.layout.stride(dim)} * {text.whole}{{0}}]"
+    place = f"{{into.name}}[{{into.index}} + {whole.layout.stride(dim)} * {text.to_index}{{0}}]"
     text.each(index.shape, [index, source], f"{place} = {{1}};", first)
     return whole
 
 
 def _index_put(text: Text, x: Any, indices: Sequence[Any], values: Any, accumulate: bool = False) -> Array:
-    """A copy, to whose entries at known places along one axis others are added, or whose they are."""
+    """A copy in which entries at constant indices along one axis are replaced, or others are added to them."""
     whole = text.copy(x, text.new(shape_of(x)))
     (axis, places), *more = [(axis, index) for axis, index in enumerate(indices) if index is not None]
     if more or not isinstance(places, torch.Tensor) or places.ndim != 1 or places.dtype == torch.bool:
@@ -228,7 +230,7 @@ def _softmax(text: Text, x: Array, dim: int, half_to_float: bool = False) -> Arr
     return RULES["div"](text, raised, RULES["sum"](text, raised, [dim], True))
 
 
-def _padded(text: Text, x: Array, pad: Sequence[int], value: float = 0.0) -> Array:
+def _pad(text: Text, x: Array, pad: Sequence[int], value: float = 0.0) -> Array:
     if min(pad) < 0:
         raise NotImplementedError
     sides = [(0, 0)] * (len(x.shape) - len(pad) // 2) + list(zip(pad[::2], pad[1::2], strict=True))[::-1]
@@ -242,7 +244,7 @@ def _padded(text: Text, x: Array, pad: Sequence[int], value: float = 0.0) -> Arr
 
 
 def _solution(text: Text, A: Any, B: Any, *, left: bool = True, check_errors: bool = False) -> list[Any]:
-    """A⁻¹B, or BA⁻¹, of one matrix after another; B may be a batch of vectors."""
+    """A⁻¹B or BA⁻¹, one matrix after another; B may be a batch of vectors."""
     A, B = (value if isinstance(value, Array) else text.tables.of(value) for value in (A, B))
     vectors = len(B.shape) == 1 or B.shape == A.shape[:-1]
     right = B.layout[..., None] if vectors else B.layout
@@ -260,7 +262,7 @@ def _solution(text: Text, A: Any, B: Any, *, left: bool = True, check_errors: bo
     return [Array(whole.name, whole.layout[..., 0]) if vectors else whole, None, None, NO_ERROR]
 
 
-NO_ERROR = torch.zeros((), dtype=torch.int32)  # what torch's linear algebra returns beside its result
+NO_ERROR = torch.zeros((), dtype=torch.int32)  # torch's linear algebra also returns an error code
 
 
 def _inverse(text: Text, A: Array, *, check_errors: bool = False) -> list[Any]:
@@ -287,7 +289,7 @@ def _cumulative_sum(text: Text, x: Array, dim: int, *, dtype: Any = None) -> Arr
 RULES = Rules("C", lambda row: None if row.c is None else _elementwise(row.c), {
     "add": _sum("+"),
     "sub": _sum("-"),
-    "div": _divided,
+    "div": _divide,
     "pow": _power,
     "clamp": _clamp,
     "sum": _reduction(0.0, "{into} += {0};"),
@@ -305,23 +307,23 @@ RULES = Rules("C", lambda row: None if row.c is None else _elementwise(row.c), {
     "scatter": _scatter,
     "index_put": _index_put,
     "_softmax": _softmax,
-    "constant_pad_nd": _padded,
+    "constant_pad_nd": _pad,
     "linalg_vector_norm": _norm,
     **dict.fromkeys(("mm", "bmm", "mv", "dot"), _product),
     "_linalg_solve_ex": _solution,
     "linalg_inv_ex": _inverse,
     "_linalg_det": _determinant,
     "cumsum": _cumulative_sum,
-    **dict.fromkeys(("_to_copy", "clone", "alias", "lift_fresh_copy"), _same),
-    "_unsafe_view": lambda text, x, shape: text.viewed(aten.view.default, x, shape),
+    **dict.fromkeys(("_to_copy", "clone", "alias", "lift_fresh_copy"), _identity),
+    "_unsafe_view": lambda text, x, shape: text.view(aten.view.default, x, shape),
     "cat": _cat,
     "stack": _stack,
-    "copy": _copied,
-    "select_scatter": _scattered(aten.select.int),
-    "slice_scatter": _scattered(aten.slice.Tensor),
-    "diagonal_scatter": _scattered(aten.diagonal.default),
+    "copy": _copy,
+    "select_scatter": _scatter_into(aten.select.int),
+    "slice_scatter": _scatter_into(aten.slice.Tensor),
+    "diagonal_scatter": _scatter_into(aten.diagonal.default),
     **{
-        name: _moved(getattr(aten, name))
+        name: _rearrangement(getattr(aten, name))
         for name in ("flip", "index", "index_select", "repeat", "roll")
     },
     "getitem": lambda text, results, index: results[index],

@@ -1,4 +1,4 @@
-"""C99 as it is written: arrays in memory, tables of constants, and loops over them."""
+"""Text of C99: arrays in memory, tables of constants, and loops over them."""
 
 import math
 import re
@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-PER_LINE = 8  # numbers of a table
+PER_LINE = 8  # numbers of a table in one line
 
 
 @dataclass(frozen=True)
 class Array:
-    """A place in memory: an array's name, and a tensor without entries for its shape, strides and offset."""
+    """A place in memory: the name of an array, and a meta tensor for its shape, strides and offset."""
 
     name: str
     layout: Tensor
@@ -26,7 +26,7 @@ class Array:
 
 
 class Place(NamedTuple):
-    """An entry of an array, as it is written."""
+    """An entry of an array as text, such as v0[2 * i0]."""
 
     name: str
     index: str
@@ -36,7 +36,7 @@ class Place(NamedTuple):
 
 
 class Tables:
-    """The constants of functions: each written once."""
+    """The constants of functions; equal constants share one table."""
 
     def __init__(self) -> None:
         self.text: list[str] = []
@@ -48,35 +48,35 @@ class Tables:
         key = tuple(numbers.shape), numbers.numpy().tobytes()
         if key not in self._known:
             name = f"w{len(self._known)}"
-            self.text.append(self.written(name, numbers))
+            self.text.append(self.format_table(name, numbers))
             self._known[key] = Array(name, torch.empty(numbers.shape, device="meta"))
         return self._known[key]
 
-    def written(self, name: str, numbers: Tensor) -> str:
-        """A table in float64, as text."""
+    def format_table(self, name: str, numbers: Tensor) -> str:
+        """The declaration of a table of float64 numbers."""
         entries = [literal(number) for number in numbers.flatten().tolist()] or ["0.0"]
         rows = [", ".join(entries[i : i + PER_LINE]) for i in range(0, len(entries), PER_LINE)]
         return f"static const double {name}[{len(entries)}] = {{\n    {f',{chr(10)}    '.join(rows)}}};\n"
 
 
 class Text:
-    """The body of a C function, line by line; that of a similar language where a class derived from it says how.
+    """The body of a C function, line by line; subclasses write similar languages.
 
     Args:
-        tables: takes its constants.
+        tables: collects the constants.
     """
 
-    language, otherwise = "C", "take --to torch"  # for messages
+    language, otherwise = "C", "export it to torch"  # for error messages
     declaration = "double {name}[{size}];"  # of an array
-    counter = "int"  # how one is declared
-    whole = "(int)"  # makes an index of a number
+    counter = "int"  # declares a loop counter
+    to_index = "(int)"  # converts a number to an index
 
     def __init__(self, tables: Tables):
         self.tables, self.lines, self.bytes, self._count = tables, list[str](), 0, 0
-        self._known: dict[str, int] = {}  # lines, with their new arrays counted from 0 ↦ the first of these
+        self._known: dict[str, int] = {}  # lines, with their new arrays numbered from 0 ↦ number of the first one
 
     def new(self, shape: Sequence[int]) -> Array:
-        """A new array."""
+        """Declare a new array."""
         name, layout = f"v{self._count}", torch.empty(tuple(shape), device="meta")
         size = max(1, layout.numel())
         self._count, self.bytes = self._count + 1, self.bytes + 8 * size
@@ -84,9 +84,9 @@ class Text:
         return Array(name, layout)
 
     def once(self, write: Callable[[], Any]) -> Any:
-        """What `write` returns, whose lines are kept unless the same stand already: then their arrays are returned.
+        """Call `write`; if its lines already exist, remove the new ones and return the earlier arrays.
 
-        An array is written to where it is made, and never again, so that the same lines have the same results.
+        This is correct because an array is written only where it is created, so that equal lines have equal results.
         """
         lines, first, size = len(self.lines), self._count, self.bytes
         result = write()
@@ -102,12 +102,12 @@ class Text:
             result,
         )
 
-    def unused(self, name: str) -> None:
-        """Write that an array may serve nobody, which a compiler would point out else."""
+    def mark_unused(self, name: str) -> None:
+        """Tell the compiler not to warn if an array is unused."""
         self.lines.append(f"(void){name};")
 
-    def excuse_unread(self) -> None:
-        """Write that arrays which are written to, and never read, serve nobody: a result that is not asked for, say."""
+    def mark_unread(self) -> None:
+        """Mark arrays as unused that are written but never read, such as unused results of an operation."""
         at = dict[str, list[int]]()
         for k, line in enumerate(self.lines):
             for name in set(re.findall(r"\bv\d+\b", line)):
@@ -118,13 +118,13 @@ class Text:
                 self.lines[places[0]] += f" (void){name};"
 
     def each(self, shape: Sequence[int], values: Sequence[Any], line: str, into: Array) -> Array:
-        """Write a line at every index of a shape: {0}, {1}, … are the values there, and {into} is where it goes.
+        """Write loops over a shape around a line, in which {0}, {1}, … are entries of the values, {into} the result.
 
-        An array's value is a Place.
+        An entry of an array is a Place.
 
         Args:
-            values: Arrays, tensors or numbers, each broadcast.
-            into: of that shape, or with strides of zero.
+            values: Arrays, tensors or numbers; they are broadcast.
+            into: has that shape, possibly with strides of 0.
         """
         arrays = [value if isinstance(value, Array) else self._constant(value) for value in (*values, into)]
         layouts = [array.layout.expand(tuple(shape)) if isinstance(array, Array) else None for array in arrays]
@@ -143,17 +143,17 @@ class Text:
         return into
 
     def copy(self, source: Any, into: Array) -> Array:
-        """Write a copy."""
+        """Write a loop that copies source."""
         return self.each(into.shape, [source], "{into} = {0};", into)
 
     def contiguous(self, value: Any) -> Array:
-        """A value with its entries one after another."""
+        """A value with contiguous entries."""
         array = value if isinstance(value, Array) else self.tables.of(torch.as_tensor(value, dtype=torch.float64))
         is_whole = array.layout.is_contiguous() and array.layout.storage_offset() == 0
         return array if is_whole else self.copy(array, self.new(array.shape))
 
-    def viewed(self, target: Any, array: Array, *args: Any, **kwargs: Any) -> Any:
-        """Another look at an array's entries; of a copy where its strides do not allow it."""
+    def view(self, target: Any, array: Array, *args: Any, **kwargs: Any) -> Any:
+        """A view of an array, or of a contiguous copy if its strides do not allow the view."""
         try:
             found = target(array.layout, *args, **kwargs)
         except RuntimeError:
@@ -162,7 +162,7 @@ class Text:
         return tree_map(lambda layout: Array(array.name, layout), found)
 
     def _constant(self, value: Any) -> Array | str:
-        """A number as it is written, or a table."""
+        """A number as text, or a table."""
         if isinstance(value, Tensor) and value.numel() != 1:
             return self.tables.of(value)
         number = literal(float(value))
@@ -170,14 +170,14 @@ class Text:
 
 
 def _renamed(text: str, first: int, letter: str, start: int) -> str:
-    """A text whose arrays from v`first` on are counted from `start`."""
+    """Replace the names of arrays from v`first` on by `letter` and numbers from `start` on."""
     return re.sub(
         r"\bv(\d+)\b", lambda name: name[0] if int(name[1]) < first else f"{letter}{int(name[1]) - first + start}", text
     )
 
 
 def literal(number: float) -> str:
-    """A number in C, to its last bit."""
+    """A number in C that keeps every bit."""
     if math.isnan(number):
         return "NAN"
     if math.isinf(number):
@@ -186,7 +186,7 @@ def literal(number: float) -> str:
 
 
 def _axes(shape: Sequence[int], layouts: Sequence[Tensor]) -> list[tuple[int, tuple[int, ...]]]:
-    """The axes to loop over, each with a stride for each array: those that follow one another in all arrays as one."""
+    """The axes to loop over: (size, a stride for each array); axes that are contiguous in all arrays are merged."""
     axes = list[tuple[int, tuple[int, ...]]]()
     for size, strides in zip(shape, zip(*(layout.stride() for layout in layouts), strict=True), strict=True):
         if size == 1:
@@ -199,11 +199,11 @@ def _axes(shape: Sequence[int], layouts: Sequence[Tensor]) -> list[tuple[int, tu
 
 
 def _index(offset: int, steps: Sequence[tuple[str, int]]) -> str:
-    """offset + Σ stride · counter, as short as it can be written."""
+    """offset + Σ stride · counter as text, without zeros and ones."""
     terms = [counter if stride == 1 else f"{stride} * {counter}" for counter, stride in steps if stride]
     return " + ".join([*([str(offset)] if offset or not terms else []), *terms])
 
 
 def shape_of(value: Any) -> torch.Size:
-    """The shape of an array or a tensor; a number has none."""
+    """The shape of an array or a tensor; that of a number is empty."""
     return value.shape if isinstance(value, Array | Tensor) else torch.Size()

@@ -1,4 +1,4 @@
-"""lyapnet's own C++, compiled once for a machine and kept on disk; and the folder where such things are kept."""
+"""Compiles lyapnet's C++ once for each machine, and keeps the libraries in a cache folder."""
 
 import ctypes
 import hashlib
@@ -25,15 +25,15 @@ FLAGS = ("-std=c++17", "-O3", "-march=native", "-ffp-contract=fast", "-fno-math-
 
 
 def library_of(name: str, sources: tuple[Path, ...], *definitions: str) -> ctypes.CDLL:
-    """Compiled C++, from disk, or compiled now: one file for each machine.
+    """Load a compiled library from the cache, or compile it now.
 
     Args:
-        name: the file's name begins with.
-        sources: the last one includes the others.
-        definitions: of macros, as "NAME=value".
+        name: the first part of the file name.
+        sources: source files; the last one includes the others.
+        definitions: macros, as "NAME=value".
 
     Raises:
-        CompilationError: there is no compiler, or it fails; or the cache is not the user's own.
+        CompilationError: there is no compiler, it fails, or another user can write to the cache.
     """
     path, folder = file_of_library(name, sources, *definitions), cache_folder()
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -43,7 +43,7 @@ def library_of(name: str, sources: tuple[Path, ...], *definitions: str) -> ctype
         require_own(path)
         if digest.is_file() and digest.read_text(encoding="ascii") == digest_of_file(path):
             return ctypes.CDLL(str(path))
-        logging.getLogger(__name__).warning("note: compiling again what is in %s: got another digest.", path)
+        logging.getLogger(__name__).warning("note: compiling %s again: its digest does not match.", path)
     with tempfile.TemporaryDirectory(dir=folder, prefix=".new_") as draft:
         file = Path(draft) / path.name
         _compile(sources[-1], file, definitions)
@@ -61,22 +61,22 @@ def _compile(source: Path, file: Path, definitions: Sequence[str]) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        reason = one_line(RuntimeError(said))[:200]
+        message = getattr(error, "stderr", None) or str(error)
+        reason = one_line(RuntimeError(message))[:200]
         raise CompilationError(f"Expected {source.name} to compile, got {reason}") from error
     file.chmod(0o600)
 
 
 def file_of_library(name: str, sources: Sequence[Path], *definitions: str) -> Path:
-    """Where machine code is kept: by its source, how it is compiled, and the instructions of the CPU."""
+    """The file of a library; its name has a hash of the source, the compiler flags and the features of the CPU."""
     capabilities = sorted(torch.cpu.get_capabilities().items())
     parts = [platform.machine(), capabilities, FLAGS, definitions, *(source.read_bytes() for source in sources)]
     return cache_folder() / f"{name}_{hashlib.sha256(repr(parts).encode()).hexdigest()[:32]}.so"
 
 
 def require_own(path: Path) -> None:
-    """Refuse a folder or file of machine code that another user owns or may write."""
-    if sys.platform == "win32":  # its access rights are not in these bits
+    """Refuse a folder or file of machine code that another user owns or can write."""
+    if sys.platform == "win32":  # Windows has no such permission bits
         return
     facts = path.stat()
     if facts.st_uid != os.getuid() or facts.st_mode & 0o022:
@@ -88,7 +88,7 @@ def require_own(path: Path) -> None:
 
 @contextmanager
 def compilation_errors() -> Iterator[None]:
-    """Turn whatever compiling raises into a CompilationError; what lyapnet itself says stays as it is."""
+    """Convert exceptions of compilation to CompilationError; errors of lyapnet are raised as they are."""
     try:
         yield
     except LyapnetError:
@@ -99,7 +99,7 @@ def compilation_errors() -> Iterator[None]:
 
 
 def has_compiler() -> bool:
-    """Whether there is a C++ compiler: $CXX, g++ or clang++."""
+    """Whether a C++ compiler is found: $CXX, g++ or clang++."""
     from torch._inductor.cpp_builder import get_cpp_compiler
     from torch._inductor.exc import InvalidCxxCompiler
 
@@ -111,12 +111,12 @@ def has_compiler() -> bool:
 
 
 def cache_folder() -> Path:
-    """Where compiled functions are kept: $LYAPNET_CACHE, else lyapnet in the user's cache folder."""
+    """The folder of compiled functions: $LYAPNET_CACHE, else lyapnet in the user's cache folder."""
     chosen = os.environ.get("LYAPNET_CACHE")
     return Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "lyapnet"
 
 
 def constants_of(graph: GraphModule) -> list[tuple[str, Any]]:
-    """Name and entries of every tensor that a graph holds."""
+    """(name, entries) of every tensor that a graph holds."""
     constants = {**vars(graph), **dict(graph.named_buffers())}
     return [(key, value.tolist()) for key, value in sorted(constants.items()) if isinstance(value, Tensor)]

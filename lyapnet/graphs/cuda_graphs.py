@@ -1,4 +1,4 @@
-"""Functions on a GPU whose kernels are recorded once and launched at once (CUDA graphs)."""
+"""Functions on a GPU whose kernels are recorded once, and then launched together (CUDA graphs)."""
 
 from collections.abc import Callable, Sequence
 from threading import Lock
@@ -7,14 +7,14 @@ import torch
 from torch import Tensor
 
 Replay = Callable[[], None]
-WARM_UP = 3  # runs before the recording, in which libraries set themselves up
+WARM_UP = 3  # runs before the recording, in which libraries initialise themselves
 
 
 def record(run: Callable[[], None]) -> Replay:
-    """What launches again all kernels that a function launches, on the memory that they have now.
+    """A function that launches all kernels of `run` again, on the same memory.
 
     Raises:
-        RuntimeError: of torch, where an operation cannot be recorded, as one that waits for a value.
+        RuntimeError: torch cannot record an operation, for example one that waits for a value.
     """
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
@@ -29,14 +29,14 @@ def record(run: Callable[[], None]) -> Replay:
 
 
 class RecordedFunction:
-    """(*arguments) ↦ results, by the kernels that a function launched when it was recorded.
+    """(*arguments) ↦ results, by replaying the kernels that a function launched when it was recorded.
 
-    Where thousands of small kernels are launched one by one, the launches take longer than the kernels.
+    It is faster where launching thousands of small kernels one by one takes longer than running them.
 
     Args:
-        function: of tensors; which kernels it launches does not depend on values.
-        arguments: examples; each call has others of the same shapes, which are copied to where the kernels read.
-        record: makes what launches the kernels again.
+        function: of tensors; it launches the same kernels for all values.
+        arguments: examples; the arguments of a call must have the same shapes, and are copied to their memory.
+        record: returns a function that launches the kernels again.
 
     Raises:
         RuntimeError: as record.
@@ -50,7 +50,7 @@ class RecordedFunction:
     ):
         self._arguments = [each.detach().clone() for each in arguments]
         self._results = list[Tensor]()
-        self._lock = Lock()  # there is one memory
+        self._lock = Lock()  # all calls share one memory
 
         def run() -> None:
             self._results = [*function(*self._arguments)]
@@ -62,7 +62,7 @@ class RecordedFunction:
         """The results.
 
         Raises:
-            ValueError: arguments of other shapes.
+            ValueError: the arguments have other shapes.
         """
         shapes, expected = ([tuple(each.shape) for each in given] for given in (arguments, self._arguments))
         if shapes != expected:

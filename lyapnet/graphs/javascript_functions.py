@@ -1,4 +1,4 @@
-"""Functions of tensors as JavaScript: the loops of c_functions, over arrays that are made once and used again."""
+"""Translates traced functions to JavaScript: the loops of c_functions, with arrays that are allocated once."""
 
 import base64
 from collections.abc import Sequence
@@ -11,47 +11,49 @@ from lyapnet.graphs.c_text import Tables, Text
 
 
 class JavaScriptTables(Tables):
-    """The constants of JavaScript functions, to the last bit: each written once."""
+    """The constants of JavaScript functions, with every bit."""
 
-    def written(self, name: str, numbers: Tensor) -> str:
+    def format_table(self, name: str, numbers: Tensor) -> str:
         content = base64.b64encode(numbers.numpy().astype("<f8").tobytes()).decode()
         return f'const {name} = table("{content}");\n'
 
 
 class JavaScriptText(Text):
-    """The body of a JavaScript function, line by line; its arrays stand outside of it."""
+    """The body of a JavaScript function, line by line; its arrays are declared outside of the function."""
 
-    language, otherwise = "JavaScript", "take lyapnet animate"
+    language, otherwise = "JavaScript", "use lyapnet animate"
     declaration = "const {name} = new Float64Array({size});"
-    counter, whole = "let", ""
+    counter, to_index = "let", ""
 
-    def unused(self, name: str) -> None:
+    def mark_unused(self, name: str) -> None:
         pass
 
-    def excuse_unread(self) -> None:
+    def mark_unread(self) -> None:
         pass
 
 
 def javascript_function(
     name: str, graph: GraphModule, arguments: dict[str, Tensor], results: Sequence[str], tables: JavaScriptTables
 ) -> str:
-    """A trace as the text of a JavaScript function of arrays, of its arguments first, then of its results.
+    """The text of a JavaScript function for a trace; its parameters are the arrays of arguments, then of results.
 
     Args:
         name: of the function.
-        graph: of `core_trace`, on one state.
-        arguments: the names of the arrays that it takes, and tensors of their shapes.
-        results: the names of the arrays that take its results.
-        tables: takes the constants.
+        graph: a trace by `core_trace`, for one state.
+        arguments: name of each array argument ↦ a tensor of its shape.
+        results: the names of the arrays for the results.
+        tables: collects the constants.
 
     Raises:
-        ExportError: an operator has no rule; names it.
+        ExportError: an operator has no rule.
     """
     text = JavaScriptText(tables)
     write_body(text, graph, arguments, results)
-    head, body = ("\n".join(line for line in text.lines if line.startswith("const ") is made) for made in (True, False))
-    given = ", ".join([*arguments, *results])
-    return f"const {name} = (() => {{\n{head}\nreturn ({given}) => {{\n{body}\n}};\n}})();\n"
+    head, body = (
+        "\n".join(line for line in text.lines if line.startswith("const ") is declares) for declares in (True, False)
+    )
+    parameters = ", ".join([*arguments, *results])
+    return f"const {name} = (() => {{\n{head}\nreturn ({parameters}) => {{\n{body}\n}};\n}})();\n"
 
 
 HELPERS = """"use strict";

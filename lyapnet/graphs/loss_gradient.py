@@ -1,4 +1,4 @@
-"""The gradient of a loss in the parameters of a module, by lyapnet's kernel where that can be."""
+"""The gradient of a loss in the parameters of a module, by lyapnet's kernel if possible."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,13 +11,13 @@ from lyapnet.graphs.tracing import trace
 
 
 def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[..., None]:
-    """(*arguments) ↦ puts the gradient of loss(*arguments) in its trained parameters into their `grad`.
+    """A function (*arguments) that writes the gradient of loss(*arguments) to `grad` of its trained parameters.
 
-    On a CPU the loss and its gradient are traced and run by lyapnet's kernel, for the parameters and buffers as they
-    are at each call. What cannot be traced, or has an operation that the kernel lacks, is differentiated by torch.
+    On a CPU the loss and its gradient are traced and run by lyapnet's kernel, with the current parameters and buffers.
+    A loss that cannot be traced, or with an operation that the kernel lacks, is differentiated by torch.
 
     Args:
-        arguments: of the same shapes and types as those of every call.
+        arguments: examples with the shapes and types of every call.
     """
     trained = trained_of(loss)
     kernel = _kernel(loss, arguments)
@@ -34,7 +34,7 @@ def gradient_of_loss(loss: nn.Module, arguments: Sequence[Tensor]) -> Callable[.
 
 
 def _kernel(loss: nn.Module, arguments: Sequence[Tensor]) -> NumberKernel | None:
-    """The gradient as a program; None where there is none."""
+    """The gradient as a kernel; None if it cannot be one."""
     trained, of_state = len(trained_of(loss)), stateless(loss)
 
     def gradient(*tensors: Tensor) -> tuple[Tensor, ...]:

@@ -1,8 +1,8 @@
-"""The table of elementwise operators: what each is in C, in CasADi and in the kernel for numbers, once.
+"""The table of elementwise operators: each row has an operator in C, in CasADi and in the kernel for numbers.
 
-A reader of traces makes its rules from these rows. It has rules of its own only for what a row cannot say: options, as
-alpha in a sum, and operators that move, add up or solve. Bounds are the column that lyapnet.prover.operators puts
-beside, as a proof depends on that folder alone; `register` there takes a whole row, bounds included.
+A reader translates traces, with rules from these rows. It has further rules only for what a row cannot express:
+options, such as alpha in a sum, and operators that move, add or solve. lyapnet.prover.operators has the column of
+bounds, since a proof depends on that folder alone; `register` there takes a whole row with bounds.
 """
 
 import math
@@ -15,23 +15,24 @@ from torch import Tensor
 
 from lyapnet.base.errors import UsageError
 
+# domains of operands for the tests against torch
 ANY = (-3.0, 3.0)
 POSITIVE = (0.1, 9.0)
 UNIT = (-0.99, 0.99)
-TRUTH = None
+TRUTH = None  # a boolean
 
 
 @dataclass(frozen=True)
 class Operator:
-    """An elementwise operator of torch, and what it is to each reader; None where a reader refuses it.
+    """An elementwise operator of torch and its expression for each reader; None if a reader does not support it.
 
     Args:
-        name: torch's, without the overload, as it stands in traces: `sin` of torch.ops.aten.sin.
-        c: an expression in C99 and JavaScript, of operands {0}, {1}, …
-        casadi: the name of CasADi's function, or (casadi, *operands) ↦ an expression.
-        numbers: an expression of vectors x, y, z in C++ (see program.cpp); else `c` is computed number by number.
-        domain: intervals of the operands, or TRUTH, in which the columns are held against torch.
-        namespace: of torch.ops.
+        name: the name in torch without the overload, such as `sin` for torch.ops.aten.sin.
+        c: an expression in C99 and JavaScript with operands {0}, {1}, …
+        casadi: the name of a function of CasADi, or (casadi, *operands) ↦ an expression.
+        numbers: an expression in C++ of vectors x, y, z (see program.cpp); None to compute `c` for each number.
+        domain: the intervals of the operands, or TRUTH, on which the columns are tested against torch.
+        namespace: in torch.ops.
     """
 
     name: str
@@ -43,12 +44,12 @@ class Operator:
 
     @property
     def operands(self) -> int:
-        """How many there are."""
+        """The number of operands."""
         return len(self.domain)
 
     @property
     def instruction(self) -> str | None:
-        """The expression of vectors that the kernel for numbers computes."""
+        """The expression for the kernel for numbers."""
         if self.numbers is not None or self.c is None:
             return self.numbers
         names = "xyz"[: self.operands]
@@ -57,28 +58,28 @@ class Operator:
 
     @property
     def overloads(self) -> list[Any]:
-        """torch's operators of this name that return a new tensor, that of tensors alone first."""
+        """torch's overloads that return a new tensor; those that take only tensors come first."""
         packet = getattr(getattr(torch.ops, self.namespace), self.name)
-        every = [getattr(packet, name) for name in packet.overloads()]
-        return sorted((each for each in every if not each._schema.is_mutable), key=_takes_numbers)
+        overloads = [getattr(packet, name) for name in packet.overloads()]
+        return sorted((each for each in overloads if not each._schema.is_mutable), key=_takes_numbers)
 
     def __call__(self, *operands: Tensor) -> Tensor:
-        """What torch computes."""
+        """The result of torch."""
         return self.overloads[0](*operands)
 
     def at(self, unit: Tensor) -> list[Tensor]:
-        """Operands in the domain at points of the unit cube, (*, operands)."""
+        """Operands in the domain, from points of the unit cube, (*, operands)."""
         pairs = zip(unit.unbind(-1), self.domain, strict=True)
         return [u > 0.5 if sides is None else sides[0] + (sides[1] - sides[0]) * u for u, sides in pairs]
 
 
 def _takes_numbers(overload: Any) -> bool:
-    """Whether an operator needs something else than tensors."""
+    """Whether an overload has required arguments that are not tensors."""
     return any(str(each.type) != "Tensor" for each in overload._schema.arguments if not each.has_default_value())
 
 
 def _of_library(name: str, domain: tuple[float, float] = ANY, casadi: Any = "", numbers: str | None = None) -> Operator:
-    """A function of the C library and of CasADi's."""
+    """An operator that is a function of the C library, with the same name in CasADi unless given."""
     return Operator(name, f"{name}({{0}})", casadi or name, numbers, (domain,))
 
 
@@ -87,13 +88,13 @@ def _comparison(name: str, sign: str, casadi: Callable[..., Any]) -> Operator:
 
 
 def _logical(name: str, sign: str, casadi: str) -> list[Operator]:
-    """Of truths; the kernel for numbers has rules of its own, which refuse numbers."""
+    """Logical and bitwise operators of booleans; the kernel for numbers has its own rules, which refuse other types."""
     c = f"{{0}} != 0 {sign} {{1}} != 0"
     return [Operator(f"{kind}_{name}", c, casadi, domain=(TRUTH, TRUTH)) for kind in ("logical", "bitwise")]
 
 
 def _remainder(casadi: Any, a: Any, b: Any) -> Any:
-    """With the sign of b; a − b ⌊a/b⌋ would be b off where a/b is rounded up to a whole number."""
+    """The remainder with the sign of b; a − b⌊a/b⌋ would be wrong by b where a/b is rounded up to an integer."""
     r = casadi.fmod(a, b)
     return casadi.if_else(casadi.logic_and(r != 0, (r < 0) != (b < 0)), r + b, r)
 
@@ -139,8 +140,8 @@ _ROWS = [
     Operator(
         "sigmoid", "1.0 / (1.0 + exp(-{0}))", lambda casadi, a: (1 + casadi.tanh(a / 2)) / 2, "(logistic<T, V>(x))"
     ),
-    Operator("sigmoid_backward", numbers="x * (y * (1 - y))", domain=(ANY, ANY)),  # of a costate and σ
-    Operator("tanh_backward", numbers="x * (1 - y * y)", domain=(ANY, ANY)),  # of a costate and tanh
+    Operator("sigmoid_backward", numbers="x * (y * (1 - y))", domain=(ANY, ANY)),  # operands: a costate and σ
+    Operator("tanh_backward", numbers="x * (1 - y * y)", domain=(ANY, ANY)),  # operands: a costate and tanh
     Operator("add", "{0} + {1}", lambda casadi, a, b: a + b, "x + y", (ANY, ANY)),
     Operator("sub", "{0} - {1}", lambda casadi, a, b: a - b, "x - y", (ANY, ANY)),
     Operator("mul", "{0} * {1}", lambda casadi, a, b: a * b, "x * y", (ANY, ANY)),
@@ -178,12 +179,12 @@ Rule = Callable[..., Any]
 
 
 class Rules(dict[str, Rule]):
-    """What a reader makes of each operator: of each row that it can read, or by a rule of its own.
+    """The rules of a reader: operator name ↦ rule, from the table or written for this reader.
 
     Args:
-        reader: its name, for the overview of all.
-        of_row: a row ↦ the rule; None where its column is empty.
-        own: rules by the names of operators, instead of those of rows or beside them.
+        reader: its name, as a key of READERS.
+        of_row: row ↦ rule; None if the reader's column is empty.
+        own: further rules by operator name; they replace those from the table.
     """
 
     def __init__(self, reader: str, of_row: Callable[[Operator], Rule | None], own: Mapping[str, Rule]):
@@ -195,28 +196,30 @@ class Rules(dict[str, Rule]):
         READERS[reader] = self
 
     def add(self, row: Operator) -> None:
-        """Take the rule of a row."""
+        """Add the rule of a row, if there is one."""
         rule = self._of_row(row)
         if rule is not None:
             self[row.name] = rule
 
 
 READERS: dict[str, Rules] = {}
-"""The readers that are loaded."""
+"""Name of each loaded reader ↦ its rules."""
 
 
 def add(row: Operator) -> None:
-    """Put a row into the table, for all readers; see lyapnet.prover.operators.register.
+    """Add a row to the table, for all readers; see lyapnet.prover.operators.register.
 
     Raises:
-        UsageError: there is one, or a reader has a rule of its own for it; or torch has no such operator.
+        UsageError: the operator is in the table or in a reader's own rules, or torch does not have it.
     """
     if row.name in OPERATORS or any(row.name in rules for rules in READERS.values()):
-        raise UsageError(f"Expected an operator that lyapnet lacks, got {row.name}; it is in the table of operators.")
+        raise UsageError(
+            f"Expected an operator that lyapnet lacks, got {row.name}; use the row that is in the table of operators."
+        )
     if not hasattr(getattr(torch.ops, row.namespace), row.name):
         raise UsageError(
             f"Expected an operator of torch.ops.{row.namespace}, got {row.name!r}; print the graph of "
-            "lyapnet.graphs.tracing.trace to see what an operator is called."
+            "lyapnet.graphs.tracing.trace to see the names of operators."
         )
     OPERATORS[row.name] = row
     for rules in READERS.values():
@@ -224,7 +227,7 @@ def add(row: Operator) -> None:
 
 
 def remove(row: Operator) -> None:
-    """Take a row out again."""
+    """Remove a row from the table and from all readers."""
     del OPERATORS[row.name]
     for rules in READERS.values():
         rules.pop(row.name, None)

@@ -1,4 +1,4 @@
-"""A step that is taken over and over, as one function of tensors."""
+"""A repeated step as one function of tensors."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,13 +7,13 @@ from torch import Tensor
 
 
 class Scan:
-    """(*state, *columns, x₀) ↦ what step(*state, *columns at n, x_n, *prepare(*state)) keeps at each step, over time.
+    """(*state, *columns, x₀) ↦ the outputs of x_{n+1}, *outputs = step(*state, *columns[n], x_n, *prepare(*state)).
 
     Args:
-        prepare: what all steps share.
-        step: returns the next x and, after it, what is kept, and at last what is summed over the steps.
+        prepare: computes what all steps share.
+        step: returns the next x, the outputs to stack over time, and the outputs to sum over time.
         tensors: number of tensors in `state`.
-        sums: number of results that are summed.
+        sums: number of outputs to sum.
     """
 
     def __init__(
@@ -26,7 +26,7 @@ class Scan:
         self.prepare, self.step, self.tensors, self.sums = prepare, step, tensors, sums
 
     def loop(self, *arguments: Tensor) -> list[Tensor]:
-        """The scan as a loop, for a step of any kind."""
+        """The scan as a Python loop, for any step."""
         state, (*columns, x) = arguments[: self.tensors], arguments[self.tensors :]
         shared, kept = self.prepare(*state), []
         for now in zip(*columns, strict=True):

@@ -1,4 +1,4 @@
-"""What several tests of proofs share: a closed loop whose condition is known to hold, and violations planted in it."""
+"""A closed loop whose condition is known to hold, and planted violations of it, for several tests."""
 
 from functools import cache
 
@@ -32,7 +32,7 @@ class Planted(DecreaseCondition):
 
 def riccati():
     """P of V = xᵀPx, the optimum of the double integrator on an infinite horizon."""
-    return _riccati().copy()  # as nobody may change it for the others
+    return _riccati().copy()  # a copy, so that no test can change it for others
 
 
 @cache
@@ -60,7 +60,7 @@ def X0():
 
 
 def problem():
-    """Of the double integrator from X₀ over 2 s."""
+    """The double integrator from X₀ over 2 s."""
     return problem_of(DoubleIntegrator(), cost(), 100, DURATION / 100, X0())
 
 

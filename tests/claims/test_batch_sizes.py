@@ -81,7 +81,7 @@ PLACES = {
 
 
 def refused(way, function):
-    """The message, of one line, that names the line in which it stands."""
+    """The error message: one line that names the line of the code."""
     with pytest.raises(UsageError) as error:
         function()
     message = str(error.value)
@@ -97,7 +97,7 @@ def guarded(add):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_what_asks_for_the_size_of_a_batch_is_refused_at_its_line(way):
-    """Before it is tried on any state."""
+    """It is refused before it is called on any state."""
     x = torch.zeros(4, 2)
     refused(way, lambda: check_batch_sizes("f(x)", lambda x: (guarded(WAYS[way])(x),), [x]))
 
@@ -106,7 +106,7 @@ TEN = ("len", "shape", "size", "numel", "number of axes", "broadcast_shapes", "s
 
 
 def functions_of(place, add):
-    """The function of the closed loop that something was added to, and what it is given."""
+    """The changed function of the closed loop, and its arguments."""
     parts = PLACES[place](add)
     x, t = torch.zeros(4, 2), torch.zeros(4)
     if place == "u":

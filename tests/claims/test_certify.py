@@ -1,4 +1,4 @@
-"""lyapnet.certify: which claims go together, what each can use, and that docs and fields say the same."""
+"""lyapnet.certify: combinations of claims, the resources that each can use, and agreement of docs and fields."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""Where closed loops may violate constraints: against closed forms, and closed loops that do."""
+"""Levels below which no closed loop violates constraints, against closed forms and violating closed loops."""
 
 import pytest
 import torch
@@ -17,7 +17,7 @@ from lyapnet.task.systems import DoubleIntegrator
 from tests.claims.planted import cost, domain, loop, problem, riccati, stationary
 from tests.problems import Formula, hjb_loop
 
-ENOUGH = 1e6  # far above what is asked for here
+ENOUGH = 1e6  # far above the levels in these tests
 
 
 def position(limit, side=1.0):
@@ -69,7 +69,7 @@ class Bent(Constraints):
 
 
 class Lying(Constraints):
-    """x ≤ 1.2 with a gradient that is not its own."""
+    """x ≤ 1.2 with a wrong gradient."""
 
     names = ("lying",)
 
@@ -107,7 +107,7 @@ def claim(constraints, **options):
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
-    """The proof that is kept of the safe claim, for tests that read it."""
+    """The file of the proof of the safe claim."""
     return tmp_path_factory.mktemp("kept") / "proof"
 
 
@@ -136,9 +136,9 @@ def test_a_safe_set_is_proved_and_another_falsified(safe, unsafe):
     assert unsafe.verdict == "falsified"
     assert unsafe.violation.constraint == "position within 1.03"
     assert unsafe.violation.h > 0
-    assert between.verdict == "unknown", "no closed loop violates it, but the level of V does not tell"
+    assert between.verdict == "unknown", "no closed loop violates it, but the level of V does not prove this"
     assert between.rho <= between.crossing < between.wanted
-    assert "may cross a constraint" in between.reason
+    assert "satisfy the constraints" in between.reason
     assert 0 < between.volume_share < 1
 
 
@@ -154,7 +154,7 @@ def test_a_kept_proof_is_about_its_constraints(safe, kept):
 
 
 class Counting(Constraints):
-    """x ≤ 1.35 at first, and then anything."""
+    """x ≤ 1.35 in the first calls, and no limit later."""
 
     names = ("counting",)
     calls = 0
@@ -203,12 +203,12 @@ def test_the_report_says_what_is_kept(safe, unsafe):
     assert "h(x(t)) ≤ 0" in proved.in_formulas()[1]
     assert "h(x₀) ≤ 0" in proved.in_formulas()[1]
     assert proved.numbers()["constraints"] == ["position within 1.35"]
-    assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.of_the_verdict()
+    assert "no closed loop from X₀ violates a constraint: the one from x₀ = (" in failed.verdict_text()
     assert failed.numbers()["violation"]["constraint"] == "position within 1.03"
 
 
 class Fickle(Constraints):
-    """x ≤ 1.35 in batches, and never kept by one state."""
+    """x ≤ 1.35 in batches, and violated by every single state."""
 
     names = ("fickle",)
 
@@ -232,7 +232,7 @@ def test_constraints_are_one_function_with_a_name_for_each_number(hostile, messa
 
 
 def test_constraints_are_traced_once():
-    """What excludes states is what is not to be crossed."""
+    """The same trace excludes states and bounds the crossing."""
     declared = position(1.35)
     own = own_constraints(declared, domain())
     declared.limits.fill_(-100.0)
@@ -242,7 +242,7 @@ def test_constraints_are_traced_once():
     assert own_constraints(own, domain()) is own
 
 
-def test_states_of_X0_between_the_samples_are_held_against_constraints():
+def test_states_of_X0_between_the_samples_are_checked():
     """A sliver of X₀ that is 2e-6 wide is excluded."""
 
     class Sliver(Constraints):
@@ -261,7 +261,7 @@ def test_states_of_X0_between_the_samples_are_held_against_constraints():
     ]
     P, x = torch.as_tensor(riccati()), torch.tensor([0.9, 0.1234]).double()
     assert least[0] <= float(x @ P @ x) * 1.01
-    assert least[1:] == [float("inf"), float("inf")], "X₀ may reach to a limit"
+    assert least[1:] == [float("inf"), float("inf")], "X₀ may touch a limit"
 
 
 @pytest.mark.gate

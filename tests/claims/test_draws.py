@@ -1,4 +1,4 @@
-"""Draws of one checkpoint: each is on record, and a claim accounts for all of them."""
+"""Draws of one checkpoint: each is recorded, and a claim counts all of them."""
 
 import json
 import shutil
@@ -33,7 +33,9 @@ def test_each_further_seed_counts_and_the_same_one_does_not(run, capsys):
     assert (second["draws"], second["confidence_over_draws"]) == (2, pytest.approx(0.98))
     assert certified(run, capsys, "--confidence", "0.99", "--seed", "1") == second
     assert certified(run, capsys, "--confidence", "0.99")["draws"] == 2
-    assert certified(run, capsys, "--samples", "30")["draws"] == 3, "drawing on until it pleases is a choice too"
+    assert certified(run, capsys, "--samples", "30")["draws"] == 3, (
+        "repeating the draw until it succeeds is a choice too"
+    )
     lines = [json.loads(line) for line in (run / DRAWS).read_text().splitlines()]
     assert [(line["kind"], line["seed"], line["samples"]) for line in lines] == [
         ("statistical", 0, 20), ("statistical", 1, 20), ("statistical", 0, 30)
@@ -48,7 +50,7 @@ def test_a_look_by_a_sampled_claim_counts_for_other_seeds_only(run, capsys):
 
 
 def test_other_checkpoints_and_other_claims_are_no_draws_of_this_one(run, capsys):
-    """A twin of the counting."""
+    """The counterpart: other draws are not counted."""
     certified(run, capsys, "--seed", "1")
     assert certified(run, capsys, "--seed", "2", "--radius", "5")["draws"] == 1
     changed = run / "checkpoints/other.ckpt"
@@ -90,4 +92,4 @@ def test_table_and_report_say_it(run, tmp_path, capsys):
     assert "draws of this checkpoint" in capsys.readouterr().out
     text = (report / "report.md").read_text()
     assert "With confidence 1 − 2e-06" in text
-    assert "one of 2 of this checkpoint" in text
+    assert "chosen among 2 draws of this checkpoint" in text

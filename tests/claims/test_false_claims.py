@@ -115,7 +115,7 @@ def claim(system, cost, V):
 
 @pytest.mark.gate
 def test_what_nothing_is_added_to_is_certified():
-    """The twin of all that follows, with the terms themselves in torch."""
+    """The counterpart of all tests below, with the terms written in torch."""
     assert claim(System(), Paid(), Bowl()).verdict == "certified"
     rising = PLACES["q"](lambda x: 0.01 * torch.relu(x[..., 0] - CORNER))
     assert claim(*rising).verdict == "certified"
@@ -141,13 +141,19 @@ def test_it_is_refused_wherever_it_stands(place, way):
     refused(place, way)
 
 
-STEPS = {"data", "asarray", "tolist", "dlpack", "counter"}  # constant nearly everywhere: no fault of a state shows it
+STEPS = {
+    "data",
+    "asarray",
+    "tolist",
+    "dlpack",
+    "counter",
+}  # constant nearly everywhere, so that no change of a state shows it
 
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("way", sample((way for way in WAYS if way not in STEPS), 4))
 def test_before_a_training_most_of_it_is_refused_too(place, way):
-    """On states of X₀: a certificate does not rely on that."""
+    """The check uses states of X₀; a certificate does not rely on it."""
     with pytest.raises(UsageError):
         check(*PLACES[place](WAYS[way]))
 
@@ -170,7 +176,7 @@ def test_dynamics_that_are_not_those_of_f_and_g_are_refused():
 
 
 class Square(torch.autograd.Function):
-    """x², with another derivative."""
+    """x² with a wrong derivative."""
 
     @staticmethod
     def forward(ctx, x):

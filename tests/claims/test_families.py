@@ -1,4 +1,4 @@
-"""Sound claims about families, whose parameters are states that stay what they are."""
+"""Sound claims about families, whose parameters are constant states."""
 
 import pytest
 import torch
@@ -39,7 +39,7 @@ class Square(lyapnet.ValueFunction):
 
 @pytest.mark.gate
 def test_a_funnel_of_a_family_has_no_members_beside_it():
-    """A parameter stays: D is its range, closed loops do not leave D along it, and no other k is a counterexample."""
+    """A parameter is constant: D is its range, no closed loop leaves D along it, and other k do not count."""
     task = build_problem(config_from_plain({
         "experiment": "decay", "system": {"name": f"{__name__}:Decay"}, "cost": {"Q": [1], "R": [1], "Q_T": [1]},
         "initial_states": {"lower": [-1], "upper": [1]}, "horizon": {"steps": 10, "dt": 0.05},

@@ -40,21 +40,21 @@ class Wall(lyapnet.ControlAffineSystem):
 
 
 class Read(Wall):
-    """A twin: f derives it."""
+    """A counterpart that is sound: f computes the derived number."""
 
     def place(self):
         return 2 * self.k
 
 
 class Unused(Wall):
-    """A twin: what is derived is for a drawing."""
+    """A counterpart that is sound: the derived number is not used by f or g."""
 
     def place(self):
         return 2.0
 
 
 class Property(Wall):
-    """A twin."""
+    """A counterpart that is sound: the derived number is a property."""
 
     def derived(self, k):
         if k <= 0:
@@ -79,7 +79,7 @@ class Buffer(Wall):
 
 
 class Threshold(Wall):
-    """Another wall in a hundredth of P."""
+    """Another wall for a hundredth of P."""
 
     def derived(self, k):
         return 2.0 if 0.9301 < k < 0.9341 else 3.0
@@ -91,7 +91,7 @@ class Least(Wall):
 
 
 class Shared(Wall):
-    """In what all members share."""
+    """The derived number is stored in an object that all members share."""
 
     shared: ClassVar = [2.0]
 
@@ -120,7 +120,7 @@ class InDynamics(Wall):
 
 
 class InWeight(Wall):
-    """In the weight of a cost."""
+    """The derived number is the weight of a cost."""
 
     def place(self):
         return 9.0
@@ -138,7 +138,7 @@ class InMatrix(Wall):
 
 
 class InPart(Wall):
-    """In a part that is a module."""
+    """The derived number is stored in a submodule."""
 
     def derived(self, k):
         self.part = torch.nn.Linear(1, 1)

@@ -1,4 +1,4 @@
-"""Figures of certificates: what is drawn is what is claimed, in every dimension."""
+"""Figures of certificates show exactly the claim, for any number of states."""
 
 import pytest
 import torch

@@ -55,7 +55,7 @@ def test_the_riccati_solution_is_certified(P):
 
 
 def test_closed_loops_stay_in_the_funnel_and_below_their_guaranteed_cost(P):
-    """By an integrator that knows nothing of the proof, from the boundary of the funnel."""
+    """An independent integrator starts on the boundary of the funnel."""
     claim, V = riccati_claim(), stationary(P)
     angle = torch.linspace(0, 2 * math.pi, 60)
     x0 = torch.stack([angle.cos(), angle.sin()], -1)
@@ -126,7 +126,7 @@ def test_bounds_alone_do_not_certify_what_fails(P, monkeypatch):
 
 
 def test_bounds_without_remainders_would(P, monkeypatch):
-    """The twin: the verdict hangs on the remainders."""
+    """The counterpart: without remainders a false condition is certified."""
 
     def without_remainder(function):
         def wrong(*arguments, **keywords):
@@ -139,7 +139,7 @@ def test_bounds_without_remainders_would(P, monkeypatch):
         monkeypatch.setattr(module, name, without_remainder(getattr(module, name)))
     monkeypatch.setattr(
         conditions, "BoundedFunction", lambda f, domain, *_: BoundedFunction(f, domain, 1)
-    )  # all in remainders
+    )  # everything is in remainders
     assert proof_without_search(monkeypatch, P).verdict == "certified"
 
 
@@ -157,7 +157,7 @@ def test_a_violation_lowers_the_level_and_what_lies_below_holds(P):
 
 
 def true_with_a_dip(P):
-    """A condition that holds, with a narrow dip: without one, a single box is enough for it."""
+    """A condition that holds, with a narrow dip; without the dip a single box would prove it."""
     return Planted(loop(P), 0.9, 0.05).plant(torch.tensor([1.1, 0.3, 0.4]), 0.3, -5.0)
 
 
@@ -233,7 +233,7 @@ def test_the_enclosing_box_reaches_around_the_level_set(P):
 
 
 def test_a_tiny_budget_proves_nothing_and_falsifies_nothing(P, monkeypatch):
-    monkeypatch.setattr(funnels, "LEAST", AMPLE)  # seconds for levels, which are known on a busy machine too
+    monkeypatch.setattr(funnels, "LEAST", AMPLE)  # seconds for levels, enough on a busy machine too
     claim = certify(loop(P), budget=Budget(1e-6))
     assert claim.verdict == "unknown"
     assert re.fullmatch(r"seconds spent, \d+ of them before the first box: .*", claim.reason)
@@ -265,7 +265,7 @@ def pushed_claim():
 
 
 def after_pushes(push):
-    """(the highest V − δt, cost) of closed loops from the funnel's boundary, pushed by as much where V rises."""
+    """(the highest V − δt, cost) of closed loops from the funnel's boundary under the worst such disturbance."""
     claim, V, about = pushed_claim(), stationary(riccati()), problem()
     angle = torch.linspace(0, 2 * math.pi, 60)
     x = torch.stack([angle.cos(), angle.sin()], -1)

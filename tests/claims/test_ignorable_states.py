@@ -1,4 +1,4 @@
-"""States that a certificate may ignore: which they are, and that the funnel without them is that of the others."""
+"""Ignorable states: which states are, and that the funnel is that of the other states."""
 
 import math
 
@@ -51,7 +51,7 @@ def loop(push=None, Q=(*Q, 0.0), Q_T=(*Q, 0.0), R=None, V=None):
 
 
 SUM, NONE = [2], []
-HIDDEN = {  # pushes that depend on the sum, though nan does not show it
+HIDDEN = {  # forces that depend on the sum, although nan does not show it
     "comparison": lambda x: 0.1 * torch.where(x[..., 2] > 0, 1.0, -1.0),
     "sign": lambda x: 0.1 * torch.sign(x[..., 2]),
     "slope of a kink": lambda x: torch.ops.aten.threshold_backward(torch.full_like(x[..., 2], 0.1), x[..., 2], 0),
@@ -75,7 +75,7 @@ def network(n):
         ({"V": network(3)}, NONE),
         ({"V": IgnoringStates(network(2), [1, 2], 3)}, NONE),
         *(({"push": push}, NONE) for push in HIDDEN.values()),
-        ({"push": lambda x: 0.1 * torch.sign(x[..., 0])}, NONE),  # more than need be: any jump is enough
+        ({"push": lambda x: 0.1 * torch.sign(x[..., 0])}, NONE),  # stricter than necessary: any jump counts
     ],
     ids=[
         "nothing",
@@ -120,7 +120,7 @@ OPTIONS = {"alpha": 0.9, "delta": 0.02}
 
 
 def plain_claim():
-    """Of the same problem without the sum."""
+    """The claim of the same problem without the sum."""
     system, cost = DoubleIntegrator(), QuadraticCost(torch.diag(torch.tensor(Q)), [[1.0]], torch.diag(torch.tensor(Q)))
     X0, D = Box([-1.0, -0.7], [1.0, 0.7]), Box([-1.9, -3.4], [1.9, 3.4])
     problem = problem_of(system, cost, 100, DURATION / 100, X0)
@@ -137,7 +137,7 @@ def claim():
 
 
 def test_the_funnel_is_that_of_the_other_states(claim):
-    """D need not even hold X₀ along a state that is left out."""
+    """D need not contain X₀ along an ignorable state."""
     plain = plain_claim()
     assert (claim.left_out, plain.left_out) == (SUM, NONE)
     assert claim.verdict == plain.verdict == "certified"
@@ -148,7 +148,7 @@ def test_the_funnel_is_that_of_the_other_states(claim):
 
 
 def rollout(claim, push=None):
-    """(the claim's closed loops from the rim of its funnel, whatever the sum; whether each stays)."""
+    """(closed loops from the boundary of the funnel with any sum; whether each stays in it)."""
     closed_loop, angle = loop(push), torch.linspace(0, 2 * math.pi, 60)
     x0 = torch.stack([angle.cos(), angle.sin(), torch.linspace(-50, 50, 60)], -1)
     x0[:, :2] *= (claim.rho / closed_loop.policy.V(torch.zeros(()), x0)).sqrt()[:, None] * (1 - 1e-9)
@@ -163,4 +163,4 @@ def test_closed_loops_stay_in_it_whatever_the_state_is(claim):
     assert stays.all()
     assert (trajectory.x[..., 2].abs() > 40).any()
     _, stays = rollout(claim, lambda x: 2 * torch.sin(x[..., 2]))
-    assert not stays.all(), "the twin: a sum that pushes"
+    assert not stays.all(), "the counterpart: a sum that acts as a force"

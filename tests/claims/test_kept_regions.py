@@ -1,4 +1,4 @@
-"""Kept proofs of regions of attraction: they go on, are checked without a search, and are not believed."""
+"""Kept proofs of regions of attraction: they are resumed, and checked without a search and without trust."""
 
 import math
 import shutil
@@ -58,14 +58,14 @@ def read(path):
 
 
 def rewritten(path, change):
-    """The file after a change of its proof, by someone who computes the digest again."""
+    """Change the proof in a file and compute its digest again."""
     proofs = kept_proofs.read_proofs(path)
     change(proofs["region"])
     kept_proofs.write_proofs(path, proofs)
 
 
 def of_itself(content):
-    """Sets the fingerprint to that of what the changed file says, as its author could."""
+    """Set the fingerprint to that of the changed file, as a forger could."""
     of = content["of"][0]
     states = Box(of["lower"][1:], of["upper"][1:]).double()
     condition = RecedingDecrease(loop_of(V_of(), ABOUT).double().requires_grad_(False), of["decay"])
@@ -95,10 +95,10 @@ def test_stopped_and_continued_it_ends_as_in_one_go(whole, tmp_path):
 
 
 def test_a_region_that_was_not_come_to_is_none_and_a_smaller_one_is_one(whole, tmp_path):
-    """Boxes of lowest V come first: what an unfinished proof has come to is a region, too."""
+    """Boxes of lowest V come first, so that an unfinished proof also gives a region."""
     early, late = tmp_path / "early", tmp_path / "late"
     assert claimed(early, 60).rho == -math.inf
-    assert "go on with lyapnet certify region CKPT --keep" in checked(early)["reason"]
+    assert "resume it with lyapnet certify region CKPT --keep" in checked(early)["reason"]
     claim = claimed(late, whole[0].proof.boxes - 400)
     assert claim.hole < claim.rho < whole[0].rho
     assert claim.proof.remaining_volume > 0
@@ -110,7 +110,7 @@ def test_a_region_that_was_not_come_to_is_none_and_a_smaller_one_is_one(whole, t
 def test_another_rate_set_or_value_does_not_go_on(kept):
     before = kept.read_bytes()
     for options in ({"decay": 0.01}, {"states": Box([-3.0, -4.0], [3.0, 4.1]).double()}, {"V": V_of(0.999)}):
-        with pytest.raises(UsageError, match=r"take another file\.$"):
+        with pytest.raises(UsageError, match=r"choose another file\.$"):
             claimed(kept, **options)
     assert kept.read_bytes() == before
     assert claimed(kept).verdict == "certified"
@@ -155,7 +155,7 @@ def without_cuts(content):
 
 
 def closed(content):
-    """A level is claimed up to which V was found not to fall."""
+    """It claims a level up to which V was found not to fall."""
     content["worst"], content["proved"] = None, content["of"][1]
 
 
@@ -172,7 +172,7 @@ def no_number(content):
 
 
 def narrow(content):
-    """Of the hole, only a line would be in B, on which the law contracts; V is above c at both of its ends."""
+    """B is a line on which the law contracts; V is above c at both of its ends."""
     content["of"][0].update(box=[[0.0, -0.1], [0.0, 0.1]], hole=0.001)
 
 
@@ -214,7 +214,7 @@ BARE = ["a V of another checkpoint", "D without the goal", "D of one state", "λ
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_an_edited_file_is_refused(name, kept):
-    """By an author who computes the digest again, and the fingerprint."""
+    """The forger computes the digest and the fingerprint again."""
     rewritten(kept, CHANGES[name])
     if name not in BARE:
         rewritten(kept, of_itself)
@@ -226,7 +226,7 @@ def test_an_edited_file_is_refused(name, kept):
 
 @pytest.mark.parametrize("name", [name for name in CHANGES if not name.startswith(("λ", "D ", "a V"))])
 def test_nothing_more_is_proved_from_an_edited_file(name, whole, kept):
-    """A search that goes on from it refuses it, or comes to what is true."""
+    """A search that resumes from it refuses it, or gives a true result."""
     rewritten(kept, CHANGES[name])
     rewritten(kept, of_itself)
     try:
@@ -237,7 +237,7 @@ def test_nothing_more_is_proved_from_an_edited_file(name, whole, kept):
 
 
 def test_the_old_fingerprint_is_that_of_another_condition(kept):
-    """Whatever is true of the numbers: a smaller hole and a slower rate are, by a fingerprint of their own."""
+    """Even if the changed numbers are true: a smaller hole and a slower rate need another fingerprint."""
     before = kept.read_bytes()
     for name, value in (("hole", 0.05), ("decay", 0.002)):
         rewritten(kept, set_of(name, value))
@@ -248,7 +248,7 @@ def test_the_old_fingerprint_is_that_of_another_condition(kept):
 
 
 def test_the_same_edits_of_nothing_are_certified(kept):
-    """The twin: the digest and the fingerprint, computed by the tests themselves, are those of the file."""
+    """The counterpart: the digest and the fingerprint that the tests compute are those of the file."""
     before = read(kept)["of"][0]["fingerprint"]
     rewritten(kept, of_itself)
     assert read(kept)["of"][0]["fingerprint"] == before
@@ -270,7 +270,7 @@ def test_what_waits_and_is_called_closed_is_refused(tmp_path):
 
 
 def test_a_smaller_region_in_the_same_set_may_be_claimed(kept):
-    """The twin of a raised ρ: what is claimed is what is checked, and its volume is computed anew."""
+    """The counterpart of a raised ρ: the smaller claim is checked, and its volume is computed again."""
     full = checked(kept)
     rewritten(kept, lambda content: content.update(proved=1.0))
     result = checked(kept)
@@ -291,12 +291,14 @@ def test_a_region_is_no_funnel(name, kept):
 
 
 def test_a_funnel_is_no_region(kept, tmp_path):
-    """One line says what the file is, and it stays what it was."""
+    """One line names the kind of the file, and the file is not changed."""
     funnel, about = tmp_path / "funnel", Controller(planted.problem(), V_of())
     claim = Funnel(alpha=0.9, delta=0.05, states=[[-2.5, -4.5], [2.5, 4.5]])
     assert certify(about, claim, keep=funnel).verdict == "certified"
     before = kept.read_bytes(), funnel.read_bytes()
-    with pytest.raises(UsageError, match=r"^Expected the proof of a region in .*, got that of a funnel; take another"):
+    with pytest.raises(
+        UsageError, match=r"^Expected the proof of a region in .*, got that of a funnel; choose another"
+    ):
         certify(about, Region(), keep=funnel)
     for claims in ([claim], [claim, LowerBound()]):
         with pytest.raises(
@@ -322,7 +324,7 @@ def believing_c(self, around, states, seen, level, budget, proposed=None):
     ],
 )
 def test_without_that_check_it_would_certify_what_is_not_proved(name, of, method, believing, kept, monkeypatch):
-    """The twins: closed loops would leave the hole, or D."""
+    """The counterparts: closed loops would leave the hole, or D."""
     rewritten(kept, CHANGES[name])
     rewritten(kept, of_itself)
     assert checked(kept)["verdict"] == "refused"

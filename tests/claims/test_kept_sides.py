@@ -1,4 +1,4 @@
-"""Kept proofs of two sides, in one file: they go on, are checked without a search, and are not believed."""
+"""Kept proofs of both sides in one file: they are resumed, and checked without a search and without trust."""
 
 import os
 import shutil
@@ -22,7 +22,7 @@ SET = [[-2.5, -4.5], [2.5, 4.5]]
 
 
 def controller(factor=1.0):
-    """Of the optimum, with a ripple that takes some boxes."""
+    """A controller whose V is the optimum plus a ripple, so that the proof needs some boxes."""
     optimum = stationary(factor * riccati())
     return Controller(problem(), Formula(lambda t, x: optimum(t, x) * (1 + 0.002 * torch.sin(4 * t + 3 * x[..., 0]))))
 
@@ -45,7 +45,7 @@ def kept(whole, tmp_path):
 
 
 def rewritten(path, change):
-    """The file after a change of its proofs, by someone who computes the digest again."""
+    """Change the proofs in a file and compute its digest again."""
     proofs = kept_proofs.read_proofs(path)
     change(proofs)
     kept_proofs.write_proofs(path, proofs)
@@ -63,11 +63,11 @@ def test_both_sides_are_confirmed_by_their_leaves_alone(whole, kept):
 
 
 def test_stopped_on_either_side_it_goes_on(whole, kept, monkeypatch):
-    """After the side from above alone, and in the middle of the one from below."""
+    """It is stopped after the bound from above, and in the middle of the one from below."""
     found, calls = whole[0].result, []
     rewritten(kept, lambda proofs: proofs.pop("below"))
     alone = check(controller(), kept)
-    assert (alone["of"], alone["verdict"]) == ("sound", "certified"), "what it proves is the funnel"
+    assert (alone["of"], alone["verdict"]) == ("sound", "certified"), "the file proves the funnel"
     original = kept_proofs.KeptProof.write
     monkeypatch.setattr(
         kept_proofs.KeptProof, "write",
@@ -85,7 +85,7 @@ def test_ctrl_c_in_the_middle_of_the_second_side_keeps_both(whole, tmp_path):
     path = tmp_path / "stopped.proof"
 
     def stop(progress):
-        if path.exists() and progress.boxes:  # the first side ended, and the second is searched
+        if path.exists() and progress.boxes:  # the first side is complete, and the second is in progress
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(Interrupted, match=r"the proof so far is kept in .*stopped\.proof"):
@@ -104,7 +104,7 @@ def test_another_question_does_not_go_on(kept):
     for options in ({"alpha": 0.94}, {"delta": 0.06}, {"states": [[-2.5, -4.5], [2.5, 4.6]]}, {"factor": 0.999}):
         with pytest.raises(UsageError, match=r"take a new file\.$"):
             both(kept, **options)
-    with pytest.raises(UsageError, match=r"take a new file\.$"):  # forms of another degree
+    with pytest.raises(UsageError, match=r"take a new file\.$"):  # Taylor forms of another degree
         certify(controller(), Funnel(alpha=0.95, delta=0.02, states=SET), keep=kept)
     assert kept.read_bytes() == before
 
@@ -175,7 +175,7 @@ def test_an_edited_file_is_refused(name, kept):
 
 
 def test_leaves_that_are_not_proved_are_refused_on_either_side(kept, tmp_path):
-    """What waits is called closed: V of a finished proof, with all its cuts but the first one undone."""
+    """Waiting leaves are recorded as closed: all cuts of a finished proof but the first are removed."""
     for name in ("above", "below"):
         changed = shutil.copy(kept, tmp_path / name)
         rewritten(changed, cut_less(name))
@@ -185,13 +185,13 @@ def test_leaves_that_are_not_proved_are_refused_on_either_side(kept, tmp_path):
 
 
 def test_sides_of_two_questions_are_no_claim(kept, tmp_path):
-    """Each of them is proved, at a δ of its own."""
+    """Each side is proved, but with another δ."""
     other = tmp_path / "other.proof"
     assert both(other, delta=0.06).verdict == "certified"
     rewritten(kept, lambda proofs: proofs.update(below=kept_proofs.read_proofs(other)["below"]))
     result = check(controller(), kept)
     assert result["verdict"] == "refused"
-    assert "both sides by the same α and δ" in result["reason"]
+    assert "two proofs with the same α and δ" in result["reason"]
     assert check(controller(), other)["verdict"] == "certified"
 
 

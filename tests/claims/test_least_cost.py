@@ -1,4 +1,4 @@
-"""The optimum from below: against Riccati's solution, brute force over controls, and claims that must fail."""
+"""Lower bounds of the optimum, against Riccati's solution and brute force over controls; and claims that must fail."""
 
 import dataclasses
 import io
@@ -68,7 +68,7 @@ def test_the_riccati_solution_bounds_the_optimum_from_below_and_closely():
 
 
 def test_no_control_is_cheaper():
-    """Of random ones, and of the optimal one disturbed: by an integrator that knows nothing of the proof."""
+    """Random controls and perturbed optimal ones, by an independent integrator."""
     generator, about, dt = torch.Generator().manual_seed(0), problem(), DURATION / STEPS
     x = X0().sample(2000, generator)
     least, paid, P = plain_claim().least_cost(optimum(x)), torch.zeros(2000), torch.as_tensor(riccati())
@@ -85,7 +85,7 @@ DOMAIN = torch.tensor([0.0, -1.5, -2.5]), torch.tensor([DURATION, 1.5, 2.5])
 
 
 def proved(V, beta, delta, boxes=600):
-    """The proof that V rises no faster than a control pays for, on all of DOMAIN."""
+    """The proof of the condition on all of DOMAIN."""
     about = problem()
     condition = RiseCondition(ClosedLoop(about, HJBPolicy(about, V)), beta, delta, about)
     return prove(condition.requires_grad_(False), DOMAIN, 40.0, Budget(100, boxes, chunk=128))
@@ -128,7 +128,7 @@ def test_the_same_without_a_bump_is_certified():
 
 
 def test_the_least_over_controls_is_what_brute_force_finds():
-    """Within limits and without, about another u*; at points where the law errs it is only lower."""
+    """With and without limits, and with another u*; where the law is wrong, the bound is lower."""
     generator = torch.Generator().manual_seed(0)
     b = 3 * torch.randn(200, 2, generator=generator)
     R = torch.tensor([[1.0, 0.4], [0.4, 0.5]]).expand(200, 2, 2)
@@ -155,8 +155,10 @@ def test_the_least_over_controls_is_what_brute_force_finds():
 
 @pytest.mark.gate
 def test_limits_make_the_bound_higher_and_are_not_left_out():
-    """From (1, 0.7) with |u| ≤ 1 the optimum is dearer than Riccati's: a V between the two is right with them alone."""
-    P = torch.as_tensor(solve_continuous_are([[0.0]], [[1.0]], [[1.0]], [[1.0]]))  # ẋ = u, q = x²: J* = x² without
+    """From (1, 0.7) with |u| ≤ 1 the optimum exceeds Riccati's: a V between the two is right only with limits."""
+    P = torch.as_tensor(
+        solve_continuous_are([[0.0]], [[1.0]], [[1.0]], [[1.0]])
+    )  # ẋ = u, q = x²: J* = x² without limits
     about = {
         limit: problem_of(
             Linear([[0.0]], [[1.0]]), QuadraticCost([[1.0]], [[1.0]], P.tolist()), 20, 0.1, Box([-4.0], [4.0]), controls
@@ -164,7 +166,7 @@ def test_limits_make_the_bound_higher_and_are_not_left_out():
         for limit, controls in ((None, None), (1.0, ControlBox(-1.0, 1.0)))
     }
 
-    def V(t, x):  # x² up to |x| = 1, beyond it rises by 1 + x² a unit of distance: what |u| = 1 pays on its way
+    def V(t, x):  # x² up to |x| = 1; beyond, it rises by 1 + x² for each unit of distance, the cost of |u| = 1
         return x[..., 0] ** 2 + torch.relu(x[..., 0].abs() - 1) ** 3 / 3 + 0 * t
 
     found = {limit: claimed(Formula(V), one, 0.97, 0.02, Box([-4.5], [4.5]).double()) for limit, one in about.items()}
@@ -174,7 +176,7 @@ def test_limits_make_the_bound_higher_and_are_not_left_out():
 
 
 def test_r_has_to_be_positive_definite_where_it_is_asked():
-    """At one state in a thousand R = −1: any V would do, and none does."""
+    """R = −1 at one state in a thousand: without the check any V would be certified."""
     torch.testing.assert_close(least_pivot(torch.tensor([[4.0, 2.0], [2.0, 3.0]])), torch.tensor(2.0))
     cost = QuadraticCost(Q, lambda x: (1 - 2 * torch.relu(1 - 50 * (x[..., 0] - 0.503).abs()))[..., None, None], Q)
     condition = RiseCondition(
@@ -191,14 +193,14 @@ def test_what_is_no_claim_is_refused():
         def running(self, x, u):
             return super().running(x, u) - 5
 
-    with pytest.raises(UsageError, match=r"ℓ = q \+ \(u − u\*\)ᵀR\(u − u\*\), got Own with another running"):
+    with pytest.raises(UsageError, match=r"ℓ = q \+ \(u − u\*\)ᵀR\(u − u\*\), got Own with its own `running`"):
         claimed(about=problem(cost=Own(Q, [[1.0]], Q)))
-    with pytest.raises(UsageError, match="with a lower and an upper one each"):
+    with pytest.raises(UsageError, match="with two finite limits each"):
         claimed(about=problem(ControlBox(0.0, math.inf)))
 
 
 class Costly(Cost):
-    """q = x² but for a pit of some depth and width 0.002 at x = 2, R = 1 and φ = x²; or what a subclass makes of it."""
+    """q = x² with a pit of width 0.002 at x = 2, R = 1 and φ = x²; subclasses change this."""
 
     def __init__(self, depth=0.0):
         super().__init__()
@@ -221,14 +223,14 @@ def of_one_state(cost):
 
 
 def test_a_running_cost_that_falls_below_zero_beyond_the_level_is_part_of_the_excess():
-    """No sample meets the pit, in which a control could rest and earn; where it is shallow, it costs that much."""
+    """No sample meets the pit, where a control could rest at negative cost; a shallow pit enters e."""
     assert of_one_state(Costly()).verdict == "certified"
     assert of_one_state(Costly(1e4)).verdict != "certified"
     assert of_one_state(Costly(4.001)).excess == pytest.approx(0.001 * 2.0, abs=1e-3)
 
 
 def test_a_goal_that_the_terminal_cost_is_not_about_is_none():
-    """Of a target cost with another φ, and of matrices with a goal beside them, nothing is known outside of D."""
+    """For a target cost with another φ, or a goal away from the target, nothing is known outside of D."""
     plain = QuadraticCost(Q, [[1.0]], Q)
     assert is_quadratic_about_target(TargetCost(plain, [1.0, 0.0], [0.0]))
     other = TargetCost(plain, [1.0, 0.0], [0.0])
@@ -290,7 +292,7 @@ def test_where_nothing_is_proved_nothing_is_said():
 
 
 def test_both_sides_of_the_riccati_solution():
-    """The ratio of the means is that of α and β and of what δT adds to each side; every optimum lies between."""
+    """The ratio of the means follows from α, β and δT; every optimum lies between the bounds."""
     result = certify(Controller(problem(), stationary(riccati())), Funnel(alpha=0.95, delta=0.02), LowerBound()).result
     assert result["verdict"] == "certified"
     assert result["holds_for"] == "every control"
@@ -325,7 +327,7 @@ def test_the_command_prints_both_sides(checkpoint, capsys, tmp_path):
     assert {"lower_level", "lower_level_wanted", "holds_for", "lower_boxes"} <= result.keys()
     assert (tmp_path / "b.png").stat().st_size > 1000
     report = (tmp_path / "r" / "report.md").read_text()
-    assert "--two-sided" in report.rsplit("## Again", 1)[1]
+    assert "--two-sided" in report.rsplit("## To repeat it", 1)[1]
     for other in ("--refine=1", "--disturbance=velocity=1"):
         assert main([*arguments, other]) == 2
         assert "Expected --two-sided alone" in capsys.readouterr().err

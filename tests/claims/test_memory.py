@@ -26,7 +26,7 @@ LATER = 400  # calls
 
 
 def rise(x, calls):
-    """Zero at the first calls, and then what lets V rise."""
+    """Zero at the first calls; later a term that lets V rise."""
     return 40.0 * torch.relu(x[..., 0] - 0.6) * (calls > LATER)
 
 
@@ -69,7 +69,7 @@ class Inner(nn.Module):
 
 
 class Hooked(nn.Module):
-    """A hook of a part counts."""
+    """A hook of a submodule counts calls."""
 
     def __init__(self):
         super().__init__()
@@ -82,7 +82,7 @@ class Hooked(nn.Module):
 
 
 class Plain:
-    """No module."""
+    """An object that is not a module counts calls."""
 
     def __init__(self):
         self.kept = {"calls": 0}
@@ -121,7 +121,7 @@ class Static:
 
 
 class Largest(nn.Module):
-    """The largest |x| that it met: on the same states it settles."""
+    """It stores the largest |x| so far, which does not change on the same states."""
 
     def __init__(self):
         super().__init__()
@@ -133,7 +133,7 @@ class Largest(nn.Module):
 
 
 class Last(nn.Module):
-    """The states of the call before."""
+    """It stores the states of the previous call."""
 
     last = None
 
@@ -143,7 +143,7 @@ class Last(nn.Module):
 
 
 class Scaled(nn.Module):
-    """A batch norm that was left in training."""
+    """A batch norm in training mode."""
 
     def __init__(self):
         super().__init__()
@@ -267,7 +267,7 @@ def by_generator():
 
 
 def counting(function):
-    """A decorator."""
+    """A decorator that counts calls."""
     kept = [0]
 
     @functools.wraps(function)
@@ -306,7 +306,7 @@ WAYS = {
 
 
 class Law(HJBPolicy):
-    """The law of V, and something more."""
+    """The law of V plus a term."""
 
     def __init__(self, problem, V, add):
         super().__init__(problem, V)
@@ -386,7 +386,7 @@ def evaluated():
 
 
 def parametrized():
-    """A spectral norm updates its vectors in training alone."""
+    """A spectral norm, which updates its vectors only in training mode."""
     layer = nn.utils.parametrizations.spectral_norm(nn.Linear(2, 1, bias=False)).double().eval()
     with torch.no_grad():
         layer.parametrizations.weight.original.mul_(1.0)
@@ -394,7 +394,7 @@ def parametrized():
 
 
 def test_constants_that_are_computed_once_are_certified():
-    """The twins: what the first calls fill in stays."""
+    """The counterparts: attributes that the first calls set do not change later."""
     law = lambda problem, V: Law(problem, V, by_lru_cache)  # noqa: E731
     assert claim(System(Lazy()), Paid(terminal=Property()), law=law).verdict == "certified"
     assert claim(System(parametrized())).verdict == "certified"

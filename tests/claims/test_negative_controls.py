@@ -1,4 +1,4 @@
-"""What must never be certified: planted violations, unstable loops, wrong signs, wrong α; and what errors say."""
+"""Claims that must never be certified: planted violations, unstable loops, wrong signs, wrong α; and error messages."""
 
 import math
 
@@ -28,7 +28,7 @@ UNSTABLE = [[2.0, 0.0], [0.3, 1.0]]
 
 @pytest.fixture(autouse=True)
 def _little_time_for_levels(monkeypatch):
-    """The levels of a V that cannot be certified are sought as long as there is time."""
+    """The levels of a V that cannot be certified take all the time that is allowed."""
     monkeypatch.setattr(funnel, "LEVELS", 5.0)
 
 
@@ -65,7 +65,7 @@ def claim(closed_loop, *arguments, **options):
 
 
 def planted_at_random(seed):
-    """(A condition with a violation of a random place and side from 0.3 to 0.01, its place); in c, or in V itself."""
+    """(a condition with a violation at a random place, of width 0.3 to 0.01, in c or in V; its place)."""
     generator = torch.Generator().manual_seed(seed)
     point = LOWER + (UPPER - LOWER) * torch.rand(3, generator=generator).double()
     side = 0.3 * (0.01 / 0.3) ** ((seed % 10) / 9)
@@ -90,7 +90,7 @@ def refuted(condition, point, side):
 
 
 def controls(seeds):
-    """Verdicts on planted violations; and each true counterexample lies above the level that was proved."""
+    """Verdicts on planted violations; each true counterexample lies above the proved level."""
     verdicts = []
     for seed in seeds:
         condition, point, side = planted_at_random(seed)
@@ -107,7 +107,7 @@ def controls(seeds):
 
 
 def test_what_nothing_is_planted_in_is_certified():
-    """The twin of all that follows, by the same budget."""
+    """The counterpart of all tests below, with the same budget."""
     assert proof_of(DecreaseCondition(loop(Bowl()), 0.5, 0.02), 0).verdict == "certified"
 
 
@@ -118,7 +118,7 @@ def test_a_hundred_planted_violations_are_never_certified(first):
 
 @pytest.mark.parametrize("seed", range(2))
 def test_unstable_loops_are_falsified_with_true_counterexamples(seed):
-    """Their states grow whatever V says, and at the counterexample V grows by plain arithmetic along a short step."""
+    """Their states grow, and V grows from the counterexample along a short step, in plain arithmetic."""
     torch.manual_seed(seed)
     closed_loop = loop(Bowl(0.2), A=(torch.tensor(UNSTABLE) + 0.1 * torch.randn(2, 2)).tolist(), gain=0.1)
     found = claim(closed_loop, 0.5, 0.01, Box(LOWER[1:], UPPER[1:]), Budget(AMPLE, boxes=2000))
@@ -145,7 +145,7 @@ def test_too_large_an_alpha_is_falsified():
 
 
 class Jump(Bowl):
-    """V that jumps up by 1 where x₁ becomes negative, which its gradient does not tell."""
+    """V that jumps up by 1 where x₁ becomes negative, which its gradient does not show."""
 
     def forward(self, t, x):
         return super().forward(t, x) + (x[..., 0] < 0).to(x)

@@ -1,4 +1,4 @@
-"""Control sets of one's own whose `minimise` or `project` leaves what `contains` has: none is certified."""
+"""Control sets of a user whose `minimise` or `project` leaves the set of `contains`: none is certified."""
 
 import pytest
 import torch
@@ -18,7 +18,7 @@ LIMITS = torch.tensor([-1.0, -1.0]), torch.tensor([1.0, 1.0])
 
 
 class Limits(ControlSet):
-    """|u_i| ≤ 1; for a diagonal R."""
+    """|u_i| ≤ 1, for a diagonal R."""
 
     def minimise(self, R, b):
         return self.project(-0.5 * b / R.diagonal(dim1=-2, dim2=-1))
@@ -73,7 +73,7 @@ class OneSide(Limits):
 
 
 class Narrow(Limits):
-    """`contains` has less than `project`."""
+    """The set of `contains` is smaller than that of `project`."""
 
     def contains(self, u):
         return (u.abs() <= 0.99).all(-1)
@@ -85,7 +85,7 @@ class OfTheSum(Limits):
 
 
 class Either(Limits):
-    """Of the two halves of a box, without the middle."""
+    """The two halves of a box, without the middle."""
 
     def contains(self, u):
         return super().contains(u) & ((u[..., 0] >= 0.1) | (u[..., 0] <= -0.1))
@@ -107,7 +107,7 @@ class Rounded(Limits):
 
 
 class Turned(Limits):
-    """Off by a rotation."""
+    """The result is rotated."""
 
     def minimise(self, R, b):
         u = super().minimise(R, b)
@@ -115,19 +115,19 @@ class Turned(Limits):
 
 
 def assumed(controls):
-    """What is assumed of u = clamp(−2x) on D."""
+    """The assumption about u = clamp(−2x) on D."""
     problem = problem_of(Linear(A, torch.eye(2)), controls=controls)
     return check_controls(ClosedLoop(problem, HJBPolicy(problem, Bowl())).double(), DOMAIN)
 
 
 @pytest.mark.parametrize("controls", [Limits, TwoSided])
 def test_what_keeps_to_its_set_is_proved(controls):
-    """The twins."""
+    """The counterparts."""
     assert not assumed(controls())
 
 
 def test_what_bounds_do_not_decide_is_said(caplog):
-    assert "held at 20000 points of [0, T] × D, and is not proved" in assumed(Disk())
+    assert "tested at 20000 points of [0, T] × D, and is not proved" in assumed(Disk())
     assert "not proved" in caplog.text
 
 
@@ -142,7 +142,7 @@ def test_what_leaves_its_set_is_refused(controls):
 
 
 class OfOne(Limits):
-    """In one control; `leave` is where it leaves U."""
+    """A set for one control; u leaves U at `leave`."""
 
     def __init__(self, leave):
         super().__init__()
@@ -153,5 +153,5 @@ class OfOne(Limits):
 
 
 def test_certificates_look_at_it():
-    with pytest.raises(UsageError, match=r"Expected OfOne\.minimise\(R, b\) in the set that contains\(u\) has"):
+    with pytest.raises(UsageError, match=r"Expected OfOne\.minimise\(R, b\) in the set that contains\(u\) describes"):
         claim(controls=OfOne(lambda b: 1e4 * torch.relu(1e-4 - (b - 1.93).abs())))

@@ -1,4 +1,4 @@
-"""Regions of plants whose parameters are not known: against closed forms, simulated plants, and laws that are told."""
+"""Regions of plants with unknown parameters, against closed forms, simulated plants, and laws that depend on them."""
 
 import dataclasses
 import math
@@ -53,7 +53,7 @@ class Leaky(ControlAffineSystem):
         return (self.gain + torch.zeros_like(x[..., 0]))[..., None, None]
 
     def inverse_mass(self, x):
-        """What R is where a law should not know another gain."""
+        """R, in tests where the law must not depend on the gain."""
         return self.g(x)
 
 
@@ -76,7 +76,7 @@ class Spring(ControlAffineSystem):
 
 
 class Bumpy(Leaky):
-    """ẋ = −x, but for parameters in a slice of width 2e-4: there it leaves every |x| > edge."""
+    """ẋ = −x, except for parameters in a slice of width 2e-4, where states |x| > edge diverge."""
 
     edge = 0.0
 
@@ -91,7 +91,7 @@ class BumpyFarOut(Bumpy):
 
 
 def leaky(system=None, x0=0.5):
-    """V = x², of ẋ = −x + u: u = −2x."""
+    """The controller of ẋ = −x + u with V = x²: u = −2x."""
     system = system or Leaky()
     about = problem_of(system, QuadraticCost([[1.0]], [[0.5]], [[1.0]]), 100, 0.02, Box([-x0], [x0]))
     return Controller(about, Formula(lambda t, x: (x**2).sum(-1) + 0 * t))
@@ -103,7 +103,7 @@ def spring():
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """Volumes are not what these tests are about; one size of B, as these laws are linear."""
+    """Skip volumes, and test one size of B, since these laws are linear."""
     monkeypatch.setattr(region, "share_of", lambda *_: 0.5)
     monkeypatch.setattr(contraction, "SIZES", 1)
 
@@ -118,7 +118,7 @@ def claimed(controller, ranges, states=None, boxes=3000, **options):
 
 @cache
 def springs():
-    """0.9 of the stiffness with which V = xᵀPx falls."""
+    """Parameters in 0.9 of the interval in which V = xᵀPx falls."""
     stiff, soft = (edge(lambda k: excess(1.0, k), 0.0, far) for far in (9.0, -9.0))
     return claimed(spring(), {"stiffness": [0.9 * soft, 0.9 * stiff]})
 
@@ -128,21 +128,21 @@ def springs():
 
 @pytest.mark.parametrize("share", [0.999, 1.001])
 def test_of_one_state_the_largest_interval_is_known(share):
-    """V̇ = 2(−1 − 2 gain)x² ≤ −λx² where gain ≥ λ/4 − ½. A law that is told it has no such limit."""
+    """V̇ = 2(−1 − 2 gain)x² ≤ −λx² where gain ≥ λ/4 − ½. A law that depends on the gain has no such limit."""
     claim = claimed(leaky(), {"gain": [share * (LAMBDA / 4 - 0.5), 3.0]})
     assert (claim.verdict == "certified") == (share < 1)
     assert share < 1 or claim.rho == -math.inf
 
 
 def excess(mass, stiffness):
-    """The largest eigenvalue of PA + AᵀP + λP, A of the spring under u = −K x that was made for mass 1, stiffness 0."""
+    """The largest eigenvalue of PA + AᵀP + λP for the spring under the law u = −Kx of mass 1 and stiffness 0."""
     P = riccati()
     A = np.array([[0.0, 1.0], [-(stiffness + P[1, 0]) / mass, -P[1, 1] / mass]])
     return np.linalg.eigvalsh(P @ A + A.T @ P + LAMBDA * P).max()
 
 
 def edge(function, inside, outside):
-    """Where a function that is at most 0 inside comes to be above it."""
+    """The edge of an interval where a function becomes positive, by bisection."""
     for _ in range(60):
         middle = (inside + outside) / 2
         inside, outside = (middle, outside) if function(middle) <= 0 else (inside, middle)
@@ -172,7 +172,7 @@ def test_with_pushes_the_ultimate_bound_is_that_of_the_worst_plant():
     assert 1 < claim.hole / (0.3 / (2.5 - LAMBDA / 2)) ** 2 < 1.05
     assert claim.extent.dimension == claim.states.dimension == 1
     assert float(claim.extent.upper) == pytest.approx(math.sqrt(claim.hole), rel=0.025)
-    assert "for each plant of this model with constant decay ∈ [0.5, 3.0], whatever pushes" in words(leaky(), claim)
+    assert "for each plant of this model with constant decay ∈ [0.5, 3.0], under all" in words(leaky(), claim)
 
 
 def words(controller, claim):
@@ -192,7 +192,7 @@ def test_without_width_the_claim_is_that_of_the_one_plant():
 
 
 def test_no_plant_leaves_and_each_goes_to_the_goal():
-    """From the region's edge, at the ends of P and in it."""
+    """Closed loops from the region's edge, for plants at the ends of P and inside."""
     claim, about = springs(), spring()
     angle = torch.linspace(0, 2 * math.pi, 25)
     x = torch.stack([angle.cos(), angle.sin()], -1)
@@ -211,7 +211,7 @@ def test_no_plant_leaves_and_each_goes_to_the_goal():
 
 
 def test_the_law_and_V_are_told_x_alone():
-    """Of what the law is made, R = g of the nominal plant included, nothing knows p; its twin, a family, is told."""
+    """Nothing in the law depends on p, not even R = g of the nominal plant; in a family, the counterpart, it does."""
     system = Leaky()
     paid = QuadraticCost([[1.0]], system.inverse_mass, [[1.0]])
     about = Controller(problem_of(system, paid, 100, 0.02, Box([-0.5], [0.5])), leaky().V)
@@ -231,12 +231,12 @@ def test_the_law_and_V_are_told_x_alone():
     condition = RecedingDecrease(loop, LAMBDA)
     value, slope = x[:, 0] ** 2, 2 * x[:, 0]
     assert torch.allclose(condition(t.expand(9), z), slope * (-decay * x[:, 0] + gain * u) + LAMBDA * value)
-    assert (about.system.gain, about.system.decay) == (1.0, 1.0), "what is tried leaves no trace in the plant"
+    assert (about.system.gain, about.system.decay) == (1.0, 1.0), "the comparison does not change the plant"
 
 
 @pytest.mark.parametrize("system", [Bumpy, BumpyFarOut])
 def test_what_fails_in_a_thin_slice_of_plants_is_found(system):
-    """At the goal nothing contracts there; far from it V rises. Beside the slice there is a region."""
+    """In the slice nothing contracts at the goal, and V rises far from it. Without the slice there is a region."""
     at = leaky(system(), x0=0.7)
     claim = claimed(at, {"decay": [1.0, 1.5]})
     assert claim.verdict != "certified"
@@ -246,7 +246,7 @@ def test_what_fails_in_a_thin_slice_of_plants_is_found(system):
 
 
 def test_the_jacobian_is_bounded_for_each_plant_and_the_metric_that_of_V():
-    """The middle's own metric has no common rate for stiffness −3 to 3; V_xx has."""
+    """For stiffness −3 to 3, the metric of the middle gives no common rate; V_xx does."""
     found = plants_of(spring(), {"stiffness": [-3.0, 3.0]})
     loop, inside = found.all_of(spring().closed_loop, spring().problem)
     contracts, slowest = contraction_around(loop, inside.goal, found.around(Box([-1.0] * 2, [1.0] * 2)), [0, 1])
@@ -282,10 +282,10 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     at, path = leaky(), tmp_path / "plants.proof"
     claim = Region(states=[[-1], [1]], parameters={"gain": (2, 3)})
     certificate = certify(at, claim, budget=20, keep=path)
-    assert certificate.verdict == "certified", "a law is not bound to hold its own plant"
+    assert certificate.verdict == "certified", "the nominal plant need not be in P"
     assert "for each plant of this model with constant gain ∈ [2.0, 3.0]: no closed loop" in certificate.in_words()
-    assert "u and V are those made for gain = 1.0: they are not told" in certificate.in_words()
-    assert "all go to one equilibrium of their plant exponentially" in certificate.in_words()
+    assert "u and V are those made for gain = 1.0: they do not depend" in certificate.in_words()
+    assert "all converge to one equilibrium of their plant exponentially" in certificate.in_words()
     assert sum("for each p = (gain) ∈ P = [[2.0, 3.0]]" in line for line in certificate.in_formulas()) == 2
     assert certificate.result["parameters"] == {"gain": [2.0, 3.0]}
     assert certificate.result["nominal_parameters"] == {"gain": 1.0}
@@ -301,7 +301,7 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
     assert result["parameters"] == {"gain": [2.0, 3.0]}
     whole = path.read_bytes()
     for others in ({"gain": (2, 3.1)}, {}):
-        with pytest.raises(UsageError, match=r"Expected the parameters of .*, got others; take another file"):
+        with pytest.raises(UsageError, match=r"Expected the parameters of .*, got others; choose another file"):
             certify(at, dataclasses.replace(claim, parameters=others), budget=20, keep=path)
     for name, (change, word) in EDITS.items():
         path.write_bytes(whole)
@@ -310,7 +310,7 @@ def test_the_certificate_says_which_plants_and_what_the_law_was_made_for(tmp_pat
         kept_proofs.write_proofs(path, proofs)
         result = check(at, path)
         assert (result["verdict"], "\n" in (result["reason"] or "")) == (word, False), name
-    assert result["parameters"] == {"gain": [2.0, 2.5]}, "another claim, which says what it is about"
+    assert result["parameters"] == {"gain": [2.0, 2.5]}, "another claim, about the parameters that it names"
 
 
 def of(**values):
@@ -324,7 +324,7 @@ def ends(lower, upper):
     return change
 
 
-EDITS = {  # by someone who computes the digest again; the fingerprint is that of the operations, which see no P
+EDITS = {  # the forger computes the digest again; the fingerprint does not depend on P
     "another parameter": (of(parameters=["decay"]), "refused"),
     "none of the system": (of(parameters=["mass"]), "refused"),
     "no list": (of(parameters="g"), "refused"),
@@ -351,9 +351,9 @@ EDITS = {  # by someone who computes the digest again; the fingerprint is that o
         ("mass=1", "with two numbers, got 'mass=1'"),
         ("mass=a:b", "with two numbers"),
         ("mass=1:2:3", "with two numbers"),
-        ("mass=2:1", "Expected --parameter mass=LOWER:UPPER, LOWER ≤ UPPER and finite, got (2.0, 1.0)"),
-        ("mass=1:inf", "LOWER ≤ UPPER and finite"),
-        ("mass=nan:1", "LOWER ≤ UPPER and finite"),
+        ("mass=2:1", "by name, with lower ≤ upper, got {'mass': (2.0, 1.0)}"),
+        ("mass=1:inf", "as finite numbers (lower, upper)"),
+        ("mass=nan:1", "as finite numbers (lower, upper)"),
     ],
 )
 def test_what_is_no_interval_is_refused(named, expected):
@@ -376,14 +376,14 @@ def test_an_interval_is_named_once():
             {"mas": [1, 2]},
             r"among the arguments of Pendulum \(mass, length, damping, gravity\), got mas; did",
         ),
-        (Pendulum(), {"damping": [0, 1]}, r"Expected --parameter among the numbers that Pendulum keeps \(mass, length"),
-        (Pendulum(), {"mass": [-1, 2]}, r"--parameter: Expected mass > 0, got -1\.0"),
+        (Pendulum(), {"damping": [0, 1]}, r"Expected parameters among the numbers that Pendulum keeps \(mass, length"),
+        (Pendulum(), {"mass": [-1, 2]}, r"parameters: Expected mass > 0, got -1\.0"),
         (DoubleIntegrator(), {"mass": [0.9, 1.1]}, r"Expected DoubleIntegrator\.f or g to read mass, got the same"),
         (Pendulum(length=2.0), {"mass": [1, 2]}, r"got another f than that of Pendulum built with \["),
     ],
 )
 def test_what_does_not_make_another_plant_is_refused(system, ranges, expected):
-    """What a constructor derives, what nothing reads, and other numbers than the constructor's own."""
+    """Parameters that a constructor derives from or that nothing reads, and values that it refuses."""
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     with pytest.raises(UsageError, match=expected) as refused:
         plants_of(Controller(problem_of(system), V), ranges)
@@ -395,7 +395,7 @@ def test_a_set_of_other_states_and_a_family_are_refused():
         claimed(leaky(), {"gain": [1.0, 2.0]}, states=Box([-1.0] * 2, [1.0] * 2))
     found = plants_of(leaky(), {"gain": [1.0, 2.0]})
     _, inside = found.all_of(leaky().closed_loop, leaky().problem)
-    with pytest.raises(UsageError, match="Expected one system, got a family; choose a member with --at"):
+    with pytest.raises(UsageError, match="Expected one system, got a family; choose one member"):
         plants_of(Controller(inside, leaky().V), {"gain": [1.0, 2.0]})
 
 

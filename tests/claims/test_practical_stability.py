@@ -1,4 +1,4 @@
-"""Regions under disturbances: against closed forms, the worst pushes, larger ones, and files that are not believed."""
+"""Regions under disturbances, against closed forms, the worst disturbances and larger ones; and forged files."""
 
 import json
 import math
@@ -12,7 +12,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims import region
 from lyapnet.claims.certify import certify
 from lyapnet.claims.checking import check
-from lyapnet.claims.disturbances.regions import RegionsUnderPushes
+from lyapnet.claims.disturbances.regions import DisturbedRegions
 from lyapnet.claims.kinds import Region
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.receding_decrease import RecedingDecrease
@@ -60,7 +60,7 @@ def highest_rise(w):
 
 
 def pushed(x, push, seconds=6.0, dt=2e-3, kind="worst"):
-    """(the highest V, V in the end) of closed loops under u(0, x), by Euler steps, with pushes on the velocity."""
+    """(the highest V, V in the end) of closed loops under u(0, x), by Euler steps, with a disturbed velocity."""
     about, t, V, X = problem(), torch.zeros(()), stationary(riccati()), P()
     generator, highest = torch.Generator().manual_seed(0), torch.tensor(-math.inf)
     assert torch.allclose(HJBPolicy(about, V)(t, x), -(x @ X)[:, 1:]), "the law in closed form"
@@ -78,7 +78,7 @@ def pushed(x, push, seconds=6.0, dt=2e-3, kind="worst"):
 
 
 def start(claim):
-    """States all over the region, a third of them on its edge."""
+    """States in the region, a third of them on its edge."""
     x = D.sample(3000, torch.Generator().manual_seed(0))
     V = stationary(riccati())(torch.zeros(()), x)
     edge = x[:200] * (claim.rho / V[:200]).sqrt()[:, None] * (1 - 1e-9)
@@ -122,7 +122,7 @@ def test_of_a_linear_law_region_and_ultimate_bound_are_those_of_the_ellipses():
 
 @pytest.mark.gate
 def test_the_ultimate_bound_grows_with_the_square_of_the_push():
-    """Of a linear law all is alike at each size: c(2W) = 4c(W)."""
+    """A linear closed loop scales: c(2W) = 4c(W)."""
     assert claimed(disturbance=2 * W).hole == pytest.approx(4 * pushed_claim().hole, rel=5e-3)
 
 
@@ -130,7 +130,7 @@ def test_the_ultimate_bound_grows_with_the_square_of_the_push():
 
 
 @pytest.mark.parametrize("kind", ["worst", "constant", "resonant", "random"])
-def test_whatever_pushes_there_are_closed_loops_stay_and_end_in_the_ultimate_set(kind):
+def test_under_any_disturbance_closed_loops_stay_and_end_in_the_ultimate_set(kind):
     claim = pushed_claim()
     assert claim.verdict == "certified"
     highest, end = pushed(start(claim), W, kind=kind)
@@ -152,13 +152,13 @@ def test_a_hundred_times_larger_pushes_leave_it_and_nothing_is_proved_of_them():
     none = claimed(disturbance=100 * W)
     assert (none.verdict, none.rho, none.volume, none.extent) == ("unknown", -math.inf, 0.0, None)
     assert none.entered_within == math.inf
-    assert none.reason.startswith("no levels c < ρ were found between which V(0, ·) falls whatever the pushes")
+    assert none.reason.startswith("no levels c < ρ were found between which V(0, ·) falls under every disturbance")
     assert "\n" not in none.reason
 
 
 @pytest.mark.gate
 def test_nothing_is_proved_of_a_hole_that_is_too_small(monkeypatch):
-    """The twin of the search for c: no claim rests on it."""
+    """The counterpart of the search for c: a wrong c proves nothing."""
     monkeypatch.setattr(region, "ultimate_level", lambda *_: 0.5 * pushed_claim().hole)
     claim = claimed(disturbance=W)
     assert claim.rho == -math.inf
@@ -177,7 +177,7 @@ def test_without_pushes_the_claim_is_what_it_was():
 
 
 def test_pushes_end_in_every_well():
-    """V = x²(x − 2)² is low around 0 and 2, and nothing is said of which of the two a closed loop comes to."""
+    """V = x²(x − 2)² is low around 0 and 2; the claim does not say to which of the two a closed loop goes."""
     about = problem_of(Linear([[0.0]], [[1.0]]), None, 100, 0.02, Box([-0.2], [0.2]))
     V = Formula(lambda t, x: (x[..., 0] * (x[..., 0] - 2)) ** 2 + 0 * t)
     claim = prove_region(
@@ -189,7 +189,7 @@ def test_pushes_end_in_every_well():
     assert float(claim.extent.upper) > 2
 
 
-def test_a_constraint_bounds_it_however_pushed():
+def test_a_constraint_bounds_the_region():
     wall = StateLimits([0], [1.0], [1.0], [1.0], ["position ≤ 1"])
     claim = claimed(about=problem(constraints=wall), disturbance=W)
     largest = float(1 / P().inverse()[0, 0])
@@ -251,7 +251,7 @@ def checked(path):
 
 
 def of_itself(of):
-    """Sets the fingerprint to that of what the changed file says, as its author could."""
+    """Set the fingerprint to that of the changed file, as a forger could."""
     w = torch.tensor(of["disturbance"])
     condition = RecedingDecrease(loop_of(stationary(riccati()), problem()).requires_grad_(False), of["decay"], w)
     domain = over_time(Box(of["lower"][1:], of["upper"][1:]).double(), 0.0)
@@ -274,18 +274,20 @@ def test_a_kept_proof_is_checked_with_its_disturbance(kept):
     assert (result["rho"], result["ultimate_level"]) == (pushed_claim().rho, pushed_claim().hole)
     assert result["disturbance"] == {"velocity": 0.2}
     rewritten(kept, lambda content: None)
-    assert checked(kept)["verdict"] == "certified", "the twin: what the tests compute anew is what the file says"
+    assert checked(kept)["verdict"] == "certified", (
+        "the counterpart: the fingerprint that the tests compute is that of the file"
+    )
 
 
 @pytest.mark.gate
 def test_it_goes_on_by_the_same_disturbance_alone(kept, plain):
     before = kept.read_bytes()
     for w in (0.5 * W, 2 * W, 0 * W, None):
-        with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
+        with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; choose another file"):
             kept_at(kept, w)
     assert kept.read_bytes() == before
     assert kept_at(kept).rho == pushed_claim().rho
-    with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; take another file"):
+    with pytest.raises(UsageError, match=r"Expected the disturbance of .*, got another; choose another file"):
         kept_at(plain)
 
 
@@ -312,7 +314,7 @@ EDITS = {
 @pytest.mark.gate
 @pytest.mark.parametrize("name", EDITS)
 def test_an_edited_file_is_refused(name, kept):
-    """By an author who computes the digest and the fingerprint again."""
+    """The forger computes the digest and the fingerprint again."""
     rewritten(kept, EDITS[name])
     result = checked(kept)
     assert result["verdict"] == "refused"
@@ -357,7 +359,7 @@ def controller():
 def test_for_each_size_there_is_a_claim():
     about, pushes = controller(), [0.0, 0.2, 0.4, 30.0]
     claims = [Region(states=D, disturbance={"velocity": w}) for w in pushes]
-    regions = RegionsUnderPushes(about, "velocity", pushes, [certify(about, claim) for claim in claims])
+    regions = DisturbedRegions(about, "velocity", pushes, [certify(about, claim) for claim in claims])
     still, small, large, none = (each.claim for each in regions.certificates)
     assert still.contraction is not None
     assert small.hole == pytest.approx(pushed_claim().hole, rel=1e-3)
@@ -369,7 +371,7 @@ def test_for_each_size_there_is_a_claim():
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     figure = regions.figure()
     volumes, plane = figure.axes
-    assert volumes.get_xlabel() == "largest push on d(velocity)/dt, w_max (m/s²)"
+    assert volumes.get_xlabel() == "largest disturbance of d(velocity)/dt, w_max (m/s²)"
     assert volumes.get_ylabel() == "certified volume (m · m/s)"
     assert [float(y) for y in volumes.lines[0].get_ydata()] == [c.volume for c in (still, small, large, none)]
     assert "none proved" in [text.get_text() for text in volumes.texts]

@@ -86,7 +86,7 @@ def test_of_a_linear_law_the_largest_ellipse_in_the_set_is_proved():
 
 
 def test_its_contraction_is_that_of_the_linear_law():
-    """κ at most the slowest eigenvalue's, and a remainder that is rounding."""
+    """κ is at most the rate of the slowest eigenvalue, and the offset is rounding."""
     A = torch.tensor([[0.0, 1.0], [0.0, 0.0]]) - torch.tensor([[0.0], [1.0]]) @ torch.from_numpy(riccati())[1:]
     slowest = -float(torch.linalg.eigvals(A).real.max())
     found = plain_claim().contraction
@@ -97,7 +97,7 @@ def test_its_contraction_is_that_of_the_linear_law():
 
 @pytest.mark.gate
 def test_between_limits_the_region_is_what_a_grid_says():
-    """The least V where V does not fall, on 400 × 400 states outside the hole: no more is proved, and 90 % of it is."""
+    """The least V where V does not fall, on 400 × 400 states outside the hole: ρ is below it, and above 90 % of it."""
     claim, V, t = limited_claim(), stationary(riccati()), torch.zeros(())
     about = problem(controls=LIMITED)
     x = torch.cartesian_prod(*(torch.linspace(-float(side), float(side), 400) for side in D.upper))
@@ -124,7 +124,7 @@ def test_a_law_that_leaves_the_goal_has_no_region():
     assert claim.verdict == "unknown"
     assert claim.rho == -math.inf
     assert claim.volume == claim.volume_share == 0
-    assert "does not hold the goal: linearised, an eigenvalue has the real part" in claim.reason
+    assert "does not stabilise the goal: its linearisation has an eigenvalue with real part" in claim.reason
 
 
 def test_a_law_that_leaves_further_out_is_falsified():
@@ -150,7 +150,7 @@ def test_a_second_well_is_not_taken_for_the_hole():
 
 
 class Lying(torch.autograd.Function):
-    """x/2, with the derivative of −5x."""
+    """x/2 with the derivative of −5x."""
 
     @staticmethod
     def forward(ctx, x):
@@ -180,7 +180,7 @@ def test_the_jacobian_is_that_of_the_operations_that_run():
 
 
 class Rubbing(Linear):
-    """A body on which Coulomb's friction acts: it stops wherever |u| does not overcome it."""
+    """A body with Coulomb friction: it stops wherever |u| is smaller than the friction."""
 
     dynamics = ControlAffineSystem.dynamics
 
@@ -227,7 +227,7 @@ def test_a_certificate_does_not_say_the_goal_where_it_is_another_equilibrium():
     claim = claimed(V, about)
     assert claim.verdict == "certified"
     words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).in_words()
-    (within,) = re.findall(r"one equilibrium exponentially, for ever, which is within (\S+) of the goal", words)
+    (within,) = re.findall(r"one equilibrium exponentially, which is within (\S+) of the goal", words)
     assert 0.01 <= float(within) < 0.1
 
 
@@ -239,7 +239,7 @@ def test_a_hole_below_zero_is_none(well):
     claim = prove_region(loop_of(V, about), about, None, Box([-1.0], [1.0]), Budget(5, 1000, chunk=64))
     assert claim.verdict != "certified"
     assert claim.rho == -math.inf
-    assert "not above 0 around the goal" in claim.reason
+    assert "not positive around the goal" in claim.reason
 
 
 @pytest.mark.gate
@@ -251,8 +251,8 @@ def test_a_rate_that_is_asked_in_vain_is_not_called_unstable():
     assert at(1.9).verdict == "certified"
     claim = at(2.1)
     assert claim.verdict != "certified"
-    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).of_the_verdict()
-    assert "closed loops may go to the goal even so" in words
+    words = RegionCertificate(Controller(about, V), claim, {"seed": 0}).verdict_text()
+    assert "closed loops may still go to the goal" in words
 
 
 class Switched(Linear):
@@ -269,7 +269,7 @@ class Switched(Linear):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_what_jumps_far_from_the_goal_is_no_obstacle_there(dtype):
-    """The twin of friction: truths that are decided on B; the box does not reach beyond the jump."""
+    """The counterpart of friction: comparisons are constant on B, which does not reach the jump."""
     about = problem_of(Switched(), None, 100, 0.02, Box([-0.5], [0.5]))
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     default = torch.get_default_dtype()

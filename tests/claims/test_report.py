@@ -1,4 +1,4 @@
-"""Reports of certificates: they name what was certified; what cannot be written is refused, or leaves nothing."""
+"""Reports of certificates: their content; and outputs that cannot be written are refused, or leave no file."""
 
 import hashlib
 import json
@@ -76,7 +76,7 @@ def test_a_report_names_what_was_certified(kind, reported, checkpoint):
 
 @pytest.mark.gate
 def test_a_report_has_the_limits_of_the_controller(checkpoint):
-    """Not those of its config, which may be others."""
+    """Not the limits of the config, which may differ."""
 
     def controls_of(**own):
         certificate = certify(load(checkpoint, **own), Sampled(samples=3))
@@ -125,7 +125,7 @@ def test_another_checkpoint_has_another_hash(reported, checkpoint, tmp_path):
 
 
 def claimed(cls, claim, seed=3):
-    """A certificate of a claim, about a controller that is made up."""
+    """A certificate of a claim about an untrained controller."""
     V = Formula(lambda t, x: (x**2).sum(-1) + 0 * t)
     return cls(Controller(problem_of(DoubleIntegrator()), V), claim, {"seed": seed})
 
@@ -139,9 +139,9 @@ def test_a_sampled_claim_in_words():
     one = claimed(SampledCertificate, count_successes(97, Tolerances(0.5, None, 0.05)))
     assert one.in_words().startswith("Of 100 states drawn uniformly from X₀ (seed 3), 97 succeed")
     assert one.in_formulas() == ["‖x(T)‖ ≤ 0.5", "J(x₀) ≤ 1.05 V(0, x₀)"]
-    assert "one that fails was found" in one.of_the_verdict()
+    assert "one that fails was found" in one.verdict_text()
     all_succeed = claimed(SampledCertificate, count_successes(100, Tolerances(0.5, None, 0.05)))
-    assert "one that fails" not in all_succeed.of_the_verdict()
+    assert "one that fails" not in all_succeed.verdict_text()
 
 
 def test_a_bound_is_rounded_down_in_words():
@@ -177,7 +177,7 @@ def test_no_funnel_claims_nothing():
     assert nothing.verdict == "falsified"
     assert "nothing is claimed" in nothing.in_words()
     assert not any("1.25" in line or "inf" in line for line in nothing.in_formulas())
-    assert "At t = 1 s, x = (0.5, 1.5) it fails by 0.1" in nothing.of_the_verdict()
+    assert "At t = 1 s, x = (0.5, 1.5) it fails by 0.1" in nothing.verdict_text()
 
 
 @pytest.mark.gate

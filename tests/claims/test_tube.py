@@ -1,4 +1,4 @@
-"""Tubes around closed loops: against closed forms and a second integrator; and what they must not prove."""
+"""Tubes around closed loops, against closed forms and a second integrator; and false claims."""
 
 import json
 import re
@@ -31,7 +31,7 @@ HALF, T = 0.3, 1.0
 
 
 def controller(system=None, V=None, constraints=None, half=HALF):
-    """Of a system under the HJB law of V, zero by default, from |x_i| ≤ 0.3 over 1 s, with Q = R = Q_T = 1."""
+    """The HJB law of V (0 by default) from |x_i| ≤ 0.3 over 1 s, with Q = R = Q_T = 1."""
     system = system or Linear([[0.0, 2.0], [-2.0, -0.5]], [[0.0], [1.0]])
     X0 = Box(torch.full((2,), -half).double(), torch.full((2,), half).double())
     about = problem_of(system, steps=20, dt=T / 20, initial_states=X0)
@@ -41,7 +41,7 @@ def controller(system=None, V=None, constraints=None, half=HALF):
 
 
 class Swinging(ControlAffineSystem):
-    """θ̈ = 4 sin θ − θ̇ + u, by θ³ too: nonlinear in every way that matters here."""
+    """θ̈ = 4 sin θ − θ̇ + u with a term in θ³."""
 
     state_names, state_units = ("angle", "rate"), ("rad", "rad/s")
     control_names, control_units = ("torque",), ("N·m",)
@@ -60,7 +60,7 @@ def damped(t, x):
 
 @pytest.fixture(scope="module")
 def straight():
-    """Of the linear system without a law."""
+    """The tube of the linear system without control."""
     return prove_tube(controller(), Budget(60))
 
 
@@ -81,7 +81,7 @@ def final(about, x0):
 
 
 def test_a_linear_flow_and_its_cost_in_closed_form(straight):
-    """x(T) = e^{AT}x₀, and J = x₀ᵀPx₀ by a Lyapunov equation: the bounds hold them, and little else."""
+    """x(T) = e^{AT}x₀, and J = x₀ᵀPx₀ by a Lyapunov equation: the bounds contain them, and are tight."""
     A = torch.tensor([[0.0, 2.0], [-2.0, -0.5]]).double()
     flow = torch.linalg.matrix_exp(A * T)
     P = torch.from_numpy(solve_continuous_lyapunov(A.T.numpy(), -torch.eye(2).double().numpy()))
@@ -112,7 +112,7 @@ def test_a_second_integrator_stays_within(swung):
         assert float(low[k]) <= cost <= float(high[k])
         inside = torch.tensor(end)
         assert bool(((swung.ends[..., 0].amin(0) <= inside) & (inside <= swung.ends[..., 1].amax(0))).all())
-    assert float((high - low).max()) < 0.05 * float(high.mean()), "and the bounds are not loose"
+    assert float((high - low).max()) < 0.05 * float(high.mean()), "the bounds are tight"
 
 
 @pytest.mark.gate
@@ -168,7 +168,7 @@ def test_what_escapes_is_not_proved():
     "bad", [[[1.0, 2.0], [2.0, 4.0]], [[torch.nan, 0.0], [0.0, 1.0]], [[torch.inf, 1.0], [1.0, 1.0]]]
 )
 def test_coordinates_without_an_inverse_bound_nothing_and_leave_the_other_cells_alone(bad):
-    """A narrow spike in f gives such coordinates: its slope takes what moves with the middle of a cell to e⁵⁰."""
+    """A narrow spike in f gives such coordinates: its slope stretches them by e⁵⁰ along the middle of a cell."""
     good = torch.tensor([[2.0, 1.0], [0.0, 1.0]]).double()
     frames, r = torch.stack([good, torch.tensor(bad).double(), good]), torch.full((3, 2), 0.1).double()
     found = rotated(frames, frames.abs(), frames, frames.abs(), 0 * r, r)
@@ -180,7 +180,7 @@ def test_coordinates_without_an_inverse_bound_nothing_and_leave_the_other_cells_
 
 
 class Pretending(Escaping):
-    """Runs as another system than its f says."""
+    """Its dynamics differ from f + gu."""
 
     def dynamics(self, x, u):
         return torch.stack([-x[..., 0], u[..., 0] - x[..., 1]], -1)
@@ -191,16 +191,16 @@ def test_a_closed_loop_that_is_not_its_parts_is_refused():
         prove_tube(controller(Pretending()), Budget(4))
 
 
-advanced = enclosure.nominal.advanced
+integrate = enclosure.nominal.integrate
 
 
 def bad_nominal(slope, t, h, y):
-    """Closed loops that are not, by 0.3 % after a second."""
-    return advanced(slope, t, h, y) * (1 + 0.003 * h)
+    """Wrong closed loops: an error of 0.3 % after a second."""
+    return integrate(slope, t, h, y) * (1 + 0.003 * h)
 
 
 def outside(claim, about):
-    """How many of 20 costs by scipy are not within their bounds, and how many have bounds."""
+    """(how many of 20 costs by scipy are outside of their bounds, how many have bounds)."""
     x0 = about.initial_states.sample(20, torch.Generator().manual_seed(3)).double()
     low, high = claim.bounds_of_cost(x0)
     costs = torch.tensor([final(about, x)[1] for x in x0.tolist()])
@@ -209,8 +209,8 @@ def outside(claim, about):
 
 @pytest.mark.gate
 def test_simulations_are_not_believed(monkeypatch):
-    """Polynomials along closed loops that are not are further off, and the tube is as much wider."""
-    monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
+    """With polynomials along wrong closed loops the tube becomes wider, and stays true."""
+    monkeypatch.setattr(enclosure.nominal, "integrate", bad_nominal)
     about = controller(Swinging(), Formula(damped))
     claim = prove_tube(about, Budget(20))
     wrong, bounded = outside(claim, about)
@@ -220,8 +220,8 @@ def test_simulations_are_not_believed(monkeypatch):
 
 @pytest.mark.gate
 def test_without_the_bounds_they_would_be(monkeypatch):
-    """The twin: with the bounds of what polynomials are off taken for 0, what is claimed is false."""
-    monkeypatch.setattr(enclosure.nominal, "advanced", bad_nominal)
+    """The counterpart: if the defect of the polynomials is set to 0, the claim is false."""
+    monkeypatch.setattr(enclosure.nominal, "integrate", bad_nominal)
     bounded = enclosure._Tube._bounded
 
     def careless(self, *arguments):

@@ -1,4 +1,4 @@
-"""Tubes from two sides: against Riccati's solution, and V that must not be taken for a bound from below."""
+"""Two-sided claims with tubes, against Riccati's solution; and a V that is no bound from below."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ BETA, DELTA = 0.98, 0.005
 
 
 def in_continuous_time():
-    """The steps of Runge and Kutta: their optima are those of continuous time to 1e-9."""
+    """Runge-Kutta steps, whose optima differ by 1e-9 from those of continuous time."""
     return problem().in_steps(method="rk4")
 
 
@@ -47,7 +47,7 @@ def riccatis():
 
 @pytest.mark.gate
 def test_the_optimum_lies_between_and_the_tube_is_the_closer_side(riccatis):
-    """What is left of the ratio is β and δT; a funnel would pay for both once more, from above."""
+    """The ratio comes from β and δT alone; a funnel would add α and δT from above."""
     result = riccatis.result
     assert result["verdict"] == "certified"
     assert result["holds_for"] == "every control"
@@ -69,19 +69,19 @@ def test_a_law_that_is_dear_has_a_ratio_that_says_so(riccatis):
 
 @pytest.fixture
 def few_boxes(monkeypatch):
-    """Of each side, whatever the seconds."""
+    """A budget of few boxes for each side."""
     monkeypatch.setattr(branch_and_bound, "Budget", partial(Budget, boxes=300))
 
 
 @pytest.mark.gate
 def test_a_value_that_is_too_high_is_no_bound():
     certificate = both_sides(1.1, budget=Budget(60, boxes=300))
-    assert certificate.claim.verdict == "certified", "the tube itself is none the worse"
+    assert certificate.claim.verdict == "certified", "the tube itself is still certified"
     assert certificate.verdict != "certified"
     assert certificate.result["lower_reason"] is not None
     below, inside = certificate.below.claim, certificate.above.inside
     assert below.level < below.wanted
-    assert bool((below.least_cost(inside.value) <= optimum(inside.x0)).all()), "what is left of it is true"
+    assert bool((below.least_cost(inside.value) <= optimum(inside.x0)).all()), "the smaller bound is true"
 
 
 @pytest.mark.gate
@@ -115,7 +115,7 @@ def test_the_command(capsys, tmp_path):
     assert (result["beta"], result["delta"]) == (0.8, 0.5)
     assert result["lower_set"] == [[-3.0, -4.0], [3.0, 4.0]]
     assert {"mean_cost", "lower_level", "holds_for"} <= result.keys()
-    assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## Again", 1)[1]
+    assert "--two-sided" in (tmp_path / "r" / "report.md").read_text().rsplit("## To repeat it", 1)[1]
 
 
 @pytest.mark.parametrize("option", ["--beta=0.9", "--delta=0.1", "--set=-1:1,-1:1"])
@@ -127,13 +127,13 @@ def test_what_is_of_the_other_side_is_refused_without_it(option, capsys):
 
 @pytest.mark.gate
 def test_a_controller_that_leaves_the_set_is_not_compared_with_those_that_stay():
-    """D just around X₀: a bound for controls that stay there, and a law that does not."""
+    """D just around X₀: the bound holds for controls that stay in D, and the law leaves D."""
     certificate = both_sides(states=[[-1.01, -0.71], [1.01, 0.71]], budget=30)
     assert certificate.below.claim.verdict == certificate.claim.verdict == "certified"
     assert not certificate.below.claim.everywhere
     assert certificate.result["tube_in_set"] is False
     assert certificate.verdict == "unknown"
-    assert "the tube leaves D" in certificate.of_the_verdict()
+    assert "the tube leaves D" in certificate.verdict_text()
 
 
 @pytest.mark.gate

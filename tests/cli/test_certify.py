@@ -109,7 +109,7 @@ REFUSED = [
     ("certify sound --keep=nowhere/kept", "make 'nowhere' first"),
     ("certify region --keep=nowhere/kept", "make 'nowhere' first"),
     ("certify sampled --figure=claim.xyz", "got 'claim.xyz'; for example claim.png"),
-    ("certify sampled --report=conf/reacher.yaml", "Expected --report as a folder, got 'conf/reacher.yaml'"),
+    ("certify sampled --report=conf/reacher.yaml", "Expected report as a folder, got 'conf/reacher.yaml'"),
 ]
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from lyapnet.claims.certify import certify
 from lyapnet.claims.kinds import Funnel
-from lyapnet.claims.tables import progress_told_to
+from lyapnet.claims.tables import progress_reporter
 from lyapnet.cli import main
 from lyapnet.cli.options import stages_of
 from lyapnet.controller.loading import load
@@ -75,7 +75,7 @@ def test_training_says_what_it_waits_for(tmp_path, monkeypatch, capsys, telling)
 @pytest.mark.gate
 def test_a_certificate_tells_its_stages_before_its_boxes(checkpoint, few_seconds_for_levels):
     told, seen = [], []
-    report = progress_told_to(lambda stage, detail: seen.append((stage, detail)), "sound")
+    report = progress_reporter(lambda stage, detail: seen.append((stage, detail)), "sound")
 
     def both(progress):
         told.append(progress)

@@ -1,4 +1,4 @@
-"""Traced torch functions as C: equal to torch at points, compiled without a warning, and what has no rule is named."""
+"""Traced torch functions as C: equal to torch, compiled without warnings; operators without a rule are named."""
 
 import ctypes
 import shutil

@@ -1,4 +1,4 @@
-"""C++ compiled once for a machine; without a compiler, none; and what is not the user's own is not run."""
+"""C++ is compiled once for a machine, not at all without a compiler; files of other users are not run."""
 
 import ctypes
 from pathlib import Path
@@ -18,7 +18,7 @@ SMALL = ["network.hidden=[4,4]", "horizon.steps=6", "training.batch_size=3", "tr
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """A cache of its own, empty."""
+    """An empty cache."""
     folder = tmp_path / "cache"
     monkeypatch.setenv("LYAPNET_CACHE", str(folder))
     return folder
@@ -59,7 +59,7 @@ def test_a_file_that_changed_is_compiled_again(change, source, cache, caplog):
     path = compilation.file_of_library("some", (source,))
     compilation.library_of("some", (source,))
     whole = path.read_bytes()
-    path.unlink()  # the code that runs here keeps its file
+    path.unlink()  # the library that is loaded here keeps its file
     path.write_bytes({"cut short": whole[:100], "exchanged": b"another", "without a digest": whole}[change])
     path.chmod(0o600)
     if change == "without a digest":
@@ -70,7 +70,7 @@ def test_a_file_that_changed_is_compiled_again(change, source, cache, caplog):
     assert str(path) in note
     caplog.clear()
     assert ctypes.CDLL(str(path)).number() == compilation.library_of("some", (source,)).number() == 7
-    assert not caplog.records, "the twin: as it is now"
+    assert not caplog.records, "the counterpart: the unchanged file"
 
 
 def test_a_loop_that_cannot_be_traced_says_so(monkeypatch):

@@ -1,4 +1,4 @@
-"""Functions whose kernels are recorded, with a recording that a CPU can make: running them again."""
+"""Functions with recorded kernels; on a CPU a recording is replaced by running the function again."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from tests.graphs.test_compilation import rollout_of
 
 
 def run_again(run):
-    """On the memory that a function was recorded on."""
+    """Run the function again on the memory of the recording."""
     run()
     return run
 
@@ -45,14 +45,16 @@ def test_a_recorded_loop_has_the_path_and_the_gradient_of_a_traced_one(overrides
             pair.append([*nodes, *flat(loop.gradient(routines, theta, nodes.stages, bars))])
         assert_close(*pair, rtol=1e-10, atol=1e-10)
         results.append(pair[0])
-    assert not torch.allclose(results[0][0], results[1][0]), "the twin: parameters and states are read at each call"
+    assert not torch.allclose(results[0][0], results[1][0]), (
+        "the counterpart: parameters and states are read at each call"
+    )
 
 
 @pytest.mark.gate
 @pytest.mark.parametrize("policy", ["hjb", "sampled"])
 @pytest.mark.parametrize("method", ["euler", "rk4"])
 def test_nothing_is_copied_from_another_device(method, policy):
-    """As a recording on a GPU would not allow; with tensors without values in the place of a GPU's."""
+    """A recording on a GPU would not allow a copy; tensors without values stand for those of the GPU."""
     rollout = rollout_of(f"rollout.method={method}", f"rollout.policy={policy}").to("meta")
     loop, x0 = rollout.discrete, torch.zeros(3, 2, device="meta")
     work = loop._work(x0)

@@ -1,4 +1,4 @@
-"""The gradient of a loss by the kernel is torch's own, also of a module that has changed, and where there is none."""
+"""The gradient of a loss by the kernel equals torch's, also after the module changed, and without a kernel."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from lyapnet.graphs.loss_gradient import gradient_of_loss
 
 
 class Residual(nn.Module):
-    """(x, y) ↦ the mean of (N(x) − y)², of a network that holds one layer twice, a frozen weight and a buffer."""
+    """(x, y) ↦ the mean of (N(x) − y)², for a network that uses one layer twice, with a frozen weight and a buffer."""
 
     def __init__(self, round_trip=False):
         super().__init__()
@@ -50,7 +50,7 @@ def test_it_is_torchs_gradient(round_trip, monkeypatch):
     for seed in (1, 2):
         differentiate(*batch(seed))
         assert_close(slopes(loss), [*by_torch(loss, batch(seed))], rtol=1e-12, atol=1e-14)
-        with torch.no_grad():  # as an optimizer does, in place; and another buffer
+        with torch.no_grad():  # in place, like an optimizer; and another buffer
             for p in loss.parameters():
                 p.mul_(0.9)
         loss.offset = torch.tensor(-0.2)

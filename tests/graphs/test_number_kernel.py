@@ -1,4 +1,4 @@
-"""Programs on numbers: each rule against torch, on tensors as they lie in memory; scans; what is refused."""
+"""Programs on numbers: each rule against torch, for tensors of any layout; scans; and refusals."""
 
 import re
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from lyapnet.graphs.number_kernel import rules
 from lyapnet.graphs.number_kernel.assembly import SOURCE
 from lyapnet.graphs.number_kernel.kernel import NumberKernel, ScanKernel, in_threads
 from lyapnet.graphs.number_kernel.program import OPERATIONS
-from lyapnet.graphs.number_kernel.rewriting import rewritten
+from lyapnet.graphs.number_kernel.rewriting import rewrite
 from lyapnet.graphs.scan import Scan
 from lyapnet.graphs.tracing import trace
 from lyapnet.loop.rollout import Rollout
@@ -167,7 +167,7 @@ def test_what_networks_have_for_tanh_is_one_operation(function, known):
 
     a = torch.linspace(-4, 4, 101, dtype=torch.float64)
     graph = trace(with_slopes, (a,))
-    written = rewritten(graph)
+    written = rewrite(graph)
     names = {node.target for node in written.graph.nodes}
     assert (torch.ops.aten.tanh.default in names) is known
     assert len(written.graph.nodes) < len(graph.graph.nodes) or not known
@@ -211,8 +211,8 @@ def test_what_has_no_rule_is_named():
         NumberKernel(trace(lambda x, y: (x.sort(-1).values,), pair()), pair())
 
 
-def test_places_that_depend_on_arguments_are_refused():
-    with pytest.raises(NotImplementedError, match="places that depend on arguments"):
+def test_indices_that_depend_on_arguments_are_refused():
+    with pytest.raises(NotImplementedError, match="indices that depend on arguments"):
         NumberKernel(trace(lambda x, y: (x.mT[y.argmax(-1)],), pair()), pair())
 
 
@@ -266,7 +266,7 @@ def test_integers_are_held_to_what_they_were():
     kernel = NumberKernel(trace(lambda i, x, y: (x[:, i] * y[:, :2],), (places, *pair())), (places, *pair()))
     x, y = pair()
     assert_close(kernel(places, x, y)[0], x[:, places] * y[:, :2])
-    with pytest.raises(ValueError, match="int64 as it was traced"):
+    with pytest.raises(ValueError, match="int64 values of the examples"):
         kernel(places + 1, x, y)
 
 
@@ -293,7 +293,7 @@ def test_parts_run_at_once_on_as_many_threads_as_torch_has(monkeypatch):
 
     def run(k):
         if k < 3:
-            at_once.wait()  # would break if one thread did them in turn
+            at_once.wait()  # would fail if one thread ran them in turn
         return kernel(pair()[0] + k, pair()[1])[0]
 
     kernel = NumberKernel(trace(OPERATORS["mixed"], pair()), pair())
@@ -337,7 +337,7 @@ def test_a_scan_computes_what_its_loop_does():
     one = ScanKernel(*scan_of(1))
     assert_close(one(*scan_of(1)[2])[0], Scan(*scan_of(1)[:2], 1).loop(*scan_of(1)[2])[0])
     for found, expected in zip(one(*arguments), kernel(*arguments), strict=True):
-        assert_close(found, expected, rtol=0, atol=0)  # of more steps than it was written for
+        assert_close(found, expected, rtol=0, atol=0)  # more steps than in the examples
 
 
 def test_sums_over_the_steps_are_those_of_what_is_kept():
@@ -409,7 +409,7 @@ def test_closed_loops_and_their_gradient(law, changed):
         assert_close(rollout(others).x, plain.x, rtol=1e-9, atol=1e-9)
         for parameter in rollout.parameters():
             parameter.mul_(1.1)
-        assert float((rollout(others).x - plain.x).abs().max()) > 1e-6, "the twin: weights are read at each call"
+        assert float((rollout(others).x - plain.x).abs().max()) > 1e-6, "the counterpart: weights are read at each call"
 
 
 def freeze(*parameters):
@@ -447,11 +447,11 @@ def test_a_loop_takes_the_code_of_one_that_differs_in_tensors_alone(overrides, c
     with torch.no_grad():
         for start in (x0, 0.5 * x0[:5]):
             assert_close(other(start).x, written(start).x, rtol=1e-9, atol=1e-9)
-        assert float((rollout(x0).x - other(x0).x).abs().max()) > 1e-6, "the twin: they are two loops"
+        assert float((rollout(x0).x - other(x0).x).abs().max()) > 1e-6, "the counterpart: they are two loops"
 
 
 class Walled(Pendulum):
-    """With a spring that acts far from the centre alone, and a wind; both are numbers."""
+    """A system with a spring that acts only far from the centre, and a wind; both are plain numbers."""
 
     stiffness, wind = 0.0, 0.0
 
@@ -460,7 +460,7 @@ class Walled(Pendulum):
 
 
 class Timed(FCN):
-    """With a number that counts late."""
+    """A function with a number that matters only late."""
 
     late = 0.0
 

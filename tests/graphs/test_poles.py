@@ -1,4 +1,4 @@
-"""Poles that a step jumps over: found where a function grows beyond bounds, and not where it is guarded or bounded."""
+"""Poles that a step jumps over: found where a function is unbounded, not where it is guarded or bounded."""
 
 import copy
 
@@ -21,8 +21,8 @@ ACROSS = torch.tensor([[1.0], [0.4], [-0.3], [-1.0]], dtype=torch.float64)  # a 
         (lambda x: torch.reciprocal(x), True),
         (lambda x: torch.exp(x) / torch.sin(x), True),
         (lambda x: 1 - 2.7 / (x + 0.1), True),
-        (lambda x: 1 / (x - 5), False),  # elsewhere
-        (lambda x: torch.sin(x) / x, False),  # it is one there
+        (lambda x: 1 / (x - 5), False),  # the zero is elsewhere
+        (lambda x: torch.sin(x) / x, False),  # the function is 1 there
         (lambda x: torch.where(x.abs() < 1e-3, 1 - x**2 / 6, torch.sin(x) / x), False),
         (lambda x: x / torch.where(x.abs() < 0.1, 0.1, x), False),
         (lambda x: x / (1 + x**2), False),
@@ -44,7 +44,7 @@ def test_each_path_of_a_batch_is_asked_by_itself():
 
 def test_a_function_that_divides_by_no_state_has_none():
     assert poles_of(lambda x: (x / 3 + torch.log(x) + x**2,), ONE) is None
-    assert poles_of(lambda x: (x / float(x),), ONE) is None  # refused by its own gate
+    assert poles_of(lambda x: (x / float(x),), ONE) is None  # refused by another check
 
 
 class Stock(lyapnet.ControlAffineSystem):
@@ -79,8 +79,11 @@ def test_a_path_that_jumps_over_a_pole_has_no_finite_cost():
     def cost(problem, effort):
         return path_under(problem, lambda n, x: torch.full_like(x[..., :1], effort), x0).cost
 
-    assert cost(problem, 1.0).isfinite().tolist() == [False, True]  # the first is fished out, and paid for going on
+    assert cost(problem, 1.0).isfinite().tolist() == [
+        False,
+        True,
+    ]  # the first path is fished out, and catches from a negative stock
     assert cost(problem, 0.2).isfinite().all()
     blind = copy.deepcopy(problem)
     blind.findings = type(problem.findings)(poles=None)
-    assert cost(blind, 1.0).isfinite().all()  # of a stock below zero
+    assert cost(blind, 1.0).isfinite().all()  # the stock is below zero

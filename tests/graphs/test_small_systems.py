@@ -1,4 +1,4 @@
-"""Small linear systems and minima within a box, which the kernel has as one instruction each."""
+"""Small linear systems and minima in a box, each one instruction of the kernel."""
 
 import contextlib
 import math
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C++ compiler
 
 
 def convex(*batch, m):
-    """Some (R, b), of which the unlimited minimum is often outside the limits."""
+    """Random (R, b) whose minimum without limits is often outside of the limits."""
     factor = torch.randn(*batch, m, m)
     return factor @ factor.mT + 0.05 * torch.eye(m), 4 * torch.randn(*batch, m)
 
@@ -56,7 +56,7 @@ def test_all_or_none_may_be_held():
 
 @pytest.mark.parametrize("m", [3, 7])
 def test_its_slope_is_that_of_the_free_controls(m):
-    """Of what a limit holds it is zero, of the others that of the linear system that is left for them."""
+    """The derivative is 0 for controls at a limit, and that of the remaining linear system for the others."""
     controls, (R, b) = ControlBox(-0.5, 0.5), convex(20, m=m)
 
     def slope(R, b, bar):
@@ -100,7 +100,7 @@ def test_what_is_repeated_lies_once_in_memory(shapes):
 
 
 def test_a_matrix_that_is_not_symmetric_is_no_small_system():
-    """Up to six unknowns the upper triangle is never read; of more, torch reads it, and the instruction would not."""
+    """Up to six unknowns the upper triangle is not read; for more, torch reads it and the instruction does not."""
     A, B = torch.randn(5, 8, 8) + 8 * torch.eye(8), torch.randn(5, 8, 1)
     with pytest.raises(ValueError, match="computes something else"):
         trace(lambda A, B: (solve(A, B),), [A, B], whole=True)

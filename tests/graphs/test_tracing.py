@@ -1,4 +1,4 @@
-"""Traced graphs compute what their functions do: as they are, and cut in two."""
+"""Traced graphs compute the same as their functions, also after a cut."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from lyapnet.graphs.tracing import cut, trace
 
 
 def function(weight, x, late):
-    """Two early results and two late ones, of which one needs nothing late; with a derivative inside."""
+    """Two early and two late results, one of which needs no late argument; with a derivative inside."""
     leaf = x.detach().requires_grad_()
     with torch.enable_grad():
         hidden = torch.tanh(leaf @ weight.mT + torch.ones(3).to(x))
@@ -52,7 +52,7 @@ def test_nothing_is_computed_twice():
 
 
 def test_shapes_that_are_changed_in_place():
-    """A product with a vector has such a change within torch; what only changes shapes is traced once."""
+    """torch uses such a change in a product with a vector; graphs that only change shapes are traced once."""
     calls = []
 
     def shaped(x):
@@ -108,7 +108,7 @@ LEAVING = {
 
 @pytest.mark.parametrize("way", LEAVING)
 def test_code_that_reads_values_is_refused_where_it_does(way):
-    """Whatever the values are: at these arguments most of them come to the same at any other near by."""
+    """For any values: most of these functions are constant near these arguments."""
     function = LEAVING[way]
 
     def leaves(weight, x):

@@ -295,7 +295,7 @@ def test_a_certificate_is_about_all_members_or_one(trained, capsys, tmp_path):
 
     assert certified("sampled", str(trained), "--samples", "3", "--report", str(tmp_path))[0] == 0
     report = json.loads((tmp_path / "report.json").read_text())
-    assert "include the parameters of a family, which stay what they are: mass, length" in report["claim"]["words"]
+    assert "include the parameters of a family, which are constant: mass, length" in report["claim"]["words"]
     assert report["system"] == {"name": "family of pendulum", "parameters": {"damping": 0.1, "gravity": 9.81}}
     assert report["cost"] == {"Q": [1, 0.1], "R": "inverse_mass", "Q_T": [10, 1]}
     one = ("--at", "length=1.4", "--at", "mass=0.9")

@@ -1,28 +1,28 @@
-"""Regions under pushes of several sizes, in a terminal."""
+"""A table of regions under disturbances of several sizes, for a terminal."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from rich.table import Table
 
-from lyapnet.claims.disturbances.regions import RegionsUnderPushes
+from lyapnet.claims.disturbances.regions import DisturbedRegions
 from lyapnet.claims.tables import floored
 
 
-def table(title: str, regions: RegionsUnderPushes) -> Table:
-    """A row for each largest push."""
+def table(title: str, regions: DisturbedRegions) -> Table:
+    """A table with a row for each w."""
     names = regions.controller.system.state_names
-    about = f"regions that no closed loop leaves, whatever pushes d({regions.state})/dt by at most w"
+    about = f"regions that no closed loop leaves under disturbances of at most w on d({regions.state})/dt"
     found = Table("w", "volume ≥", "of D", "c", "ends in", "verdict", title=f"{title}\n{about}")
     for row in regions.result["rows"]:
-        found.add_row(f"{row['w']:g}", *_end(row, names), row["verdict"])
+        found.add_row(f"{row['w']:g}", *_columns(row, names), row["verdict"])
     reasons = [f"w = {row['w']:g}: {row['reason']}" for row in regions.result["rows"] if row["reason"]]
     found.caption = "\n".join(["ends in: a box around {V(0, ·) ≤ c}", *reasons])
     return found
 
 
-def _end(row: dict[str, Any], names: Sequence[str]) -> tuple[str, str, str, str]:
-    """(volume, share of D, c, where closed loops end)."""
+def _columns(row: dict[str, Any], names: Sequence[str]) -> tuple[str, str, str, str]:
+    """The columns volume, share of D, c, and where closed loops end."""
     if row["rho"] is None:
         return "none proved", "", "", ""
     size = f"{row['region_volume_proved']:.4g}", floored(row["set_volume_share"])

@@ -1,4 +1,4 @@
-"""Certificates of tubes: where all closed loops from X₀ go, and what they cost."""
+"""Certificates of tubes: bounds of all closed loops from X₀, and of their costs."""
 
 import math
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ import torch
 from lyapnet.base.contracts import copied
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.claims.arguments import COMPARED
-from lyapnet.claims.certificates import FROZEN, listed
+from lyapnet.claims.certificates import FROZEN, format_state
 from lyapnet.claims.costs import CostCertificate, Inside
 from lyapnet.claims.least_cost import ProvedLowerBound
 from lyapnet.claims.tables import floored
@@ -19,7 +19,7 @@ from lyapnet.claims.tubes.tube import ProvedTube
 
 
 class TubeCertificate(CostCertificate):
-    """The tube of all closed loops from X₀, and their cost in it."""
+    """A tube around all closed loops from X₀, with bounds of their costs."""
 
     kind: str = "tube"
     picture: str = "tube.png"
@@ -35,10 +35,10 @@ class TubeCertificate(CostCertificate):
         "guaranteed_cost_ratio": "guaranteed cost there / optimum of the steps of Δt, ratio of the means",
         "ends": "x(T) between",
         "reach": "‖x(T) − goal‖, at most",
-        "missing": "a state whose closed loop ends further from the goal than --radius",
-        "cells": "boxes of X₀ that are proved",
-        "boxes": "boxes of X₀ that were tried",
-        "steps": "steps of them",
+        "missing": "a state whose closed loop ends further from the goal than the radius",
+        "cells": "proved boxes of X₀",
+        "boxes": "tested boxes of X₀",
+        "steps": "steps, summed over boxes",
         "seconds": "seconds",
         "fingerprint": "fingerprint of what was bounded",
     }
@@ -53,7 +53,7 @@ class TubeCertificate(CostCertificate):
         low, high = self.claim.bounds_of_cost(x0)
         known = high.isfinite()
         x0, low, high = x0[known], low[known], high[known]
-        with torch.no_grad():  # V as it is bounded
+        with torch.no_grad():  # V in float64, as in the proof
             value = copied(self.controller.V)(x0.new_zeros(len(x0)).double(), x0.double())
         return Inside(x0, value, high, low)
 
@@ -61,16 +61,16 @@ class TubeCertificate(CostCertificate):
         return {"beta": lower.beta, "delta": lower.delta, "tube_in_set": self.lies_in(lower)}
 
     def lies_in(self, lower: ProvedLowerBound) -> bool:
-        """Whether the tube lies in the D of a bound from below, so that the controller keeps the state there."""
+        """Whether the tube lies in the D of a bound from below, so that the controller keeps the state in D."""
         claim = self.claim
         axes = [k for k, i in enumerate(claim.seen) if i not in lower.left_out]
         D, ranges = lower.states, claim.ranges[:, axes]
         low, high = (side.double()[[claim.seen[k] for k in axes]] for side in (D.lower, D.upper))
         return bool(((low <= ranges[..., 0]) & (ranges[..., 1] <= high)).all())
 
-    def why_apart(self, lower: ProvedLowerBound) -> str:
-        both = lower.everywhere or self.lies_in(lower)
-        return "" if both else "But the tube leaves D: choose a larger one."
+    def mismatch(self, lower: ProvedLowerBound) -> str:
+        covered = lower.everywhere or self.lies_in(lower)
+        return "" if covered else "But the tube leaves D: choose a larger D."
 
     def in_short(self, lower: ProvedLowerBound) -> str:
         return f"{self._proved()}; β = {lower.beta:g}, δ = {lower.delta:.3g}"
@@ -101,15 +101,15 @@ class TubeCertificate(CostCertificate):
     def in_words(self) -> str:
         claim = self.claim
         if not len(claim.slack):
-            return "No box of X₀ has a tube that was proved: nothing is claimed. The conditions below were sought."
+            return "No box of X₀ has a tube that was proved: nothing is claimed. The conditions below were not proved."
         low, high = claim.mean_cost
-        kept = f" violates a constraint ({'; '.join(claim.constraints)}), and" if claim.constraints else ""
+        constraints = f" violates a constraint ({'; '.join(claim.constraints)}), and" if claim.constraints else ""
         return (
             f"Boxes that make up at least {floored(claim.volume_share)} of X₀ by volume have a tube, proved in "
-            f"continuous time for this model up to T = {claim.duration:g} s with u = policy(t, x) read at every t: "
-            f"no closed loop from there{kept} leaves it, and each costs no more, and no less, than the bounds "
+            f"continuous time for this model up to T = {claim.duration:g} s with u = policy(t, x) at every t: "
+            f"no closed loop from there{constraints} leaves it, and each costs no more, and no less, than the bounds "
             f"of its box: {low:.6g} to {high:.6g} in the mean, {claim.greatest_cost:.6g} at most. It is about the "
-            f"operations that f, g, ℓ, φ and u were traced to, of this fingerprint; {FROZEN}{self.of_parameters}"
+            f"traced operations of f, g, ℓ, φ and u, which have this fingerprint; {FROZEN}{self.parameters_text}"
         )
 
     def in_formulas(self) -> list[str]:
@@ -120,14 +120,12 @@ class TubeCertificate(CostCertificate):
             f"∫ℓ dt + φ(x({T})) = P_k(ε) + r,  low_k ≤ r ≤ high_k  from the same x₀",
         ]
 
-    def of_the_verdict(self) -> str:
+    def verdict_text(self) -> str:
         claim = self.claim
         if claim.violating is not None:
-            return f"The verdict: closed loops from around {listed(claim.violating)} violate a constraint."
+            return f"All closed loops from a box around {format_state(claim.violating)} violate a constraint."
         if claim.missing is not None:
-            return (
-                f"The verdict: closed loops from around {listed(claim.missing)} end further from the goal than asked."
-            )
+            return f"All closed loops from a box around {format_state(claim.missing)} end outside of the radius."
         why = "it is" if claim.verdict == "certified" else "undecided within the budget"
         asked = "" if claim.radius is None else f", and ends within {claim.radius:g} of the goal"
         return f"The verdict is on the claim that each closed loop from X₀ is in a proved tube{asked}: {why}."

@@ -1,4 +1,4 @@
-"""What closed loops from boxes of initial states do within [0, T], enclosed step by step."""
+"""Encloses the closed loops from boxes of initial states on [0, T], step by step."""
 
 from typing import NamedTuple
 
@@ -12,18 +12,18 @@ from lyapnet.claims.tubes.field import DEGREE, Field
 from lyapnet.claims.tubes.nominal import at_end, derivative, flow, over_step, places
 from lyapnet.prover.taylor import EPSILON, TaylorForm, monomials
 
-LEAST = 1e-30  # of r that is tried: what never moves stays within it
-TRIES = 6  # sizes of r that are tried on a step
-SKEW = 100.0  # condition of the coordinates, beyond which they are made orthogonal
-TURN = 0.3  # of the coordinates within a step, at most
-LEAK = 1e-3  # of r over T, that no step is shortened for
-SHORTEST = 1 / 2000  # of T
-WIDEST = 0.5  # r in units of the states' magnitudes, at which a cell is given up
-BINS = 60  # of [0, T], in which ranges are kept
+LEAST = 1e-30  # the smallest r̂, for states that do not move
+TRIES = 6  # values of r̂ to test on a step
+SKEW = 100.0  # coordinates with a larger condition number are made orthogonal
+TURN = 0.3  # largest change of the coordinates within a step, relative to them
+LEAK = 1e-3  # a growth of r of this size over T is accepted without shortening steps
+SHORTEST = 1 / 2000  # shortest step, as a share of T
+WIDEST = 0.5  # a cell is given up when r is larger, in units of the states
+BINS = 60  # equal parts of [0, T] for which ranges are stored
 
 
 class Cells(NamedTuple):
-    """Boxes of initial states {middle + half · ε}, with ε_k for each axis that has a width."""
+    """Boxes of initial states {middle + half · ε}, with a coordinate ε_k for each axis with a width."""
 
     lower: Corners
     upper: Corners
@@ -33,43 +33,43 @@ class Cells(NamedTuple):
 
 
 class Enclosed(NamedTuple):
-    """What is proved of each of some cells, (cells, …) each; what is not `proved` says nothing."""
+    """The results for some cells, (cells, …) each; they hold only for cells that are `proved`."""
 
     proved: Tensor  # bool
-    violated: Tensor  # bool: a constraint, by every closed loop of the cell
-    cost: Tensor  # of J(x₀) in the order of monomials(e, DEGREE), (terms, cells) …
-    cost_slack: Tensor  # … up to [low, high], (cells, 2)
+    violated: Tensor  # bool: whether every closed loop of the cell violates a constraint
+    cost: Tensor  # a polynomial near J(x₀), in the order of monomials(e, DEGREE), (terms, cells)
+    cost_slack: Tensor  # bounds of J minus this polynomial, (cells, 2)
     ends: Tensor  # bounds of x(T), (cells, n, 2)
-    ranges: Tensor  # of x(t) over BINS parts of [0, T], (BINS, cells, n, 2)
-    bend: Tensor  # how much of what is left is due to each axis, (cells, e)
+    ranges: Tensor  # bounds of x(t) on BINS parts of [0, T], (BINS, cells, n, 2)
+    bend: Tensor  # the nonlinearity along each axis, (cells, e)
     steps: int
-    bounded: int  # forms
+    bounded: int  # Taylor forms that were computed
 
 
 class Step(NamedTuple):
-    """A step that was tried: r̂ at its end, the cost's bounds, and what else is known; (cells, …) each."""
+    """The result of a step for some cells, (cells, …) each."""
 
-    radius: State  # r at τ = 1, a bound of |z| over all of the step
-    rest: PerBox  # what the forms of Yv do not tell
-    cost: Tensor  # (cells, 2)
+    radius: State  # a bound of |z| on the step, and r at its end
+    rest: PerBox  # the largest remainder of the Taylor forms of Yv
+    cost: Tensor  # bounds of the integral of ℓ minus its polynomial, (cells, 2)
     worst: Tensor  # bounds of max_j h_j over the step, (cells, 2); −∞ without constraints
-    bend: Tensor
-    held: Tensor  # bool: whether it is proved
+    bend: Tensor  # as _Tube._bends
+    held: Tensor  # bool: whether the step is proved
 
 
 class Front(NamedTuple):
-    """Where the tube of some cells stands at a time t."""
+    """The state of the tube of some cells at a time t."""
 
     t: float
     y: Tensor  # closed loops at the stencil, (points, cells, n + 1)
     flow: nominal.Flow
-    end: Tensor  # p at t as the steps before leave it
-    frame: Moving | None  # the coordinates that the steps before leave, at τ = 1; None at the beginning
-    radius: State  # |z| ≤ r in them
-    cost: Tensor  # (low, high) of ∫ℓ − its polynomial, (cells, 2)
+    end: Tensor  # p at the end of the previous step
+    frame: Moving | None  # the coordinates of the previous step; None at the beginning
+    radius: State  # |z| ≤ r in these coordinates
+    cost: Tensor  # bounds of ∫ℓ minus its polynomial, (cells, 2)
 
     def of(self, chosen: Tensor) -> "Front":
-        """That of some cells."""
+        """The front of some of the cells."""
         frame = None if self.frame is None else self.frame[chosen]
         parts = nominal.Flow(self.flow.y[:, chosen], self.flow.rate[:, chosen])
         return Front(
@@ -77,22 +77,23 @@ class Front(NamedTuple):
         )
 
 
-class Enclosing:
-    """The tube of some cells, all of whose steps are the same.
+class Enclosure:
+    """Computes the tubes of cells; all cells of one tube take the same steps.
 
-    Over a step, x(t) = p(τ, ε) + Φ(τ)z(t), with a polynomial p near closed loops, and Φ near what they do to what is
-    close to them. With v = F(t, p + Φz) − ṗ − Φ̇z, ż = Φ⁻¹v; and with Y near Φ⁻¹ and |YΦ − 1| ≤ E, ‖E‖ ≤ ν < 1,
+    On a step, x(t) = p(τ, ε) + Φ(τ)z(t), where p is a polynomial near the closed loops, and Φ approximates the flow of
+    the linearisation along them. With v = F(t, p + Φz) − ṗ − Φ̇z, ż = Φ⁻¹v; and with Y ≈ Φ⁻¹, |YΦ − 1| ≤ E and
+    ‖E‖ ≤ ν < 1,
 
         |ż| ≤ w + Ew + ν/(1 − ν) max Ew,     w ≥ |Yv| wherever |z| ≤ r̂,
 
-    so that |z| ≤ r + h|ż| at most at the end of the step if that is no more than r̂: z would have to leave {|z| ≤ r̂}
-    first. Yv is bounded as one Taylor form in (τ, ε, z), in which what F does to p and to Φz cancels against ṗ and Φ̇z.
-    Between steps Φ is made orthogonal again, and p's polynomials meet but for rounding, which |z| takes up.
+    so that |z| ≤ r + h max |ż| on the step if this is at most r̂; otherwise z would have to leave {|z| ≤ r̂} first. Yv is
+    bounded as one Taylor form in (τ, ε, z), in which F along p and Φz cancels with ṗ and Φ̇z. Between steps a skewed Φ
+    is made orthogonal, and the polynomials p of two steps agree up to rounding, which r takes into account.
 
     Args:
         field: F.
         duration: T.
-        unit: what counts as 1 of each state.
+        unit: the unit of each state, for comparisons between states.
 
     Source: the first-exit argument of validated integration with moving coordinates, Lohner, "Enclosing the solutions
     of ordinary initial and boundary value problems", 1987, and Berz, Makino, "Verified integration of ODEs and flows
@@ -105,10 +106,10 @@ class Enclosing:
         self.kinks = [*field.kinks(duration, dt), duration]
 
     def of(self, cells: Cells, axes: list[int]) -> Enclosed:
-        """What is proved of some cells.
+        """Enclose the closed loops of some cells.
 
         Args:
-            axes: those along which they have a width: e of them.
+            axes: the e axes along which the cells have a width.
         """
         tube = _Tube(self, cells, axes)
         h = self.duration / 100
@@ -118,10 +119,10 @@ class Enclosing:
 
 
 class _Tube:
-    """The tube of some cells while it is made."""
+    """The tube of some cells under construction."""
 
-    def __init__(self, about: Enclosing, cells: Cells, axes: list[int]):
-        self.about, self.axes, self.e, self.n = about, axes, len(axes), about.n
+    def __init__(self, enclosure: Enclosure, cells: Cells, axes: list[int]):
+        self.enclosure, self.axes, self.e, self.n = enclosure, axes, len(axes), enclosure.n
         self.order = monomials(1 + self.e + self.n, DEGREE)
         self.place = places(1 + self.e + self.n, DEGREE)
         self.supports = self._supports()
@@ -135,11 +136,11 @@ class _Tube:
         start[0, :, : self.n] = middle
         for i, axis in enumerate(axes):
             start[1 + i, :, axis] = half[:, axis]
-        # what middle ± half miss of the box by rounding
+        # middle ± half differ from the box by rounding
         r = 4 * EPSILON * (cells.lower.abs() + cells.upper.abs())
         zero = torch.zeros(count, dtype=torch.float64)
         self.front = Front(
-            0.0, y, flow(about.field.slope, 0.0, y, self.e), start, None, r, torch.stack([zero, zero], -1)
+            0.0, y, flow(enclosure.field.slope, 0.0, y, self.e), start, None, r, torch.stack([zero, zero], -1)
         )
         self.alive, self.kept = torch.ones(2, count, dtype=torch.bool)
         self.violated = torch.zeros(count, dtype=torch.bool)
@@ -148,46 +149,48 @@ class _Tube:
         self.steps = self.bounded = 0
 
     def step(self, h: float) -> float:
-        """Go on by a step of h seconds, or less, with what cells it holds for; what to try next.
+        """Take a step of h seconds or less, and keep the cells for which it is proved; return the next h.
 
-        A step is as short as makes τ bend F no more than ε and z do, for most of the cells.
+        The step is so short that for most cells F is no more nonlinear in τ than in ε and z.
         """
-        about, front = self.about, self.front
-        kink = next(t for t in about.kinks if t > front.t + 1e-7 * about.duration)
-        shortest = SHORTEST * about.duration
+        enclosure, front = self.enclosure, self.front
+        kink = next(t for t in enclosure.kinks if t > front.t + 1e-7 * enclosure.duration)
+        shortest = SHORTEST * enclosure.duration
         while True:
             end = front.t + h if front.t + 1.25 * h < kink else kink
-            y = nominal.advanced(about.field.slope, front.t, end - front.t, front.y)
-            after = flow(about.field.slope, end, y, self.e)
+            y = nominal.integrate(enclosure.field.slope, front.t, end - front.t, front.y)
+            after = flow(enclosure.field.slope, end, y, self.e)
             p = over_step(front.flow, after, end - front.t, self.e)
             frame, turn = self._frame(front, p, end)
             turned = float(turn.quantile(0.9, interpolation="lower"))
             if turned < TURN or h <= shortest:
-                made = self._tried(self._at_start(front, p, frame), p, frame, front.t, end)
-                fast = made.rest > LEAK / about.duration
-                ratio = torch.where(fast | ~made.held, made.bend[:, 0] / made.bend[:, 1:].sum(-1).clamp_min(LEAST), 0.0)
+                result = self._attempt(self._at_start(front, p, frame), p, frame, front.t, end)
+                fast = result.rest > LEAK / enclosure.duration
+                ratio = torch.where(
+                    fast | ~result.held, result.bend[:, 0] / result.bend[:, 1:].sum(-1).clamp_min(LEAST), 0.0
+                )
                 share = float(ratio.nan_to_num(0.0).quantile(0.9, interpolation="lower"))
                 if share <= 1 or h <= shortest:
                     break
             h = max(h / 2, shortest)
-        self._take(
-            Front(end, y, after, at_end(p, self.e, 1), frame, made.radius, front.cost + made.cost), frame, p, made
+        self._accept(
+            Front(end, y, after, at_end(p, self.e, 1), frame, result.radius, front.cost + result.cost), frame, p, result
         )
-        return min(1.5 * h, about.duration / 50) if share < 0.1 and turned < TURN / 2 else h
+        return min(1.5 * h, enclosure.duration / 50) if share < 0.1 and turned < TURN / 2 else h
 
-    def _take(self, front: Front, frame: Moving, p: Terms, made: Step) -> None:
-        """Keep what a step has proved, and go on with the cells that it holds for."""
-        about, (low, high) = self.about, made.worst.unbind(-1)
+    def _accept(self, front: Front, frame: Moving, p: Terms, result: Step) -> None:
+        """Store the results of a step, and keep the cells for which it is proved."""
+        enclosure, (low, high) = self.enclosure, result.worst.unbind(-1)
         living = torch.nonzero(self.alive).flatten()
-        self.bend[living] = torch.maximum(self.bend[living], made.bend[:, 1:-1].nan_to_num(0.0))
-        self.violated[living] |= made.held & (low > 0)
+        self.bend[living] = torch.maximum(self.bend[living], result.bend[:, 1:-1].nan_to_num(0.0))
+        self.violated[living] |= result.held & (low > 0)
         self.kept[living] &= high <= 0
-        within = ((made.radius @ torch.ones(self.n, dtype=torch.float64)) <= WIDEST) & ~self.violated[living]
-        held = made.held & within & made.radius.isfinite().all(-1)
+        within = ((result.radius @ torch.ones(self.n, dtype=torch.float64)) <= WIDEST) & ~self.violated[living]
+        held = result.held & within & result.radius.isfinite().all(-1)
         self.steps += 1
-        reach = self._range(p, frame, made.radius)
-        first = int(self.front.t / about.duration * BINS * (1 - 1e-9))
-        last = min(BINS - 1, int(front.t / about.duration * BINS))
+        reach = self._range(p, frame, result.radius)
+        first = int(self.front.t / enclosure.duration * BINS * (1 - 1e-9))
+        last = min(BINS - 1, int(front.t / enclosure.duration * BINS))
         for k in range(first, last + 1):
             self.ranges[k, living, :, 0] = torch.minimum(self.ranges[k, living, :, 0], reach[..., 0])
             self.ranges[k, living, :, 1] = torch.maximum(self.ranges[k, living, :, 1], reach[..., 1])
@@ -195,17 +198,18 @@ class _Tube:
         self.front = front.of(held)
 
     def _frame(self, front: Front, p: Terms, end: float) -> tuple[Moving, Tensor]:
-        """Coordinates over a step, and how much they turn; in floating point.
+        """Choose coordinates for a step; return them and the size of their change, in floating point.
 
-        They go on from the step before, each of unit length in the states' units, and are made orthogonal where skewed.
+        They continue those of the previous step, scaled to unit length in the states' units; skewed ones are made
+        orthogonal.
         """
-        unit, h = self.about.unit, end - front.t
+        unit, h = self.enclosure.unit, end - front.t
         if front.frame is None:
             Q = torch.diag(unit).expand(p.shape[1], self.n, self.n)
         else:
             A = front.frame.at(1) / unit[:, None]
             A = A / A.norm(dim=1, keepdim=True)
-            # singular values exist of finite matrices alone; a cell with others is not proved whatever is chosen here
+            # a matrix that is not finite has no singular values; its cell is not proved for any choice here
             skewed = torch.linalg.cond(A.where(A.isfinite(), 0.0)) > SKEW
             A_r = front.frame.at(1) / unit[:, None] * front.radius[:, None, :].clamp_min(LEAST)
             longest = A_r.norm(dim=1).argsort(-1, descending=True)[:, None].expand_as(A)
@@ -221,60 +225,60 @@ class _Tube:
 
     def _jacobians(self, times: list[float], x: list[State]) -> Tensor:
         """∂ẋ/∂x by central differences at several times, (times, cells, n, n)."""
-        step = torch.diag(1e-5 * self.about.unit)
+        step = torch.diag(1e-5 * self.enclosure.unit)
         points = torch.stack(x) + torch.stack([step, -step])[:, :, None, None]  # (2, n, times, cells, n)
         t = torch.tensor(times, dtype=step.dtype)[:, None].expand(points.shape[:-1])
-        plus, minus = self.about.field.slope(t, points)[..., : self.n]
+        plus, minus = self.enclosure.field.slope(t, points)[..., : self.n]
         return ((plus - minus) / (2 * step.diagonal()[:, None, None, None])).movedim(0, -1)
 
     def _at_start(self, front: Front, p: Terms, frame: Moving) -> tuple[Tensor, Tensor]:
-        """(r, what ∫ℓ may be off) in the coordinates of a step at its beginning, where p meets the p before."""
+        """(r, the error of ∫ℓ) at the beginning of a step, in its coordinates; both include the rounding of p."""
         begins = at_end(p, self.e, -1)
         size = at_end(p.abs(), self.e, 1) + front.end.abs()
         jump = ((begins - front.end).abs() + 16 * EPSILON * size).sum(0) * ROOM
         before = frame.at(-1) if front.frame is None else front.frame.at(1)
         size = frame.size if front.frame is None else front.frame.size
-        r, jump, off = front.radius, jump[:, : self.n], jump[:, self.n]
-        if front.frame is None:  # the radius is still one of x itself
+        r, jump, error = front.radius, jump[:, : self.n], jump[:, self.n]
+        if front.frame is None:  # the radius is still a bound of x itself
             r, jump = torch.zeros_like(r), jump + r
-        return rotated(before, size, frame.at(-1), frame.size, jump, r), off
+        return rotated(before, size, frame.at(-1), frame.size, jump, r), error
 
-    def _tried(self, start: tuple[Tensor, Tensor], p: Terms, frame: Moving, t: float, end: float) -> Step:
-        """The step, with r̂ as it has to be."""
-        r, off = start
+    def _attempt(self, start: tuple[Tensor, Tensor], p: Terms, frame: Moving, t: float, end: float) -> Step:
+        """Bound a step, with increasing r̂ until it is proved or TRIES are used up."""
+        r, error = start
         h, count = end - t, len(r)
         Y, E = turning(frame)
         tail = ratio_of(E)
-        hat = 1.1 * r + h * LEAK / self.about.duration + LEAST
-        made = Step(
+        hat = 1.1 * r + h * LEAK / self.enclosure.duration + LEAST
+        result = Step(
             r.clone(), torch.zeros_like(r[:, 0]), torch.zeros(count, 2, dtype=r.dtype),
             torch.full((count, 2), -torch.inf, dtype=r.dtype), torch.zeros(count, 2 + self.e, dtype=r.dtype),
             torch.zeros(count, dtype=torch.bool),
         )  # fmt: skip
         todo = torch.arange(count)
         for _ in range(TRIES):
-            w, cost, worst, off_form = self._bounded(p[:, todo], frame[todo], Y[todo], hat[todo], t, end)
+            w, cost, worst, defect = self._bounded(p[:, todo], frame[todo], Y[todo], hat[todo], t, end)
             Ew = (E[todo] @ w[..., None])[..., 0] * ROOM
             rate = (w + Ew + tail[todo] * Ew.amax(-1, keepdim=True)) * ROOM
             needed = (r[todo] + h * rate) * ROOM
             held = (needed <= hat[todo]).all(-1)
-            slack = off[todo, None] * torch.tensor([-1.0, 1.0], dtype=r.dtype)
+            slack = error[todo, None] * torch.tensor([-1.0, 1.0], dtype=r.dtype)
             cost = h * cost + slack
             cost = cost + cost.abs() * torch.tensor([-1e-12, 1e-12], dtype=r.dtype)
             for part, value in zip(
-                made, (needed, off_form.radius.amax(-1), cost, worst, self._bends(off_form), held), strict=True
+                result, (needed, defect.radius.amax(-1), cost, worst, self._bends(defect), held), strict=True
             ):
                 part[todo] = value
             hat[todo] = torch.where(held[:, None], hat[todo], 1.2 * torch.maximum(needed, hat[todo]))
             todo = todo[~held & hat[todo].isfinite().all(-1)]
             if not len(todo):
                 break
-        return made
+        return result
 
     def _bounded(
         self, p: Terms, frame: Moving, Y: Tensor, hat: State, t: float, end: float
     ) -> tuple[Tensor, Tensor, Tensor, TaylorForm]:
-        """(|Yv|, bounds of ℓ − its rate, bounds of the worst h, Yv) on a step, where |z| ≤ r̂."""
+        """(a bound of |Yv|, bounds of ℓ − its polynomial, bounds of max_j h_j, Yv) on a step, if |z| ≤ r̂."""
         n, h, cells = self.n, end - t, p.shape[1]
         self.bounded += cells
         x, rate = self._moving(p, frame, hat)
@@ -285,13 +289,15 @@ class _Tube:
         time, inverse = constants[..., :1], constants[..., 1:]
         room = (4 * time[0] + 4 * time[1], 16 * x.abs().sum(0), 16 * rate.abs().sum(0), 0 * inverse[0])
         terms, radius = torch.cat([time, x, rate, inverse], -1), EPSILON * torch.cat(room, -1)
-        off, cost, *h_form = self.about.field.defect.image(TaylorForm(terms, radius, 1 + self.e + n), self.supports)
-        low, high = off.interval()
+        defect, cost, *h_form = self.enclosure.field.defect.image(
+            TaylorForm(terms, radius, 1 + self.e + n), self.supports
+        )
+        low, high = defect.interval()
         worst = [side.amax(-1) for side in h_form[0].interval()] if h_form else [low.new_full((cells,), -torch.inf)] * 2
-        return torch.maximum(low.abs(), high.abs()), torch.stack(cost.interval(), -1), torch.stack(worst, -1), off
+        return torch.maximum(low.abs(), high.abs()), torch.stack(cost.interval(), -1), torch.stack(worst, -1), defect
 
     def _moving(self, p: Terms, frame: Moving, hat: State) -> tuple[Tensor, Tensor]:
-        """p + Φz, and the derivatives of (p + Φz, the polynomial of ∫ℓ) by τ, in (τ, ε, z / r̂)."""
+        """p + Φz, and ∂/∂τ of (p + Φz, the polynomial of ∫ℓ), as polynomials in (τ, ε, z/r̂)."""
         x, rate = self._padded(p[..., : self.n]), self._padded(derivative(p, self.e))
         for j in range(self.n):
             z = 1 + self.e + j
@@ -302,21 +308,19 @@ class _Tube:
             rate[self.place[0, z], :, : self.n] += 2 * bend
         return x, rate
 
-    def _bends(self, off: TaylorForm) -> Tensor:
-        """The terms of third degree by who has a part in them: τ, each ε, and z, (cells, 2 + e); what is left
-        is alike.
-        """
-        bends = torch.zeros(off.radius.shape[0], 2 + self.e, dtype=torch.float64)
+    def _bends(self, form: TaylorForm) -> Tensor:
+        """The size of the terms of degree three due to τ, each ε_k, and z, (cells, 2 + e), as a measure of bending."""
+        bends = torch.zeros(form.radius.shape[0], 2 + self.e, dtype=torch.float64)
         for axes, k in self.place.items():
             if len(axes) == DEGREE:
                 parts = {min(axis, 1 + self.e) for axis in axes}
-                size = off.terms[k].abs().amax(-1) / len(parts)
+                size = form.terms[k].abs().amax(-1) / len(parts)
                 for part in parts:
                     bends[:, part] += size
         return bends
 
     def _supports(self) -> list[tuple[int, ...]]:
-        """The terms that (t, x, rate, Y) may have: t is τ's, Y constant, and z goes with powers of τ alone."""
+        """The possibly nonzero terms of (t, x, rate, Y): t is linear in τ, Y is constant, z multiplies powers of τ."""
         own = {self.place[axes] for axes in places(1 + self.e, DEGREE)}
         with_z = {self.place[axes] for axes in self.place if len(axes) and max(axes) > self.e and not any(axes[:-1])}
         moving = tuple(sorted(own | with_z))
@@ -335,38 +339,38 @@ class _Tube:
         return torch.stack([p[0] - reach, p[0] + reach], -1)
 
     def enclosed(self) -> Enclosed:
-        """What is proved in the end."""
+        """The results after the last step."""
         front, n, count = self.front, self.n, len(self.alive)
         living = torch.nonzero(self.alive).flatten()
         terms = torch.zeros(len(places(self.e, DEGREE)), count, dtype=torch.float64)
         slack, ends = torch.zeros(count, 2, dtype=torch.float64), torch.zeros(count, n, 2, dtype=torch.float64)
         if len(living):
-            terms[:, living], slack[living], ends[living] = self._in_the_end(front)
+            terms[:, living], slack[living], ends[living] = self._at_end_of_horizon(front)
         return Enclosed(
             self.alive & self.kept, self.violated, terms, slack, ends, self.ranges, self.bend, self.steps, self.bounded
         )
 
-    def _in_the_end(self, front: Front) -> tuple[Tensor, Tensor, Tensor]:
-        """(J as a polynomial in ε, bounds of what it is off, bounds of x(T))."""
+    def _at_end_of_horizon(self, front: Front) -> tuple[Tensor, Tensor, Tensor]:
+        """(a polynomial in ε near J, bounds of J minus it, bounds of x(T))."""
         n, alone = self.n, list(places(self.e, DEGREE))
         assert front.frame is not None
         at_T, size = front.frame.at(1), front.frame.size
         d = self.e + n
         place = places(d, DEGREE)
         x = torch.zeros(len(place), len(front.radius), n, dtype=torch.float64)
-        kept = [place[axes] for axes in alone]
-        x[kept] = front.end[..., :n]
+        in_epsilon = [place[axes] for axes in alone]
+        x[in_epsilon] = front.end[..., :n]
         for j in range(n):
             x[place[(self.e + j,)]] += at_T[:, :, j] * front.radius[:, j : j + 1]
         room = 16 * EPSILON * x.abs().sum(0) + 16 * EPSILON * (size @ front.radius[..., None])[..., 0]
         time = torch.zeros(len(place), len(front.radius), 1, dtype=torch.float64)
-        time[0] = self.about.duration
+        time[0] = self.enclosure.duration
         form = TaylorForm(torch.cat([time, x], -1), torch.cat([torch.zeros_like(time[0]), room], -1), d)
-        (phi,) = self.about.field.end.image(form)
-        others = [k for k in range(len(place)) if k not in kept]
-        off = (phi.terms[others].abs().sum(0) + phi.radius) * ROOM
-        terms = front.end[..., n] + phi.terms[kept]
-        off = off + 4 * EPSILON * (front.end[..., n].abs() + phi.terms[kept].abs()).sum(0)
+        (phi,) = self.enclosure.field.end.image(form)
+        others = [k for k in range(len(place)) if k not in in_epsilon]
+        error = (phi.terms[others].abs().sum(0) + phi.radius) * ROOM
+        terms = front.end[..., n] + phi.terms[in_epsilon]
+        error = error + 4 * EPSILON * (front.end[..., n].abs() + phi.terms[in_epsilon].abs()).sum(0)
         reach = x[1:].abs().sum(0) * ROOM + room
         ends = torch.stack([x[0] - reach, x[0] + reach], -1)
-        return terms, front.cost + torch.stack([-off, off], -1), ends
+        return terms, front.cost + torch.stack([-error, error], -1), ends

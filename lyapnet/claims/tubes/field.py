@@ -1,4 +1,4 @@
-"""The closed loop that a tube is about, with bounds of how far polynomials are from obeying it."""
+"""The closed loop of a tube, with bounds of the defect of polynomials in its differential equation."""
 
 from collections.abc import Sequence
 
@@ -15,23 +15,23 @@ from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.problem import TRIED
 
-DEGREE = 3  # of the forms
+DEGREE = 3  # of the Taylor forms
 
 
 class Field:
-    """F(t, x) = (f + g u, ℓ) with u = policy(t, x), of the states that something depends on.
+    """F(t, x) = (f + g u, ℓ) with u = policy(t, x), in the states that are not ignorable.
 
     Args:
         loop: in float64.
         seen: the indices of these states; the others are 0.
-        domain: a box of (t, x), all n states, in which functions are traced.
+        domain: a box of (t, x) with all n states, on which functions are traced.
     """
 
     def __init__(
         self, loop: ClosedLoop, constraints: Constraints | None, seen: Sequence[int], domain: tuple[Corner, Corner]
     ):
         self.loop, self.constraints, self.seen, self.n = loop, constraints, list(seen), len(seen)
-        self._into = torch.eye(loop.system.n, dtype=torch.float64)[self.seen]
+        self._embedding = torch.eye(loop.system.n, dtype=torch.float64)[self.seen]
         lower, upper = (torch.cat([end[:1], end[1:][self.seen]]) for end in domain)
         memory = check_loop(loop, constraints, domain)
         check_controls(loop, domain)
@@ -50,25 +50,25 @@ class Field:
         return torch.cat([slope[..., self.seen], slope[..., -1:]], -1)
 
     def kinks(self, duration: float, dt: float) -> list[float]:
-        """Times between 0 and T at which curves in the law have their nodes; a sampled law reads them Δt ahead."""
+        """Times between 0 and T at which a curve in the law has a node; or Δt earlier, where a sampled law reads it."""
         nodes = {t for module in self.loop.modules() if isinstance(module, Curve) for t in module.nodes.tolist()}
         return sorted(t for t in {*nodes, *(t - dt for t in nodes)} if 0 < t < duration)
 
     def whole(self, x: State) -> State:
-        """All n states, of which those that nothing depends on are 0."""
-        return x if self.n == len(self._into[0]) else x @ self._into
+        """All n states, with 0 for the ignorable ones."""
+        return x if self.n == len(self._embedding[0]) else x @ self._embedding
 
     def _defect(self, t: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         """(Y (F − rate), ℓ − cost rate, h) for y = (x, (rate, cost rate), Y)."""
         n = self.n
         x, rate, Y = y[:n], y[n : 2 * n + 1], y[2 * n + 1 :].reshape(n, n)
-        off = self.slope(t, x) - rate
+        defect = self.slope(t, x) - rate
         h = () if self.constraints is None else (self.constraints(self.whole(x)),)
-        return (Y * off[:n]).sum(-1), off[n], *h
+        return (Y * defect[:n]).sum(-1), defect[n], *h
 
 
 def _check(field: Field, lower: Corner, upper: Corner) -> None:
-    """Refuse a closed loop of which the graph at one point says nothing about batches, or that is not its parts."""
+    """Refuse a closed loop that is another function on batches than on one point, or that differs from its parts."""
     share = torch.rand(TRIED, len(lower), generator=torch.Generator().manual_seed(0), dtype=lower.dtype)
     points = lower + (upper - lower) * share
     t, x = points[:, 0], points[:, 1:]

@@ -1,4 +1,4 @@
-"""Tubes drawn: where all closed loops from X₀ go, and what they cost."""
+"""Figures of tubes: bounds of all closed loops from X₀, and of their costs."""
 
 from typing import Any
 
@@ -13,19 +13,19 @@ from lyapnet.claims.costs import Inside
 from lyapnet.claims.tubes.tube import ProvedTube
 from lyapnet.controller.controller import Controller
 
-SHOWN = 12  # closed loops
+SHOWN = 12  # simulated closed loops in the figure
 
 
 def tube(
     claim: ProvedTube, controller: Controller, inside: Inside, optimum: PerState | None, headline: str,
     least: tuple[PerState, str] | None = None,
 ) -> Figure:  # fmt: skip
-    """Bounds of each state over time with some closed loops, and of the cost over the cost itself.
+    """Bounds of each state over time with some simulated closed loops; and relative bounds of the cost.
 
     Args:
-        inside: states of X₀ with their bounds.
-        optimum: of the first of them.
-        least: bounds of the optimum from below at these states, and which controls they are about.
+        inside: states of X₀ with bounds of their costs.
+        optimum: the optimal costs of the first of these states.
+        least: lower bounds of the optimum for these states, and the controls for which they hold.
     """
     labels = controller.system.state_labels
     count = len(claim.seen) + 1
@@ -62,7 +62,7 @@ def _draw_state(panel: Axes, claim: ProvedTube, k: int, trajectory: Any, i: int)
 
 
 def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tuple[PerState, str] | None) -> None:
-    """Bounds over the middle between them, relative to it, and the optima; nothing where nothing is proved."""
+    """Draw bounds and optima, divided by the middle of the bounds, over this middle; nothing without a proof."""
     panel.set(xlabel="cost from x₀, proved", ylabel="relative to it")
     lowest, highest = inside.low, inside.guaranteed
     if lowest is None or not len(inside.x0):
@@ -75,15 +75,19 @@ def _draw_cost(panel: Axes, inside: Inside, optimum: PerState | None, least: tup
     panel.plot(x, low, color=BLUE, linewidth=1)
     if least is not None:
         lowest, whose = least
-        shown = f"proved: {whose} costs at least"
-        panel.plot(x, numpy_of((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=shown)
-    telling = (middle > 0.1 * middle.mean()) & lowest.isfinite()  # where any bound is wide, states leave the picture
-    if bool(telling.any()):
-        bottom, top = (lowest / middle)[telling].min(), (highest / middle)[telling].max()
+        label = f"proved: {whose} costs at least"
+        panel.plot(x, numpy_of((lowest / middle)[order]), ".", color=GREEN, markersize=2, label=label)
+    relevant = (middle > 0.1 * middle.mean()) & lowest.isfinite()  # relative bounds of small costs are always wide
+    if bool(relevant.any()):
+        bottom, top = (lowest / middle)[relevant].min(), (highest / middle)[relevant].max()
         panel.set_ylim(min(0.95, float(bottom)), max(1.05, float(top)))
     if optimum is not None:
-        some = middle[: len(optimum)]
-        best = optimum / some
+        first = middle[: len(optimum)]
         panel.plot(
-            numpy_of(some), numpy_of(best), ".", color=VERMILION, markersize=4, label="optimum of the steps of Δt"
+            numpy_of(first),
+            numpy_of(optimum / first),
+            ".",
+            color=VERMILION,
+            markersize=4,
+            label="optimum of the steps of Δt",
         )

@@ -1,4 +1,4 @@
-"""Polynomials p(τ, ε) close to the closed loops from a box of initial states: simulated, and never believed."""
+"""Polynomials p(τ, ε) near the closed loops from a box of initial states, by simulation; proofs do not rely on them."""
 
 from collections.abc import Callable
 from functools import cache
@@ -17,7 +17,7 @@ Slope = Callable[[float, Tensor], Tensor]  # (t, x) ↦ (ẋ, ℓ) in plain arit
 
 
 class Flow(NamedTuple):
-    """y = (x, ∫ℓ) and ẏ at one time, as polynomials of second degree in ε; (terms, cells, n + 1) each.
+    """y = (x, ∫ℓ) and ẏ at one time, as polynomials of degree two in ε, (terms, cells, n + 1) each.
 
     The terms are in the order of `monomials(e, 2)`.
     """
@@ -27,7 +27,7 @@ class Flow(NamedTuple):
 
 
 def stencil(e: int) -> Tensor:
-    """The ε at which closed loops are simulated: 0, ±1 on each axis, and (1, 1) on each pair; (points, e)."""
+    """The ε at which closed loops are simulated, (points, e): 0, ±1 on each axis, and (1, 1) on each pair of axes."""
     points = [[0.0] * e]
     for i in range(e):
         points += [[sign * (k == i) for k in range(e)] for sign in (1.0, -1.0)]
@@ -37,11 +37,11 @@ def stencil(e: int) -> Tensor:
 
 
 def flow(slope: Slope, t: float, y: Tensor, e: int) -> Flow:
-    """The polynomials through y at the stencil, (points, cells, n + 1), and through their rates."""
-    return Flow(_fitted(y, e), _fitted(slope(t, y[..., :-1]), e))
+    """The polynomials through the values y at the stencil, (points, cells, n + 1), and through their derivatives."""
+    return Flow(_interpolate(y, e), _interpolate(slope(t, y[..., :-1]), e))
 
 
-def advanced(slope: Slope, t: float, h: float, y: Tensor) -> Tensor:
+def integrate(slope: Slope, t: float, h: float, y: Tensor) -> Tensor:
     """y = (x, ∫ℓ) after h seconds, by steps of the classical Runge-Kutta method."""
     h = h / SUBSTEPS
     for k in range(SUBSTEPS):
@@ -73,7 +73,7 @@ def over_step(before: Flow, after: Flow, h: float, e: int) -> Tensor:
 
 
 def derivative(terms: Terms, e: int) -> Tensor:
-    """∂p/∂τ as terms of the same monomials."""
+    """∂p/∂τ, with terms in the same order."""
     place, found = places(1 + e, DEGREE), torch.zeros_like(terms)
     for axes, k in place.items():
         if power := axes.count(0):
@@ -82,7 +82,7 @@ def derivative(terms: Terms, e: int) -> Tensor:
 
 
 def at_end(terms: Terms, e: int, tau: int) -> Tensor:
-    """p(τ, ε) at τ = ±1 as terms of `monomials(e, DEGREE)`, each a sum of four at most."""
+    """p(τ, ε) at τ = ±1, with terms in the order of `monomials(e, DEGREE)`; each is a sum of at most four."""
     place = places(e, DEGREE)
     found = terms.new_zeros(len(place), *terms.shape[1:])
     for axes, k in places(1 + e, DEGREE).items():
@@ -93,12 +93,12 @@ def at_end(terms: Terms, e: int, tau: int) -> Tensor:
 
 @cache
 def places(dimension: int, degree: int) -> dict[tuple[int, ...], int]:
-    """Where each monomial stands."""
+    """The index of each monomial."""
     return {axes: k for k, axes in enumerate(monomials(dimension, degree))}
 
 
-def _fitted(values: Tensor, e: int) -> Tensor:
-    """The polynomial of second degree through values at the stencil, (points, cells, …)."""
+def _interpolate(values: Tensor, e: int) -> Tensor:
+    """The polynomial of degree two through values at the stencil, (points, cells, …)."""
     middle, linear, squares = values[0], [], {}
     for i in range(e):
         plus, minus = values[1 + 2 * i], values[2 + 2 * i]

@@ -1,4 +1,4 @@
-"""The claim of a tube: where the closed loop goes from each initial state, and what it costs."""
+"""The claim of a tube: bounds of the closed loop from each initial state, and of its cost."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -12,8 +12,8 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import Interrupted, signals_taken
 from lyapnet.base.types import State
 from lyapnet.claims.ignorable_states import ignorable_states
-from lyapnet.claims.preconditions import over_time, without
-from lyapnet.claims.tubes.enclosure import BINS, Cells, Enclosed, Enclosing
+from lyapnet.claims.preconditions import over_time, slice_at_zero
+from lyapnet.claims.tubes.enclosure import BINS, Cells, Enclosed, Enclosure
 from lyapnet.claims.tubes.field import DEGREE, Field
 from lyapnet.claims.tubes.nominal import places
 from lyapnet.controller.controller import Controller
@@ -25,49 +25,49 @@ from lyapnet.prover.workers import answering
 from lyapnet.task.constraints import names_of
 from lyapnet.task.sets import Box
 
-CELLS = 128  # that X₀ is cut into to begin with, about
-AT_ONCE = 128  # cells of a chunk: their tubes take the same steps
-SIMULATED = 256  # closed loops, by which units are chosen
-SMALLEST = 1e-9  # share of X₀ at which a cell is cut no more
-NOTHING_KEPT = "Stopped while certifying: a tube keeps nothing."
+CELLS = 128  # cells into which X₀ is cut first, about
+AT_ONCE = 128  # cells in a chunk; their tubes take the same steps
+SIMULATED = 256  # simulated closed loops that give the unit of each state
+SMALLEST = 1e-9  # a cell with a smaller share of X₀ is not cut further
+NOTHING_KEPT = "Stopped while certifying: the proof of a tube cannot be kept."
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProvedTube:
-    """Of ẋ = f + g u with u = policy(t, x) read at every t, in continuous time, for every x₀ in one of the cells, which
-    are boxes in X₀, with ε_k ∈ [−1, 1] along each of their axes:
+    """For ẋ = f + g u with u = policy(t, x) at every t, in continuous time, and for every x₀ in one of the cells, which
+    are boxes in X₀ with coordinates ε_k ∈ [−1, 1]:
 
         x(t) exists up to T and lies within `ranges` on each of BINS equal parts of [0, T], and x(T) within `ends`;
         h(x(t)) ≤ 0 at each t where there are constraints;
-        J(x₀) = ∫ℓ dt + φ(x(T)) = P(ε(x₀)) + r, with a polynomial P of third degree and slack_low ≤ r ≤ slack_high.
+        J(x₀) = ∫ℓ dt + φ(x(T)) = P(ε(x₀)) + r, with a polynomial P of degree three and slack_low ≤ r ≤ slack_high.
 
-    Where f, g, u or ℓ jump it is about Filippov's solutions. States that nothing depends on are left out, taken as 0.
+    If f, g, u or ℓ jump, the claim is about Filippov's solutions. Ignorable states are fixed at 0.
     """
 
     duration: float
-    initial_states: Box  # X₀, without what is left out
+    initial_states: Box  # X₀, with ignorable states fixed at 0
     seen: Sequence[int]  # the indices of the other states
-    axes: Sequence[int]  # those of `seen` along which X₀ has a width
-    cells: Cells  # that are proved, (cells, seen)
+    axes: Sequence[int]  # the positions in `seen` of states along which X₀ has a width
+    cells: Cells  # the proved cells, (cells, seen)
     cost: Tensor  # P, in the order of monomials(axes, DEGREE)
     slack: Tensor  # (cells, 2)
     ends: Tensor  # (cells, seen, 2)
     ranges: Tensor  # of all cells, (BINS, seen, 2)
     volume_share: float  # of X₀ in the cells
     violating: list[float] | None  # the middle of a cell all of whose closed loops violate a constraint
-    boxes: int  # cells that were tried
-    steps: int  # of all of them
+    boxes: int  # tested cells
+    steps: int  # summed over the tested cells
     seconds: float
     fingerprint: str
     constraints: Sequence[str] = ()
-    radius: float | None = None  # within which x(T) is asked to be of the goal …
-    reach: float = float("nan")  # … and is, at most
-    missing: list[float] | None = None  # the middle of a cell whose closed loops end outside
+    radius: float | None = None  # the claim requires ‖x(T) − goal‖ ≤ radius; None for no requirement
+    reach: float = float("nan")  # an upper bound of ‖x(T) − goal‖
+    missing: list[float] | None = None  # the middle of a cell all of whose closed loops end outside of the radius
     set_up: float = 0.0  # seconds of the budget before the first cell
 
     @property
     def verdict(self) -> Verdict:
-        """On the claim that cells hold all of X₀, and that closed loops end within the radius that is asked for."""
+        """The verdict on the claim that the cells cover X₀ and that closed loops end within the radius."""
         if self.violating is not None or self.missing is not None:
             return "falsified"
         ends = self.radius is None or self.reach <= self.radius
@@ -75,16 +75,16 @@ class ProvedTube:
 
     @property
     def reason(self) -> str | None:
-        """Why the verdict is unknown, and what may help."""
+        """The reason for the verdict unknown, and advice."""
         if self.verdict != "unknown":
             return None
         if self.volume_share < 1:
             return f"{time_spent(self.set_up)}: allow more"
-        return "no bound of ‖x(T) − goal‖ is within --radius"
+        return "the bound of ‖x(T) − goal‖ is larger than the radius: allow more seconds, or a larger radius"
 
     @property
     def mean_cost(self) -> tuple[float, float]:
-        """Bounds of the mean of J over the cells, x₀ uniform in them; nan without cells."""
+        """Bounds of the mean of J for x₀ uniform on the cells; nan without cells."""
         volumes = self._volumes()
         mean = self.cost[0].clone()
         for axes, k in places(len(self.axes), DEGREE).items():
@@ -95,12 +95,12 @@ class ProvedTube:
 
     @property
     def greatest_cost(self) -> float:
-        """A bound of J on all cells; −∞ without cells."""
+        """An upper bound of J on all cells; −∞ without cells."""
         reach = self.cost[0] + self.cost[1:].abs().sum(0) + self.slack[:, 1]
         return float(reach.max()) if len(reach) else -torch.inf
 
     def bounds_of_cost(self, x0: State) -> tuple[Tensor, Tensor]:
-        """(low, high) of J(x₀) for states of all n components, (k, n); −∞ and ∞ outside the cells."""
+        """Bounds (low, high) of J(x₀) for states with all n components, (k, n); −∞ and ∞ outside of the cells."""
         x0 = x0.double()[:, list(self.seen)]
         low, high = torch.full((len(x0),), -torch.inf).double(), torch.full((len(x0),), torch.inf).double()
         for i, x in enumerate(x0):
@@ -120,8 +120,8 @@ class ProvedTube:
         return (self.cells.upper - self.cells.lower)[:, list(self.axes)].prod(-1)
 
 
-class _Found:
-    """What is proved of cells so far."""
+class _Results:
+    """The results of all cells so far."""
 
     def __init__(self, n: int):
         self.parts: list[tuple[Tensor, ...]] = []
@@ -129,17 +129,17 @@ class _Found:
         self.share, self.boxes, self.steps = 0.0, 0, 0
         self.violating: list[float] | None = None
 
-    def take(self, cells: Cells, made: Enclosed, share: Tensor) -> None:
-        ok, bad = made.proved, torch.nonzero(made.violated).flatten()
+    def add(self, cells: Cells, enclosed: Enclosed, share: Tensor) -> None:
+        ok, bad = enclosed.proved, torch.nonzero(enclosed.violated).flatten()
         self.boxes += len(ok)
-        self.steps += made.bounded
+        self.steps += enclosed.bounded
         if len(bad) and self.violating is None:
             self.violating = ((cells.lower + cells.upper)[bad[0]] / 2).tolist()
         if bool(ok.any()):
-            ranges = made.ranges[:, ok]
+            ranges = enclosed.ranges[:, ok]
             self.ranges[..., 0] = torch.minimum(self.ranges[..., 0], ranges[..., 0].amin(1))
             self.ranges[..., 1] = torch.maximum(self.ranges[..., 1], ranges[..., 1].amax(1))
-            self.parts.append((*cells[ok], made.cost[:, ok].T, made.cost_slack[ok], made.ends[ok]))
+            self.parts.append((*cells[ok], enclosed.cost[:, ok].T, enclosed.cost_slack[ok], enclosed.ends[ok]))
             self.share += float(share[ok].sum())
 
 
@@ -149,45 +149,45 @@ def prove_tube(
     radius: float | None = None,
     report: Callable[[Progress], None] | None = None,
 ) -> ProvedTube:
-    """The tube of all closed loops from X₀, as far as a budget goes.
+    """Prove tubes around the closed loops from X₀ within a budget.
 
-    X₀ is cut into cells; one whose tube comes to no end is cut in two along the axis that F bends along most.
+    X₀ is cut into cells. A cell whose tube does not reach T is cut in two, along the axis in which F is most nonlinear.
 
     Args:
-        radius: within which of the goal closed loops are asked to end.
-        report: is told what is done, and how far it is.
+        radius: the claim requires that closed loops end within this distance of the goal.
+        report: called with stages and progress.
     """
     budget = budget or Budget()
     problem, loop = controller.problem, copied(controller.closed_loop)
     tell(report, budget, "calling and tracing f, g, the cost and u")
     left_out = ignorable_states(loop, problem.constraints)
     seen = [i for i in range(problem.system.n) if i not in left_out]
-    X0 = without(problem.initial_states, left_out)
+    X0 = slice_at_zero(problem.initial_states, left_out)
     lower, upper = X0.lower[seen], X0.upper[seen]
     axes = [i for i in range(len(seen)) if upper[i] > lower[i]]
-    about = _about(controller, loop, seen)
-    found, waiting = _Found(len(seen)), _cut_up(roots(lower[None], upper[None], 0.0), axes, CELLS)
-    with torch.no_grad(), signals_taken(budget.stop.ask), answering(about, budget.workers) as answers:
+    enclosure = _enclosure_of(controller, loop, seen)
+    found, waiting = _Results(len(seen)), _cut_up(roots(lower[None], upper[None], 0.0), axes, CELLS)
+    with torch.no_grad(), signals_taken(budget.stop.ask), answering(enclosure, budget.workers) as answers:
         budget.stop.searching, set_up = True, budget.elapsed
         while len(waiting.key) and not budget.spent(found.boxes) and found.violating is None:
-            some, waiting = _next(waiting, waiting.volumes(lower, upper), AT_ONCE * budget.workers)
+            some, waiting = _choose(waiting, waiting.volumes(lower, upper), AT_ONCE * budget.workers)
             chunks = [Cells(chunk.lower, chunk.upper) for chunk in some.split(AT_ONCE)]
-            made = list(answers([(cells, axes) for cells in chunks]))
-            for boxes, cells, enclosed in zip(some.split(AT_ONCE), chunks, made, strict=True):
-                found.take(cells, enclosed, boxes.volumes(lower, upper))
-                again = ~enclosed.proved & ~enclosed.violated & (boxes.volumes(lower, upper) > SMALLEST)
-                if axes and bool(again.any()):
-                    across = _axis(boxes[again], enclosed.bend[again], axes, lower, upper)
-                    waiting = waiting.joined(boxes[again].halves(across))
+            results = list(answers([(cells, axes) for cells in chunks]))
+            for boxes, cells, enclosed in zip(some.split(AT_ONCE), chunks, results, strict=True):
+                found.add(cells, enclosed, boxes.volumes(lower, upper))
+                to_cut = ~enclosed.proved & ~enclosed.violated & (boxes.volumes(lower, upper) > SMALLEST)
+                if axes and bool(to_cut.any()):
+                    cut_axes = _axis_to_cut(boxes[to_cut], enclosed.bend[to_cut], axes, lower, upper)
+                    waiting = waiting.joined(boxes[to_cut].halves(cut_axes))
             if report is not None:
                 report(Progress(found.boxes, max(0.0, 1 - found.share), budget.elapsed))
     if budget.stop.asked:
         raise Interrupted(NOTHING_KEPT, 130)
-    return _claim(controller, about, X0, seen, axes, found, budget, radius, set_up)
+    return _claim_of(controller, enclosure, X0, seen, axes, found, budget, radius, set_up)
 
 
-def _about(controller: Controller, loop: Any, seen: list[int]) -> Enclosing:
-    """The closed loop, in units that simulations suggest."""
+def _enclosure_of(controller: Controller, loop: Any, seen: list[int]) -> Enclosure:
+    """The enclosure of the closed loop, with units from simulations."""
     problem = controller.problem
     x0 = torch.cat([controller.initial_states.corners(), controller.initial_states.sample(SIMULATED, _seeded())])
     x = controller.rollout(x0).x.double().flatten(0, -2)
@@ -196,12 +196,12 @@ def _about(controller: Controller, loop: Any, seen: list[int]) -> Enclosing:
     around = over_time(Box(x.amin(0) - 0.1 * unit, x.amax(0) + 0.1 * unit), problem.horizon.duration)
     constraints = None if problem.constraints is None else copied(problem.constraints)
     field = Field(loop, constraints, seen, around)
-    return Enclosing(field, problem.horizon.duration, problem.horizon.dt, unit[seen])
+    return Enclosure(field, problem.horizon.duration, problem.horizon.dt, unit[seen])
 
 
-def _next(waiting: Boxes, sizes: Tensor, count: int) -> tuple[Boxes, Boxes]:
-    """(some cells, the others): the smallest, so that what is proved grows with the seconds, and as many of the
-    largest, lest what cannot be proved takes all of them.
+def _choose(waiting: Boxes, sizes: Tensor, count: int) -> tuple[Boxes, Boxes]:
+    """(the next cells, the others). Half of the next cells are the smallest, which are likely to be proved; half are
+    the largest, so that cells that cannot be proved do not take all of the time.
     """
     order = sizes.argsort(stable=True)
     half = min(count, len(order)) // 2
@@ -215,7 +215,7 @@ def _seeded() -> torch.Generator:
 
 
 def _cut_up(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
-    """Boxes cut in halves along each of their axes in turn, until there are so many."""
+    """Halve boxes along each of their axes in turn, up to at most `count` boxes."""
     turn = 0
     while axes and 2 * len(boxes.key) <= count:
         boxes = boxes.halves(torch.full((len(boxes.key),), axes[turn % len(axes)]))
@@ -223,15 +223,15 @@ def _cut_up(boxes: Boxes, axes: Sequence[int], count: int) -> Boxes:
     return boxes
 
 
-def _axis(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: State) -> Tensor:
-    """Where to cut each: along the axis of most bend, of those that are not narrow beside the others."""
+def _axis_to_cut(boxes: Boxes, bend: Tensor, axes: Sequence[int], lower: State, upper: State) -> Tensor:
+    """The axis along which to cut each box: the one of the largest bend among those that are not too narrow."""
     widths = ((boxes.upper - boxes.lower) / (upper - lower).where(upper > lower, 1.0))[:, list(axes)]
     score = torch.where(widths >= widths.amax(-1, keepdim=True) / 64, bend + 1e-12 * widths, -1.0)
     return torch.tensor(list(axes))[score.argmax(-1)]
 
 
-def _claim(
-    controller: Controller, about: Enclosing, X0: Box, seen: list[int], axes: list[int], found: _Found,
+def _claim_of(
+    controller: Controller, enclosure: Enclosure, X0: Box, seen: list[int], axes: list[int], found: _Results,
     budget: Budget, radius: float | None, set_up: float,
 ) -> ProvedTube:  # fmt: skip
     n, terms = len(seen), len(places(len(axes), DEGREE))
@@ -243,17 +243,17 @@ def _claim(
     if radius is not None and bool((near > radius).any()):
         missing = ((lower + upper)[near.argmax()] / 2).tolist()
     return ProvedTube(
-        duration=about.duration, initial_states=X0, seen=seen, axes=axes, cells=Cells(lower, upper), cost=cost.T,
+        duration=enclosure.duration, initial_states=X0, seen=seen, axes=axes, cells=Cells(lower, upper), cost=cost.T,
         slack=slack, ends=ends, ranges=found.ranges,
         volume_share=min(1.0, found.share) if found.share < 1 - 1e-12 else 1.0,
         violating=found.violating, boxes=found.boxes, steps=found.steps, seconds=time.monotonic() - budget.started,
-        fingerprint=about.field.defect.fingerprint, constraints=names_of(controller.problem.constraints), radius=radius,
-        reach=float(far.max()) if len(far) else float("nan"), missing=missing, set_up=set_up,
+        fingerprint=enclosure.field.defect.fingerprint, constraints=names_of(controller.problem.constraints),
+        radius=radius, reach=float(far.max()) if len(far) else float("nan"), missing=missing, set_up=set_up,
     )  # fmt: skip
 
 
 def _distances(ends: Tensor, goal: State) -> tuple[Tensor, Tensor]:
-    """(greatest, least) ‖x(T) − goal‖ of each cell, up to 1e-12 of it."""
+    """Bounds (greatest, least) of ‖x(T) − goal‖ for each cell; a relative 1e-12 is added for rounding."""
     low, high = ends[..., 0] - goal, ends[..., 1] - goal
     far = torch.maximum(low.abs(), high.abs()).norm(dim=-1) * (1 + 1e-12)
     near = torch.maximum(low, -high).clamp_min(0).norm(dim=-1) * (1 - 1e-12)

@@ -1,1 +1,1 @@
-"""Traced functions as flat programs on tensors, which one kernel runs: compiled once for a machine, not for a task."""
+"""Traced functions as flat programs on tensors, run by a kernel that is compiled once for a machine, not for a task."""

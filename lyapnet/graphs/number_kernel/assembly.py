@@ -1,4 +1,4 @@
-"""Programs with memory for their runs: what compiled C++ is called with."""
+"""Programs with memory for their runs, and the calls of the compiled C++."""
 
 import ctypes
 from collections.abc import Iterator, Sequence
@@ -17,12 +17,12 @@ from lyapnet.graphs.number_kernel.rules import RULES
 from lyapnet.graphs.number_kernel.writing import Writer
 
 SOURCE = Path(__file__).with_name("program.cpp")
-NUMBERS = {torch.float64: "double", torch.float32: "float"}  # in C++
+NUMBERS = {torch.float64: "double", torch.float32: "float"}  # their names in C++
 
 
 @cache
 def library(*definitions: str) -> ctypes.CDLL:
-    """The library compiled from program.cpp with some macro definitions, read from disk if it is there.
+    """The library compiled from program.cpp with some macro definitions; from the cache if it is there.
 
     Raises:
         CompilationError: as library_of.
@@ -31,20 +31,22 @@ def library(*definitions: str) -> ctypes.CDLL:
 
 
 def definitions(dtype: torch.dtype) -> tuple[str, str]:
-    """What program.cpp leaves open: the type of its numbers, and the elementwise instructions."""
-    rows = (f"OPERANDS_{count}({name}, {of})" for name, (count, of) in elementwise_instructions().items())
+    """The macro definitions for program.cpp: the type of its numbers, and the elementwise instructions."""
+    rows = (
+        f"OPERANDS_{count}({name}, {expression})" for name, (count, expression) in elementwise_instructions().items()
+    )
     return f"NUMBER={NUMBERS[dtype]}", f"ELEMENTWISE={' '.join(rows)}"
 
 
 def is_built(dtype: torch.dtype) -> bool:
-    """Whether the C++ for one type of numbers was compiled before."""
+    """Whether the C++ for a type of numbers is compiled already."""
     return dtype in NUMBERS and file_of_library("numbers", (SOURCE,), *definitions(dtype)).is_file()
 
 
 class _Memory(NamedTuple):
-    """What a run of a program works in."""
+    """The memory of one run of a program."""
 
-    arena: Tensor
+    arena: Tensor  # for intermediate results
     addresses: np.ndarray  # of all buffers
 
 
@@ -52,7 +54,7 @@ class AssembledProgram:
     """A program with memory for its runs.
 
     Args:
-        arguments: as NumberKernel.
+        arguments: examples, as in NumberKernel.
     """
 
     def __init__(self, arguments: Sequence[Tensor]):
@@ -62,69 +64,74 @@ class AssembledProgram:
         self._definitions = definitions(self.dtype)
         self.writer = Writer(Program(self.dtype), int(self._function("width")()), RULES)
         self.result_shapes: list[torch.Size] = []
-        self._given, self._results = list[int](), list[int]()  # buffers
+        self._arguments, self._results = list[int](), list[int]()  # indices of buffers; −1 for none
         self._frozen: list[tuple[int, Tensor]] = []  # arguments of other types, which are constants of the program
         self._shapes = [each.shape for each in arguments]
-        self._idle = list[_Memory]()  # of runs that ended; each run has one for itself
+        self._idle = list[_Memory]()  # of finished runs; each run needs its own
 
     def arguments(self, examples: Sequence[Tensor], varying: int) -> list[Tensor]:
-        """Copies of examples, declared as arguments of the program; the last `varying` ones change in each step."""
-        own = [each.detach().contiguous().clone() for each in examples]
-        for k, example in enumerate(own):
+        """Declare arguments; the last `varying` ones change in each step. Return copies of the examples."""
+        copies = [each.detach().contiguous().clone() for each in examples]
+        for k, example in enumerate(copies):
             is_number = example.dtype in (self.dtype, torch.bool)
             if is_number and example.numel():
-                self._given.append(self.writer.argument(example, varies=k >= len(own) - varying))
+                self._arguments.append(self.writer.argument(example, varies=k >= len(copies) - varying))
             else:
-                self._given.append(-1)
+                self._arguments.append(-1)
                 self._frozen += [] if is_number else [(k, example)]
-        return own
+        return copies
 
     def finish(self, results: Sequence[Tensor], sums: int = 0, prepared: bool = False) -> None:
-        """Allocate the memory. Results are copied to the outputs; the last `sums` of them are added to the outputs.
+        """Complete the program. Results are copied to the outputs; the last `sums` of them are added to the outputs.
 
         Args:
-            prepared: what steps share depends on constants only, and is computed once for each memory.
+            prepared: whether the shared instructions depend on constants only, and run once for each memory.
         """
         program, self.sums, self._prepared = self.writer.program, sums, prepared
         for k, result in enumerate(results):
             buffer = program.new_buffer(result.numel(), varies=True, given=True)
-            in_line = torch.empty(result.shape, dtype=torch.int8).stride()
-            out, place = Place(buffer, 0, in_line), self.writer.place(result)
+            contiguous = torch.empty(result.shape, dtype=torch.int8).stride()
+            out, place = Place(buffer, 0, contiguous), self.writer.place(result)
             if k < len(results) - sums:
                 program.elementwise("copy", result.shape, out, [place])
             else:
                 program.elementwise("add", result.shape, out, [out, place])
             self._results.append(buffer)
             self.result_shapes.append(result.shape)
-        program.without_unread(self._results)
-        self._offsets, self._numbers = program.laid_out()
+        program.remove_unread(self._results)
+        self._offsets, self._numbers = program.lay_out()
         self._constants = [each.constant for each in program.buffers]
         self.shared, self.repeated = _array(program.shared), _array(program.repeated)
         self._tables = np.concatenate([*program.tables, np.zeros(1, dtype=np.int64)])
-        del self.writer  # and with it all that torch has computed of the examples
+        del self.writer  # and with it the tensors that torch computed from the examples
 
     def is_scan(self, columns: int) -> bool:
-        """Whether there are numbers in x and each column, and x' is like x."""
-        return min(self._given[-columns - 1 :]) >= 0 and self.result_shapes[0] == self._shapes[-1]
+        """Whether x and each column have numbers, and x' has the shape of x."""
+        return min(self._arguments[-columns - 1 :]) >= 0 and self.result_shapes[0] == self._shapes[-1]
 
     def new_results(self) -> list[Tensor]:
-        """Tensors for the results."""
+        """New tensors for the results."""
         return [torch.empty(shape, dtype=self.dtype) for shape in self.result_shapes]
 
     def run(self, code: np.ndarray, arguments: Sequence[Tensor], results: Sequence[Tensor]) -> None:
-        """Run instructions, and have them write the results."""
-        given = self._checked(arguments, self._shapes)
+        """Run instructions that write the results."""
+        given = self._convert(arguments, self._shapes)
         with self._memory() as memory:
             self._run(code, self._buffers(memory, given, results))
 
     def scan(
         self, state: Sequence[Tensor], moving: Sequence[Tensor], x0: Tensor, two: Tensor, columns: Sequence[Tensor]
     ) -> None:
-        """Run all steps: `two` is memory for two states x, `columns` for what the steps keep, over time, and sums."""
+        """Run all steps of a scan.
+
+        Args:
+            two: memory for two states x.
+            columns: memory for the outputs over time and for the sums.
+        """
         first = len(state)
         shapes = [torch.Size([len(moving[0]), *shape]) for shape in self._shapes[first:-1]]
-        given = self._checked([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
-        *read, carried = self._given[first:]
+        given = self._convert([*state, *moving, x0], [*self._shapes[:first], *shapes, self._shapes[-1]])
+        *read, carried = self._arguments[first:]
         written, *kept = self._results
         stacked = len(kept) - self.sums
         over_time = zip([*read, *kept[:stacked]], [*moving, *columns[:stacked]], strict=True)
@@ -137,8 +144,12 @@ class AssembledProgram:
                 _long(len(advances)), _long(carried), _long(written), ctypes.c_void_p(two[1].data_ptr()),
             )  # fmt: skip
 
-    def _checked(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
-        """Arguments as the program reads them."""
+    def _convert(self, arguments: Sequence[Tensor], shapes: Sequence[torch.Size]) -> list[Tensor]:
+        """Arguments in the type and layout that the program reads.
+
+        Raises:
+            ValueError: shapes, devices or frozen values differ from those of the examples.
+        """
         got = [each.shape for each in arguments]
         if got != [*shapes] or any(each.device.type != "cpu" for each in arguments):
             raise ValueError(
@@ -147,14 +158,13 @@ class AssembledProgram:
         for k, example in self._frozen:
             if not torch.equal(arguments[k], example):
                 raise ValueError(
-                    f"Expected {example.dtype} as it was traced in a program of {self.dtype}, got other numbers; build "
-                    "the kernel anew."
+                    f"Expected the {example.dtype} values of the examples, got others; build another kernel."
                 )
         return [argument.detach().to(self.dtype).contiguous() for argument in arguments]
 
     @contextmanager
     def _memory(self) -> Iterator["_Memory"]:
-        """Memory that no other thread works in."""
+        """Memory that no other thread uses."""
         try:
             memory = self._idle.pop()
         except IndexError:
@@ -166,9 +176,10 @@ class AssembledProgram:
 
     def _new_memory(self) -> "_Memory":
         arena = torch.empty(self._numbers + 1, dtype=self.dtype)
-        own = zip(self._constants, self._offsets, strict=True)
+        pairs = zip(self._constants, self._offsets, strict=True)
         addresses = [
-            arena[max(offset, 0) :].data_ptr() if constant is None else constant.data_ptr() for constant, offset in own
+            arena[max(offset, 0) :].data_ptr() if constant is None else constant.data_ptr()
+            for constant, offset in pairs
         ]
         memory = _Memory(arena, np.array(addresses, dtype=np.int64))
         if self._prepared:
@@ -179,9 +190,9 @@ class AssembledProgram:
         self._function("run")(_address(code), _long(len(code)), _address(self._tables), _address(table))
 
     def _buffers(self, memory: "_Memory", arguments: Sequence[Tensor], results: Sequence[Tensor]) -> np.ndarray:
-        """The addresses of all buffers."""
+        """The addresses of all buffers, with those of arguments and results."""
         table = memory.addresses.copy()
-        for buffer, tensor in zip((*self._given, *self._results), (*arguments, *results), strict=True):
+        for buffer, tensor in zip((*self._arguments, *self._results), (*arguments, *results), strict=True):
             if buffer >= 0:
                 table[buffer] = tensor.data_ptr()
         return table

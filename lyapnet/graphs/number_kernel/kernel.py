@@ -1,4 +1,4 @@
-"""Traced functions run as flat programs by compiled C++, in the place of torch's operators one by one."""
+"""Runs traced functions as flat programs in compiled C++, instead of calling torch's operators one by one."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,34 +11,34 @@ from torch.fx import GraphModule
 from lyapnet.base.errors import LyapnetError
 from lyapnet.graphs.agreement import THIRD, are_close
 from lyapnet.graphs.number_kernel.assembly import AssembledProgram
-from lyapnet.graphs.number_kernel.rewriting import rewritten
+from lyapnet.graphs.number_kernel.rewriting import rewrite
 from lyapnet.graphs.scan import Scan
 
-CHECKED = 2  # steps of a scan that are held against torch
+CHECKED = 2  # steps of a scan that are compared with torch
 Kernel = TypeVar("Kernel", bound="NumberKernel | ScanKernel")
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
 
 class NumberKernel:
-    """A graph of tensor operations for arguments of some shapes, as a program; truths in its results are 1 and 0.
+    """A graph of tensor operations for arguments of some shapes, as a program; booleans in its results are 1 and 0.
 
-    What it computes differs from torch's by rounding: sums are taken in another order. It does not depend on the number
-    of threads: a call runs on one.
+    Its results differ from torch's by rounding, since sums are taken in another order. They do not depend on the number
+    of threads, since a call runs on one.
 
     Args:
         graph: a trace.
-        arguments: examples, on which the program is held against the graph.
+        arguments: examples, on which the program is compared with the graph.
 
     Raises:
-        NotImplementedError: an operation has no rule; or the results are others.
-        CompilationError: there is no machine code.
+        NotImplementedError: an operation has no rule, or the results differ from torch's.
+        CompilationError: the C++ cannot be compiled.
     """
 
     def __init__(self, graph: GraphModule, arguments: Sequence[Tensor]):
         self._program = program = AssembledProgram(arguments)
-        own = program.arguments(arguments, varying=len(arguments))
-        program.finish(program.writer.write(rewritten(graph), own), prepared=True)
+        copies = program.arguments(arguments, varying=len(arguments))
+        program.finish(program.writer.write(rewrite(graph), copies), prepared=True)
         with torch.no_grad():
             _require_same(self(*arguments), graph(*arguments))
 
@@ -46,7 +46,7 @@ class NumberKernel:
         """The graph's results.
 
         Raises:
-            ValueError: arguments of other shapes, or other integers than in the examples.
+            ValueError: the arguments have other shapes, or other integers, than the examples.
         """
         results = self._program.new_results()
         self._program.run(self._program.repeated, arguments, results)
@@ -54,14 +54,14 @@ class NumberKernel:
 
 
 class ScanKernel:
-    """`Scan` of two graphs as a program: what all steps share is computed once.
+    """A `Scan` of two graphs as a program; computations that all steps share run once.
 
     Args:
-        prepare: of the state.
-        step: (*state, *columns at its time, x, *prepared) ↦ (x', *kept, *summed).
-        arguments: (*state, *columns, x₀), columns over some steps, of which calls may have others.
-        columns: how many there are.
-        sums: how many of the step's results, the last ones, are summed over the steps.
+        prepare: state ↦ the tensors that all steps share.
+        step: (*state, *columns at its time, x, *prepared) ↦ (x', *outputs, *summed outputs).
+        arguments: examples (*state, *columns, x₀); calls may have another number of steps.
+        columns: the number of columns.
+        sums: the number of summed outputs.
 
     Raises:
         NotImplementedError, CompilationError: as NumberKernel.
@@ -74,9 +74,9 @@ class ScanKernel:
         self._columns = columns
         examples = [*state, *(column[0] for column in moving), x0]
         self._program = program = AssembledProgram(examples)
-        own = program.arguments(examples, varying=columns + 1)
-        shared = program.writer.write(rewritten(prepare), own[: len(state)])
-        program.finish(program.writer.write(rewritten(step), [*own, *shared]), sums)
+        copies = program.arguments(examples, varying=columns + 1)
+        shared = program.writer.write(rewrite(prepare), copies[: len(state)])
+        program.finish(program.writer.write(rewrite(step), [*copies, *shared]), sums)
         if not program.is_scan(columns):
             raise NotImplementedError("a scan of an empty batch, or of a state whose shape changes")
         with torch.no_grad():
@@ -85,22 +85,22 @@ class ScanKernel:
         _require_same(self(*state, *first, x0), expected)
 
     def __call__(self, *arguments: Tensor) -> list[Tensor]:
-        """What each step keeps, stacked over time, and the sums.
+        """The outputs of the steps stacked over time, and the sums.
 
         Raises:
-            ValueError: as NumberKernel; or columns of other lengths than each other.
+            ValueError: as NumberKernel; or the columns differ in length.
         """
         program, dtype, (state, moving, x0) = self._program, self._program.dtype, _split(arguments, self._columns)
         following, *others = program.result_shapes
-        kept, summed = others[: len(others) - program.sums], others[len(others) - program.sums :]
-        results = [torch.empty(len(moving[0]), *shape, dtype=dtype) for shape in kept]
+        stacked, summed = others[: len(others) - program.sums], others[len(others) - program.sums :]
+        results = [torch.empty(len(moving[0]), *shape, dtype=dtype) for shape in stacked]
         results += [torch.zeros(shape, dtype=dtype) for shape in summed]
         program.scan(state, moving, x0, torch.empty(2, *following, dtype=dtype), results)
         return results
 
 
 def kernel_or_none(write: Callable[[], Kernel]) -> Kernel | None:
-    """What is written; None where the function has no trace, an operation no rule, or there is no compiler."""
+    """The kernel that `write` returns; None without a trace, a rule for each operation, or a compiler."""
     try:
         return write()
     except (LyapnetError, NotImplementedError, RuntimeError, TypeError, ValueError):
@@ -114,7 +114,7 @@ def _split(arguments: Sequence[Tensor], columns: int) -> tuple[Sequence[Tensor],
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """The results for several parts, in their order, on as many threads as torch has: programs leave Python's lock."""
+    """The results for several parts in their order, on as many threads as torch uses: programs release the GIL."""
     count = min(torch.get_num_threads(), len(parts))
     if count < 2:
         return [function(part) for part in parts]
@@ -123,7 +123,7 @@ def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> lis
 
 
 def _require_same(results: Sequence[Tensor], expected: Sequence[Tensor]) -> None:
-    """Hold a program against its graph up to a third of the digits: a rule that is wrong is not to be trained with."""
+    """Compare a program with its graph up to a third of the digits, so that no wrong rule is used in training."""
     for result, value in zip(results, expected, strict=True):
         if not are_close(result, value.to(result.dtype), THIRD):
             raise NotImplementedError("another result than torch's")

@@ -1,4 +1,4 @@
-"""Traced graphs in fewer operations, where the kernel has one for several."""
+"""Rewrites traced graphs in fewer operations, where the kernel has one operation for several."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -9,8 +9,8 @@ from torch.fx import Graph, GraphModule, Node
 aten = torch.ops.aten
 
 
-def rewritten(graph_module: GraphModule) -> GraphModule:
-    """The same function, with tanh a for 2σ(2a) − 1, as networks have it for torch, and x for x¹."""
+def rewrite(graph_module: GraphModule) -> GraphModule:
+    """The same function, with tanh a instead of 2σ(2a) − 1, which lyapnet's networks use, and x instead of x¹."""
     graph = Graph()
     graph.output(graph.graph_copy(graph_module.graph, {}))
     for power in graph.find_nodes(op="call_function", target=aten.pow.Tensor_Scalar):
@@ -20,13 +20,13 @@ def rewritten(graph_module: GraphModule) -> GraphModule:
         a = _half_of(sigmoid.args[0])
         if a is not None:
             with graph.inserting_after(sigmoid):
-                _put_tanh(graph, sigmoid, graph.call_function(aten.tanh.default, (a,)))
+                _insert_tanh(graph, sigmoid, graph.call_function(aten.tanh.default, (a,)))
     graph.eliminate_dead_code()
     return GraphModule(graph_module, graph)
 
 
-def _put_tanh(graph: Graph, sigmoid: Node, tanh: Node) -> None:
-    """tanh a in the place of 2σ − 1, and g(1 − tanh² a) in that of its derivative 2(2g)σ(1 − σ), with σ = σ(2a)."""
+def _insert_tanh(graph: Graph, sigmoid: Node, tanh: Node) -> None:
+    """Replace 2σ − 1 by tanh a, and its derivative 2(2g)σ(1 − σ) by g(1 − tanh² a), where σ = σ(2a)."""
     for doubled in _doubles_of(sigmoid):
         for node in list(doubled.users):
             if node.target is aten.sub.Tensor and node.args == (doubled, 1) and not node.kwargs:
@@ -45,7 +45,7 @@ def _doubles_of(x: Node) -> Iterator[Node]:
 
 
 def _half_of(node: Any) -> Node | None:
-    """x, where a node is 2x."""
+    """x if a node is 2x, else None."""
     if not isinstance(node, Node) or node.target not in (aten.mul.Tensor, aten.mul.Scalar):
         return None
     x, factor = node.args[:2]

@@ -1,4 +1,4 @@
-"""What each of torch's operators is in a program on tensors: (writer, result, *arguments) writes instructions."""
+"""Rules that write torch's operators as instructions: a rule is called with (writer, result, *arguments)."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,7 +11,14 @@ from lyapnet.graphs.number_kernel.program import Place
 from lyapnet.graphs.number_kernel.writing import Number, Writer
 from lyapnet.graphs.operators import Rules
 
-OF_MEMORY = {"memory_format", "dtype", "layout", "device", "pin_memory", "non_blocking"}  # options without a part in it
+OF_MEMORY = {
+    "memory_format",
+    "dtype",
+    "layout",
+    "device",
+    "pin_memory",
+    "non_blocking",
+}  # options without an effect on numbers
 POWERS = {-1: "reciprocal", 1: "copy", 2: "square", 3: "cube", 0.5: "sqrt", -0.5: "rsqrt"}
 
 
@@ -24,20 +31,20 @@ def _elementwise(operation: str) -> Callable[..., None]:
     return write
 
 
-def _same(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
+def _clone(writer: Writer, out: Tensor, x: Tensor, **options: Any) -> None:
     if options.keys() - OF_MEMORY:
         raise NotImplementedError(f"a copy with {', '.join(options)}")
     _copy(writer, out, x)
 
 
 def _copy(writer: Writer, out: Tensor, x: Number) -> None:
-    """x as torch stores it in the type of the result."""
+    """Copy x, converted to the type of the result as in torch."""
     given = x.dtype if isinstance(x, Tensor) else None
     if out.dtype == torch.bool and given != torch.bool:
         writer.elementwise("truth", out, x)
     elif out.dtype == torch.int64 and given not in (torch.int64, torch.bool):
         writer.elementwise("trunc", out, x)
-        writer.elementwise("add", out, out, 0)  # an integer has one zero
+        writer.elementwise("add", out, out, 0)  # −0.0 becomes 0.0, since integers have one zero
     else:
         writer.elementwise("copy", out, x)
 
@@ -67,7 +74,7 @@ def _subtract_from(writer: Writer, out: Tensor, x: Number, y: Number, alpha: flo
 
 
 def _divide(writer: Writer, out: Tensor, x: Number, y: Number, rounding_mode: str | None = None) -> None:
-    if rounding_mode == "floor":  # which is not ⌊x/y⌋ where x/y is rounded up to an integer
+    if rounding_mode == "floor":  # ⌊x/y⌋ would be wrong where x/y is rounded up to an integer
         raise NotImplementedError("a floor division")
     writer.elementwise("div", out, x, y)
     if rounding_mode is not None:
@@ -99,7 +106,7 @@ def _masked_fill(writer: Writer, out: Tensor, x: Tensor, mask: Tensor, value: Nu
 
 
 def _logical(operation: str) -> Callable[..., None]:
-    """Of truths; not of the bits of integers."""
+    """A rule for booleans, not for the bits of integers."""
 
     def write(writer: Writer, out: Tensor, x: Number, y: Number) -> None:
         if any(not isinstance(each, Tensor) or each.dtype != torch.bool for each in (out, x, y)):
@@ -145,7 +152,7 @@ def _index_of_extreme(operation: str) -> Callable[..., None]:
 
 
 def _extreme(reduced: str, start: float, index: str) -> Callable[..., None]:
-    """max and min, of all or along an axis with their index."""
+    """A rule for max or min: of all entries, or along an axis with the index."""
 
     def write(writer: Writer, out: Any, x: Tensor, dim: int | None = None, keepdim: bool = False) -> None:
         if dim is None:
@@ -171,8 +178,8 @@ def _scatter(writer: Writer, out: Tensor, x: Tensor, dim: int, index: Tensor, va
     writer.program.index(index.shape, axis, x.shape[axis], writer.place(out), given, at, into=True)
 
 
-def _truth_of(extreme: str) -> Callable[..., None]:
-    """any and all, as the largest and the least of truths."""
+def _reduction_of_booleans(extreme: str) -> Callable[..., None]:
+    """A rule for any or all: the largest or least of booleans."""
 
     def write(writer: Writer, out: Tensor, x: Tensor, dim: Any = None, keepdim: bool = False) -> None:
         truths = x if x.dtype == torch.bool else writer.new_tensor(x)
@@ -223,7 +230,7 @@ def _active_set(writer: Writer, out: Tensor, b: Tensor, R: Tensor, low: Tensor, 
 def _concatenate(writer: Writer, out: Tensor, parts: Sequence[Tensor], dim: int = 0) -> None:
     first = 0
     for part in parts:
-        if part.ndim == out.ndim:  # torch lets an empty vector pass
+        if part.ndim == out.ndim:  # torch also accepts empty vectors, which are skipped
             writer.elementwise("copy", out.narrow(dim, first, part.shape[dim]), part)
             first += part.shape[dim]
 
@@ -253,12 +260,12 @@ def _slice_scatter(
 
 
 def _backward_of(scatter: Callable[..., None]) -> Callable[..., None]:
-    """The costate at the places that were taken, and zeros elsewhere."""
+    """A rule for the backward operator: the costate at the selected places, and zeros elsewhere."""
     return lambda writer, out, costate, sizes, *places: scatter(writer, out, 0, costate, *places)
 
 
 def _positions(x: Tensor) -> Tensor:
-    """Where each entry of a tensor is, in numbers from its first."""
+    """The position of each entry of a tensor in memory, counted in numbers from the first."""
     positions = torch.zeros((), dtype=torch.int64)
     for axis, (size, stride) in enumerate(zip(x.shape, x.stride(), strict=True)):
         shape = [1] * x.ndim
@@ -270,11 +277,11 @@ def _positions(x: Tensor) -> Tensor:
 def _require_constant(writer: Writer, *given: Any) -> None:
     for each in tree_leaves(given):
         if isinstance(each, Tensor) and writer.is_written(each):
-            raise NotImplementedError("places that depend on arguments")
+            raise NotImplementedError("indices that depend on arguments")
 
 
-def _arranged(target: Any) -> Callable[..., None]:
-    """What puts entries of its first argument into other places, and zeros beside them."""
+def _rearrangement(target: Any) -> Callable[..., None]:
+    """A rule for an operator that moves entries of its first argument, and puts zeros elsewhere."""
 
     def write(writer: Writer, out: Tensor, x: Tensor, *options: Any, **named: Any) -> None:
         _require_constant(writer, options, named)
@@ -311,15 +318,15 @@ def _put(writer: Writer, out: Tensor, x: Tensor, to: Tensor, values: Tensor, add
     writer.program.move(writer.place(out), to.flatten(), place, source.flatten(), add)
 
 
-ARRANGED = {
+REARRANGEMENTS = {
     "index": torch.ops.aten.index.Tensor, "index_select": torch.ops.aten.index_select.default,
     "flip": torch.ops.aten.flip.default, "roll": torch.ops.aten.roll.default,
     "repeat": torch.ops.aten.repeat.default, "tril": torch.ops.aten.tril.default, "triu": torch.ops.aten.triu.default,
 }  # fmt: skip
 
 RULES = Rules("numbers", lambda row: None if row.instruction is None else _elementwise(row.name), {
-    **{name: _arranged(target) for name, target in ARRANGED.items()},
-    **dict.fromkeys(("_to_copy", "clone", "contiguous", "lift_fresh_copy"), _same),
+    **{name: _rearrangement(target) for name, target in REARRANGEMENTS.items()},
+    **dict.fromkeys(("_to_copy", "clone", "contiguous", "lift_fresh_copy"), _clone),
     "add": _add,
     "sub": _subtract,
     "rsub": _subtract_from,
@@ -348,8 +355,8 @@ RULES = Rules("numbers", lambda row: None if row.instruction is None else _eleme
     "argmin": _index_of_extreme("index_of_least"),
     "gather": _gather,
     "scatter": _scatter,
-    "any": _truth_of("amax"),
-    "all": _truth_of("amin"),
+    "any": _reduction_of_booleans("amax"),
+    "all": _reduction_of_booleans("amin"),
     "mean": _mean,
     "mm": _matrix_product,
     "bmm": _matrix_product,

@@ -1,7 +1,7 @@
-"""Traced graphs written as programs on tensors, node by node.
+"""Writes traced graphs as programs on tensors, node by node.
 
-Each node is run by torch once, on example arguments: what its result shares memory with is a view of that, and needs no
-instruction; how its result lies in memory is how the program keeps it.
+torch runs each node once, on example arguments. A result that shares memory with an argument is a view, and needs no
+instruction. The program stores each result with the same strides as torch.
 """
 
 import math
@@ -26,26 +26,26 @@ class Writer:
     """Writes graphs into one program.
 
     Args:
-        program: to write into.
+        program: receives the instructions.
         width: numbers in a row of a panel of packed columns.
-        rules: by the names of operators, what writes (writer, result, *arguments).
+        rules: operator name ↦ a function (writer, result, *arguments) that writes instructions.
     """
 
     def __init__(self, program: Program, width: int, rules: Mapping[str, Callable[..., None]]):
         self.program, self.width, self.rules = program, width, rules
-        self._buffers = dict[int, int]()  # by the address of a tensor's memory
+        self._buffers = dict[int, int]()  # address of a tensor's memory ↦ buffer
         self._constants = dict[Any, int]()
-        self._kept: list[Any] = []  # whose addresses are not to be taken by others
+        self._alive: list[Any] = []  # tensors that are kept so that their addresses are not used again
 
     def argument(self, example: Tensor, varies: bool) -> int:
-        """The buffer of an argument of numbers or truths, which lies in memory as the example does."""
+        """The buffer of an argument of numbers or booleans, with the strides of the example."""
         return self._new_buffer(example, varies, given=True)
 
     def write(self, graph: GraphModule, arguments: Sequence[Any]) -> list[Tensor]:
-        """The results of a graph, as torch computes them of the arguments, whose operations are written.
+        """Write the operations of a graph; return its results for these arguments, as torch computes them.
 
         Raises:
-            NotImplementedError: an operation has no rule, or arguments that its rule does not cover.
+            NotImplementedError: an operation has no rule, or no rule for its arguments.
         """
         values, given = dict[Node, Any](), iter(arguments)
         for node in graph.graph.nodes:
@@ -54,7 +54,7 @@ class Writer:
             elif node.op == "get_attr":
                 values[node] = getattr(graph, node.target).detach()
             elif node.op == "output":
-                self._kept.append(values)
+                self._alive.append(values)
                 results = map_arg(node.args[0], values.__getitem__)
                 return list(results) if isinstance(results, list | tuple) else [results]
             else:
@@ -63,24 +63,24 @@ class Writer:
         raise AssertionError("a graph ends with its output")
 
     def _result(self, target: Any, inputs: Any, keywords: Any) -> Any:
-        if target is torch.ops.aten.view.default:  # arguments are in line here, whatever they were in the trace
+        if target is torch.ops.aten.view.default:  # arguments are contiguous here, but perhaps not in the trace
             target = torch.ops.aten.reshape.default
         result = target(*inputs, **keywords)
         sources = [each for each in tree_leaves((inputs, keywords)) if isinstance(each, Tensor)]
         known = [each for each in sources if self.is_written(each)]
         if not known or name_of(target) in SHAPED:
             return result
-        made = [each for each in tree_leaves(result) if isinstance(each, Tensor)]
-        if any(self.is_written(each) and each.dtype not in {source.dtype for source in known} for each in made):
+        results = [each for each in tree_leaves(result) if isinstance(each, Tensor)]
+        if any(self.is_written(each) and each.dtype not in {source.dtype for source in known} for each in results):
             raise NotImplementedError("the bits of numbers as another type")
-        if all(self.is_written(each) or not each.numel() for each in made):
+        if all(self.is_written(each) or not each.numel() for each in results):
             return result
         rule = self.rules.get(name_of(target))
         if rule is None:
             return self._in_simpler_operators(target, inputs, keywords)
-        for out in made:
+        for out in results:
             self._new_buffer(out, any(self.varies(each) for each in known))
-        rule(self, made[0] if len(made) == 1 else made, *inputs, **keywords)
+        rule(self, results[0] if len(results) == 1 else results, *inputs, **keywords)
         return result
 
     def _in_simpler_operators(self, target: Any, inputs: Any, keywords: Any) -> Any:
@@ -101,14 +101,14 @@ class Writer:
     # --- For rules ---
 
     def is_written(self, tensor: Tensor) -> bool:
-        """Whether a tensor depends on arguments, or is a part of one; else it is a constant."""
+        """Whether a tensor depends on arguments; otherwise it is a constant."""
         return tensor.untyped_storage().data_ptr() in self._buffers and tensor.numel() > 0
 
     def varies(self, tensor: Tensor) -> bool:
         return self.program.buffers[self._buffers[tensor.untyped_storage().data_ptr()]].varies
 
     def place(self, value: Number, shape: Sequence[int] | None = None) -> Place:
-        """Where a tensor is, or a number that is in the program; repeated to a shape."""
+        """The place of a tensor or a number in the program, expanded to a shape."""
         if not isinstance(value, Tensor):
             value = torch.tensor(float(value), dtype=self.program.dtype)
             buffer = self._constant(("number", float(value), math.copysign(1, value)), value)
@@ -121,20 +121,20 @@ class Writer:
         return Place(buffer, int(value.storage_offset()), repeated.stride())
 
     def new_tensor(self, like: Tensor) -> Tensor:
-        """A tensor for what a rule keeps in between."""
-        made = torch.zeros(like.shape, dtype=self.program.dtype)
-        self._new_buffer(made, self.varies(like))
-        return made
+        """A tensor for an intermediate result of a rule."""
+        tensor = torch.zeros(like.shape, dtype=self.program.dtype)
+        self._new_buffer(tensor, self.varies(like))
+        return tensor
 
     def elementwise(self, operation: str, out: Tensor, *inputs: Number) -> None:
-        """out = operation(inputs), repeated to its shape."""
+        """out = operation(inputs), with the inputs expanded to the shape of out."""
         places = [self.place(each, out.shape) for each in inputs]
         self.program.elementwise(operation, out.shape, self.place(out), places)
 
     def _new_buffer(self, tensor: Tensor, varies: bool, given: bool = False) -> int:
         if tensor.dtype not in (self.program.dtype, torch.bool, torch.int64):
             raise NotImplementedError(f"numbers of {tensor.dtype} that depend on arguments")
-        self._kept.append(tensor)
+        self._alive.append(tensor)
         numbers = tensor.untyped_storage().nbytes() // tensor.itemsize
         buffer = self.program.new_buffer(numbers, varies, given=given)
         self._buffers[tensor.untyped_storage().data_ptr()] = buffer
@@ -142,7 +142,7 @@ class Writer:
 
     def _constant(self, key: Any, whole: Tensor) -> int:
         if key not in self._constants:
-            self._kept.append(whole)
+            self._alive.append(whole)
             copy = whole.to(self.program.dtype).clone().contiguous()
             self._constants[key] = self.program.new_buffer(copy.numel(), False, constant=copy)
         return self._constants[key]

@@ -232,7 +232,7 @@ def test_a_law_that_does_not_stabilise_has_no_region(tmp_path, capsys):
     result = certified(tmp_path, capsys, "--seconds=3", u=linear(-K))
     assert result["verdict"] != "certified"
     assert result["rho"] is None
-    assert "does not hold the goal" in result["reason"]
+    assert "does not stabilise the goal" in result["reason"]
 
 
 def test_V_and_u_swapped_have_no_region(tmp_path, capsys):

@@ -9,6 +9,7 @@ from lyapnet.claims.certificates import Certificate
 from lyapnet.claims.claim import Claim, Run
 from lyapnet.claims.costs import CostCertificate
 from lyapnet.claims.kinds import LowerBound
+from lyapnet.claims.preconditions import require_no_noise
 from lyapnet.claims.two_sided import TwoSidedCertificate
 from lyapnet.controller.controller import Controller
 from lyapnet.controller.loading import load
@@ -62,6 +63,8 @@ def certify(
     above = [claim for claim in claims if not isinstance(claim, LowerBound)]
     for claim in claims:
         run.require_used_by(claim)
+        if not claim.allows_noise:
+            require_no_noise(controller.problem, claim.kind)
     if len(claims) == 1:
         certificate = claims[0].establish(controller, run)
     elif len(above) == len(below) == 1 and above[0].share_of_two is not None:

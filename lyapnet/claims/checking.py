@@ -19,7 +19,7 @@ from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
 from lyapnet.claims.plants import plants_of
-from lyapnet.claims.preconditions import over_time
+from lyapnet.claims.preconditions import over_time, require_no_noise
 from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
@@ -48,6 +48,7 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
         kind, reprove = kind_of(path)
+        require_no_noise(controller.problem, kind)
         found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report)
         numbers, reason = found.numbers, found.reason
         share = found.seconds / found.searched if found.searched > 0 else None

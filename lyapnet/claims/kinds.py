@@ -39,6 +39,7 @@ class Sampled(Claim):
 
     kind: ClassVar[str] = "sampled"
     means: ClassVar[Sequence[str]] = ()
+    allows_noise: ClassVar[bool] = True
 
     samples: int = option(100, "Initial states to draw.", at_least=1, remedy="choose how many")
     radius: float | None = option(None, RADIUS, at_least=0, remedy=NORM)
@@ -50,7 +51,7 @@ class Sampled(Claim):
 
         require_goal(controller.problem, self.kind)
         tolerances = controller.program.tolerances(self.radius)
-        found = count_successes(controller.rollout, controller.problem, tolerances, self.samples, run.generator)
+        found = count_successes(controller.closed_loops, controller.problem, tolerances, self.samples, run.generator)
         return SampledCertificate(controller, found, run.options(self))
 
 
@@ -60,6 +61,7 @@ class Statistical(Claim):
 
     kind: ClassVar[str] = "statistical"
     means: ClassVar[Sequence[str]] = ()
+    allows_noise: ClassVar[bool] = True
 
     samples: int = option(10_000, "Initial states to draw.", at_least=1, remedy="choose how many")
     confidence: float = option(1 - 1e-6, "Confidence of the bound.", above=0, below=1, remedy="for example 0.999999")
@@ -77,7 +79,7 @@ class Statistical(Claim):
         require_goal(controller.problem, self.kind)
         tolerances = controller.program.tolerances(self.radius)
         found = bound_share(
-            controller.rollout, controller.problem, tolerances, self.samples, self.confidence, self.share,
+            controller.closed_loops, controller.problem, tolerances, self.samples, self.confidence, self.share,
             run.generator, draws=self.draws,
         )  # fmt: skip
         return StatisticalCertificate(controller, found, run.options(self))

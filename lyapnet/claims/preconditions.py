@@ -139,6 +139,22 @@ def require_goal(problem: Problem, claim: str) -> None:
         )
 
 
+def require_no_noise(problem: Problem, claim: str) -> None:
+    """Refuse a claim about the closed loop without noise, for a task that has some.
+
+    Args:
+        claim: the name of the certificate, for the message.
+
+    Raises:
+        UsageError: the task has noise.
+    """
+    if problem.noise is not None:
+        raise UsageError(
+            f"Expected a task without noise for a {claim} certificate, got one with noise, under which nothing is "
+            "sure; lyapnet certify statistical draws the noise too."
+        )
+
+
 def _close(one: Tensor, other: Tensor) -> bool:
     return one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6 * float(other.abs().max()))
 

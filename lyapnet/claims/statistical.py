@@ -15,6 +15,7 @@ from lyapnet.loop.programs import EVENTS, Tolerances
 from lyapnet.loop.programs.terms import hinge, satisfied
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.prover.verdict import Verdict
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 
 
@@ -121,17 +122,17 @@ def lower_bound(successes: int, samples: int, confidence: float) -> float:
 
 
 def count_successes(
-    rollout: Callable[[State], Trajectory],
+    rollout: Callable[[State, Increments | None], Trajectory],
     problem: Problem,
     tolerances: Tolerances,
     samples: int = 100,
     generator: torch.Generator | None = None,
     batch: int = 1000,
 ) -> CountedSuccesses:
-    """Count successes among fresh random states of X₀; the paper takes 100.
+    """Count successes among fresh random states of X₀, each with one path of the noise; the paper takes 100.
 
     Args:
-        rollout: closed loops under the control law of a V.
+        rollout: closed loops under the control law of a V, from states and the increments of the noise, if any.
         problem: gives X₀, the goal and the constraints.
         batch: the number of states that are rolled out at once, to limit the memory.
 
@@ -143,12 +144,21 @@ def count_successes(
     require_memory("samples", samples, NUMBER * samples * problem.system.n, "draw fewer")
     x0 = problem.initial_states.sample(samples, generator)
     tolerances = replace(tolerances, constraints=problem.constraints is not None)
-    held = torch.cat([_events(rollout, part, tolerances, problem) for part in x0.split(batch)])
+    draw = torch.default_generator if generator is None else generator
+    held = torch.cat(
+        [_events(rollout, part, _increments(problem, part, draw), tolerances, problem) for part in x0.split(batch)]
+    )
     return CountedSuccesses(x0.cpu(), held, tolerances)
 
 
+def _increments(problem: Problem, x0: State, generator: torch.Generator) -> Increments | None:
+    """One path of the noise from each state; None without noise."""
+    noise, horizon = problem.noise, problem.horizon
+    return None if noise is None else noise.draw(horizon.steps, horizon.dt, x0, generator)
+
+
 def bound_share(
-    rollout: Callable[[State], Trajectory],
+    rollout: Callable[[State, Increments | None], Trajectory],
     problem: Problem,
     tolerances: Tolerances,
     samples: int = 10_000,
@@ -178,7 +188,11 @@ FEWEST = 16  # a batch of so many states, one of which diverges, is not divided 
 
 
 def _events(
-    rollout: Callable[[State], Trajectory], x0: State, tolerances: Tolerances, problem: Problem
+    rollout: Callable[[State, Increments | None], Trajectory],
+    x0: State,
+    increments: Increments | None,
+    tolerances: Tolerances,
+    problem: Problem,
 ) -> Bool[Tensor, "samples events"]:
     """Which of EVENTS hold from each state.
 
@@ -187,11 +201,16 @@ def _events(
     """
     try:
         with torch.no_grad():
-            trajectory = rollout(x0)
+            trajectory = rollout(x0, increments)
     except DivergenceError:
         if len(x0) <= FEWEST:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)
-        return torch.cat([_events(rollout, half, tolerances, problem) for half in x0.tensor_split(2)])
+        halves = x0.tensor_split(2)  # each state keeps its path of the noise: a new one would be a second chance
+        paths = (None, None) if increments is None else increments.tensor_split(2, 1)
+        return torch.cat(
+            [_events(rollout, half, path, tolerances, problem) for half, path in zip(halves, paths, strict=True)]
+        )
+    J, trajectory = trajectory.cost, trajectory.compensated()  # V decreases in expectation; a cost is that of a path
     values = trajectory.require_value()
     decrease = terminal = constraints = torch.ones_like(values[0], dtype=torch.bool)
     if tolerances.decrease is not None:
@@ -200,6 +219,6 @@ def _events(
         terminal = torch.linalg.vector_norm(problem.cost.from_goal(trajectory.x[-1]), dim=-1) <= tolerances.radius
     if problem.constraints is not None:
         constraints = problem.constraints.worst(trajectory.x).amax(0) <= 0
-    cost = trajectory.cost <= (1 + tolerances.cost) * values[0]
+    cost = (1 + tolerances.cost) * values[0] >= J
     single = torch.stack([decrease, terminal, cost, constraints], -1)
     return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()

@@ -302,7 +302,7 @@ class Controller:
         )
 
     @torch.no_grad()
-    def closed_loops(self, x0: Tensor, increments: Tensor, surprising: bool = True) -> Trajectory:
+    def closed_loops(self, x0: Tensor, increments: Tensor | None = None, surprising: bool = True) -> Trajectory:
         """The closed loops under given noise, see Rollout.forward."""
         return self._rollout(x0, increments, surprising)
 

@@ -6,7 +6,9 @@ import torch
 from torch.testing import assert_close
 
 import lyapnet
-from lyapnet.base.errors import OracleError, UsageError
+from lyapnet.base.errors import DivergenceError, OracleError, UsageError
+from lyapnet.claims.sampling_certificates import StatisticalCertificate
+from lyapnet.claims.statistical import count_successes
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
 from lyapnet.evaluation.oracles import oracle_of
@@ -229,3 +231,38 @@ def test_a_noise_of_the_wrong_shape_is_refused():
     cost = QuadraticCost([[1.0]], [[1.0]], [[1.0]])
     with pytest.raises(UsageError, match=r"noise\(x\)"):
         Problem(Wrong([[0.0]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), Horizon(5, 0.1, "euler")).check()
+
+
+def test_a_statistical_bound_draws_the_noise_and_proofs_refuse_it():
+    noisy, quiet = (controller_of(task(noise=noise)) for noise in (TASK["noise"], {}))
+    radius = 0.02
+    claim = lyapnet.Statistical(samples=400, radius=radius, confidence=0.99)
+    found, still = (lyapnet.certify(each, claim) for each in (noisy, quiet))
+    assert isinstance(found, StatisticalCertificate)
+    assert isinstance(still, StatisticalCertificate)
+    ends = noisy.rollout(noisy.initial_states.sample(4000, torch.Generator().manual_seed(5)), noise=7).x[-1]
+    expected = float((ends.norm(dim=-1) <= radius).double().mean())
+    assert found.claim.lower_bounds["terminal"] < expected < found.claim.successes["terminal"] / 400 + 0.1
+    assert still.claim.successes["terminal"] > found.claim.successes["terminal"]
+    for claim in (lyapnet.Funnel(), lyapnet.Tube(), lyapnet.LowerBound()):
+        with pytest.raises(UsageError, match="Expected a task without noise"):
+            lyapnet.certify(noisy, claim, budget=5)
+
+
+def test_a_path_that_diverges_is_not_drawn_again():
+    """The states of a batch that is halved keep their noise, and those beside the divergent one count as failures."""
+    problem = task()
+    controller, calls = controller_of(problem), []
+
+    def rollout(x0, increments):
+        calls.append((x0, increments))
+        if (x0[:, 0] > 0.98).any():
+            raise DivergenceError("a state")
+        return controller.closed_loops(x0, increments)
+
+    count_successes(rollout, problem, controller.program.tolerances(1.0), 200, torch.Generator().manual_seed(0))
+    whole = {tuple(x.tolist()): w for x, w in zip(calls[0][0], calls[0][1].unbind(1), strict=True)}
+    assert len(calls) > 2
+    for x0, increments in calls:
+        for x, w in zip(x0, increments.unbind(1), strict=True):
+            assert torch.equal(whole[tuple(x.tolist())], w)

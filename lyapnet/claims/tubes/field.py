@@ -54,8 +54,8 @@ class Field:
         nodes = {t for module in self.loop.modules() if isinstance(module, Curve) for t in module.nodes.tolist()}
         return sorted(t for t in {*nodes, *(t - dt for t in nodes)} if 0 < t < duration)
 
-    def whole(self, x: State) -> State:
-        """All n states, with 0 for the ignorable ones."""
+    def whole(self, x: Tensor) -> State:
+        """All n states from the seen ones (*batch, seen), with 0 for the ignorable ones."""
         return x if self.n == len(self._embedding[0]) else x @ self._embedding
 
     def _defect(self, t: Tensor, y: Tensor) -> tuple[Tensor, ...]:

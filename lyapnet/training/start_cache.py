@@ -82,6 +82,8 @@ def _cache_file(learners: Sequence[Learner], may_look_ahead: bool) -> Path | Non
     functions = [(lambda x, u: exact.step(x, u), (x, u)), (lambda x: (exact.cost.terminal(x),), (x,))]
     if exact.constraints is not None:
         functions.append((lambda x: (exact.constraints(x),), (x,)))  # pyright: ignore[reportOptionalCall]
+    if exact.noise is not None:
+        functions.append((lambda x: (exact.noise(x),), (x,)))  # pyright: ignore[reportOptionalCall]
     try:
         with torch.no_grad():
             graphs = [trace(function, arguments) for function, arguments in functions]

@@ -14,6 +14,7 @@ from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.task.domain import as_written
 from lyapnet.task.horizon import TABLEAUX
+from lyapnet.task.noise import Noise
 from lyapnet.task.operating_points import HELD
 from lyapnet.task.problem import Problem
 from lyapnet.training.candidates import ZERO_VALUE, Candidate, Start
@@ -67,6 +68,8 @@ def facts_of(
         tell(_system_fact(exact), *jump_facts(exact), *kink_facts(exact))
         if exact.domain is not None:
             tell(Fact("domain", str(exact.domain)))
+        if exact.noise is not None:
+            tell(_noise_fact(exact, exact.noise))
         if not exact.has_goal:
             tell(Fact("goal", f"none: {exact.no_goal}", f"nothing, if that is the task; else {NAME_A_GOAL}"))
         elif (around := linearised(exact)).missing_values is not None:
@@ -177,6 +180,18 @@ def _system_fact(problem: Problem) -> Fact:
         "system",
         f"{system.title}: {_format_count(system.n, 'state')}, {_format_count(system.m, 'control')}{limits}",
     )
+
+
+def _noise_fact(problem: Problem, noise: Noise) -> Fact:
+    """The strength of the noise of each state at the goal, and the cost of noise there by the linearised problem."""
+    system, strengths = problem.system, torch.linalg.vector_norm(noise(problem.goal), dim=-1).tolist()
+    listed = ", ".join(
+        f"{name} {strength:.3g}" for name, strength in zip(system.state_names, strengths, strict=True) if strength
+    )
+    found = f"{_format_count(noise.sources, 'source')}; per √s: {listed or 'none at the goal'}"
+    if problem.has_goal and not isinstance(around := riccati_or_reason(problem), Missing):
+        found += f"; from the goal it costs {float(around.value[0]):.4g} up to T"
+    return Fact("noise", found)
 
 
 def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:

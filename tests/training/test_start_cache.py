@@ -101,7 +101,7 @@ def test_facts_say_that_their_seconds_are_those_of_an_earlier_search():
 @pytest.mark.parametrize(
     "change",
     ["seed=1", "cost.R=[0.2]", "horizon.steps=21", "controls.upper=2", "initial_states.upper=[1,0.6]",
-     "system.parameters={length: 0.9}", "rollout.policy=lookahead", "network.hidden=[8]"],
+     "system.parameters={length: 0.9}", "rollout.policy=lookahead", "network.hidden=[8]", "noise={velocity: 0.1}"],
 )  # fmt: skip
 @pytest.mark.usefixtures("kept")
 def test_another_one_does_not(change, sought):

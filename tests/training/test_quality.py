@@ -2,9 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 
+import lyapnet
+from lyapnet.base.random_streams import TEST, stream
 from lyapnet.cli import main
+from lyapnet.evaluation.measurement import PAPER_STATES
+from tests.grid_solver import solve_on_grid
 
 pytestmark = pytest.mark.nightly
 
@@ -98,3 +103,15 @@ def test_a_hundredth_of_the_training_is_not_enough(tmp_path, capsys):
     result = trained("from_scratch/double_integrator", tmp_path, capsys, "training.iterations=1")
     assert result["cost_ratio"] > 1.05
     assert result["satisfied_fraction"] < 0.95
+
+
+def test_a_swing_up_under_noise_costs_what_a_grid_finds(tmp_path, capsys):
+    """The optimum by dynamic programming on a grid, an independent route; the law without training costs more."""
+    result = trained("pendulum_noise", tmp_path, capsys)
+    controller = lyapnet.load(f"{tmp_path}/pendulum_noise/version_0/checkpoints/best.ckpt")
+    optimum = solve_on_grid(controller.problem, [-1.5, -8], [4.5, 4], 101, np.linspace(-16, 10, 40))
+    x0 = controller.initial_states.sample(result["samples"] + PAPER_STATES, stream(result["seed"], TEST))
+    least = float(optimum(x0[: result["samples"]]).mean())
+    assert 0.998 <= result["cost_mean"] / least <= 1.01
+    assert abs(result["value_mean"] / least - 1) <= 0.005
+    assert result["lqr_cost_mean"] > 1.5 * least

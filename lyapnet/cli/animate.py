@@ -42,7 +42,8 @@ def animate(
         except ValueError as error:
             raise UsageError(f"Expected --from as numbers, got {start!r}; as in --from 0.5,-0.2.") from error
     given.report("animating")
-    film = Film(controller.rollout(x0), controller.problem, controller.value, rate, speed)
+    noise = None if controller.problem.noise is None else seed
+    film = Film(controller.rollout(x0, noise=noise), controller.problem, controller.value, rate, speed)
     film.write(out)
     given.report.rest()
     Console(highlight=False, markup=False).print(f"wrote {out}", soft_wrap=True)

@@ -302,9 +302,9 @@ class Controller:
         )
 
     @torch.no_grad()
-    def closed_loops(self, x0: Tensor, increments: Tensor | None = None, surprising: bool = True) -> Trajectory:
+    def closed_loops(self, x0: Tensor, increments: Tensor | None = None, with_surprises: bool = True) -> Trajectory:
         """The closed loops under given noise, see Rollout.forward."""
-        return self._rollout(x0, increments, surprising)
+        return self._rollout(x0, increments, with_surprises)
 
     def _increments(self, x0: Tensor, steps: int | None, given: Tensor | int | None) -> Tensor | None:
         """ΔW of each step from a batch of states; None without noise."""

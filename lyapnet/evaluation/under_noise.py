@@ -53,7 +53,7 @@ def measure_under_noise(
     for path in range(paths):
         progress(path, paths)
         noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
-        trajectory = controller.closed_loops(x0, noise, surprising=path == 0)
+        trajectory = controller.closed_loops(x0, noise, with_surprises=path == 0)
         tables.append(measure(problem, controller.program, trajectory))
         plain.append(trajectory.cost)
         other = costs_of_lqr(problem, x0, noise)

@@ -68,8 +68,8 @@ def bounded_problem(
         control_scale: max |u_i| in the units of the control, one for each; known for the reference tasks.
 
     Raises:
-        UsageError: no such task or file, none, or one with state constraints; or no scale, one of another length, or
-            one that is not positive.
+        UsageError: no such task or file, none, or one with state constraints or noise; or no scale, one of another
+            length, or one that is not positive.
     """
     given = [control_scale] if isinstance(control_scale, int | float) else control_scale
     scale = CONTROL_SCALES.get(str(task)) if given is None else given
@@ -78,6 +78,11 @@ def bounded_problem(
         raise UsageError(
             "Expected a task without state constraints for an environment, got some; its reward does not know of them: "
             "leave constraints out."
+        )
+    if built.noise is not None:
+        raise UsageError(
+            "Expected a task without noise for an environment, got some; its steps and the methods compared know none: "
+            "leave noise out."
         )
     m, names = built.system.m, ", ".join(built.system.control_labels)
     if scale is None:

@@ -157,12 +157,12 @@ class Rollout(nn.Module):
             steps, dt = self.horizon.steps, self.horizon.dt
             self.discrete = DiscreteAdjoint(self.stepped, steps, dt, step, costate_limit)
 
-    def forward(self, x0: State, increments: Increments | None = None, surprising: bool = True) -> Trajectory:
+    def forward(self, x0: State, increments: Increments | None = None, with_surprises: bool = True) -> Trajectory:
         """The closed loop from x₀ (*batch, n).
 
         Args:
             increments: ΔW of each step (N, *batch, k), see Noise.draw; None: the loop without its noise.
-            surprising: whether to compute the surprises, for which V is evaluated at 2k states in each step.
+            with_surprises: whether to compute the surprises, for which V is evaluated at 2k states in each step.
 
         Raises:
             ValueError: increments of another shape, for a problem without noise, or with another gradient.
@@ -182,7 +182,7 @@ class Rollout(nn.Module):
         if increments is None or noise is None or V is None:
             return trajectory
         trajectory = trajectory._replace(martingale=martingale(V, noise, t, x.detach(), increments))
-        if surprising:
+        if with_surprises:
             value = trajectory.require_value()
             trajectory = trajectory._replace(surprise=surprises(V, noise, t, x, value, increments))
         return trajectory

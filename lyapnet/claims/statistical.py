@@ -122,7 +122,7 @@ def lower_bound(successes: int, samples: int, confidence: float) -> float:
 
 
 def count_successes(
-    rollout: Callable[[State, Increments | None], Trajectory],
+    rollout: Callable[..., Trajectory],
     problem: Problem,
     tolerances: Tolerances,
     samples: int = 100,
@@ -158,7 +158,7 @@ def _increments(problem: Problem, x0: State, generator: torch.Generator) -> Incr
 
 
 def bound_share(
-    rollout: Callable[[State, Increments | None], Trajectory],
+    rollout: Callable[..., Trajectory],
     problem: Problem,
     tolerances: Tolerances,
     samples: int = 10_000,
@@ -188,7 +188,7 @@ FEWEST = 16  # a batch of so many states, one of which diverges, is not divided 
 
 
 def _events(
-    rollout: Callable[[State, Increments | None], Trajectory],
+    rollout: Callable[..., Trajectory],
     x0: State,
     increments: Increments | None,
     tolerances: Tolerances,
@@ -201,7 +201,7 @@ def _events(
     """
     try:
         with torch.no_grad():
-            trajectory = rollout(x0, increments)
+            trajectory = rollout(x0) if increments is None else rollout(x0, increments)
     except DivergenceError:
         if len(x0) <= FEWEST:
             return torch.zeros(len(x0), len(EVENTS), dtype=torch.bool)

@@ -52,8 +52,6 @@ class ArrayTrajectory(NamedTuple):
     running_cost: np.ndarray  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: np.ndarray  # (*batch,): φ(x_N)
     value: np.ndarray  # (N + 1, *batch): V(t_n, x_n)
-    surprise: np.ndarray | None = None  # (N, *batch): V_{n+1} − E[V_{n+1} | x_n]; None without noise
-    martingale: np.ndarray | None = None  # (*batch,): Σ_n V_xᵀσΔW, of mean zero; None without noise
 
     def require_value(self) -> np.ndarray:
         """V along the trajectory."""
@@ -411,4 +409,4 @@ def _law_of(problem: Problem, V: ValueFunction) -> type[ValuePolicy]:
 
 
 def _in_form_of(given: Any, result: Any) -> Any:
-    return result if result is None or isinstance(given, Tensor) else result.detach().cpu().numpy()
+    return result if isinstance(given, Tensor) else result.detach().cpu().numpy()

@@ -163,7 +163,8 @@ def test_a_rollout_takes_a_seed_or_increments():
     quiet = controller.rollout(x0)
     assert torch.equal(controller.rollout(x0, noise=torch.zeros(30, 1, 1)).x, quiet.x)
     arrays = controller.rollout(x0.numpy(), noise=0)
-    assert isinstance(arrays.martingale, np.ndarray)
+    assert isinstance(arrays.x, np.ndarray)
+    assert_close(torch.tensor(arrays.x), first.x)
     with pytest.raises(ValueError, match="Expected no noise for a task without"):
         controller_of(task(noise={})).rollout(x0, noise=0)
     with pytest.raises(ValueError, match="steps of the horizon with noise"):

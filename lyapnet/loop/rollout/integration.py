@@ -25,8 +25,6 @@ class Trajectory(NamedTuple):
     running_cost: ValuePath  # (N + 1, *batch): ∫ℓ up to t_n
     terminal_cost: PerState  # (*batch,): φ(x_N)
     value: ValuePath | None  # (N + 1, *batch): V(t_n, x_n), if a V defines the control law
-    surprise: StepPath | None = None  # (N, *batch): V_{n+1} − E[V_{n+1} | x_n]; None without noise
-    martingale: PerState | None = None  # (*batch,): Σ_n V_xᵀσΔW, of mean zero; None without noise
 
     def require_value(self) -> ValuePath:
         """V along the trajectory.
@@ -45,26 +43,55 @@ class Trajectory(NamedTuple):
 
     @property
     def expected_cost(self) -> PerState:
-        """A sample of E J_N given x₀: J_N, with noise less the martingale, which has the same mean and varies less."""
-        return self.cost if self.martingale is None else self.cost - self.martingale
+        """A sample of E J_N given x₀; without noise J_N itself."""
+        return self.cost
 
     def compensated(self) -> "Trajectory":
-        """The trajectory without the unpredicted part of V, so that programs see expectations over each step.
-
-        With the surprises D_n, V_n − Σ_{k<n} D_k replaces V_n and φ − Σ D_k replaces φ. Then V_{n+1} − V_n becomes
-        E[V_{n+1} | x_n] − V_n, and V_n minus the cost to go becomes the sum of the expected residuals from t_n on,
-        which is zero on every path if V is the cost to go. Squares of these have no floor from the noise.
-        """
-        if self.surprise is None:
-            return self
-        value, total = self.require_value(), self.surprise.sum(0)
-        before = torch.cat([torch.zeros_like(value[:1]), self.surprise.cumsum(0)])
-        return self._replace(value=value - before, terminal_cost=self.terminal_cost - total, surprise=None)
+        """The trajectory without the unpredicted part of V; without noise itself."""
+        return self
 
     @property
     def step_cost(self) -> Any:
         """∫ℓ over each step by the integrator's quadrature, (N, *batch); with Euler, Δt ℓ(x_n, u_n)."""
         return self.running_cost[1:] - self.running_cost[:-1]
+
+
+class NoisyTrajectory(Trajectory):
+    """A batch of trajectories under noise, with what the noise does to V.
+
+    Attributes:
+        martingale: M = Σ_n V_xᵀσΔW, (*batch,), of mean zero.
+        surprise: D_n = V_{n+1} − E[V_{n+1} | x_n], (N, *batch), of mean zero; None if it was not computed.
+    """
+
+    martingale: PerState
+    surprise: StepPath | None
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, martingale: PerState, surprise: StepPath | None) -> "NoisyTrajectory":
+        """A trajectory with the effects of its noise."""
+        own = cls(*trajectory)
+        own.martingale, own.surprise = martingale, surprise
+        return own
+
+    @property
+    def expected_cost(self) -> PerState:
+        """J_N − M, which has the mean of J_N and varies less."""
+        return self.cost - self.martingale
+
+    def compensated(self) -> Trajectory:
+        """The trajectory without the unpredicted part of V, so that programs see expectations over each step.
+
+        V_n − Σ_{k<n} D_k replaces V_n and φ − Σ D_k replaces φ. Then V_{n+1} − V_n becomes E[V_{n+1} | x_n] − V_n, and
+        V_n minus the cost to go becomes the sum of the expected residuals from t_n on, which is zero on every path if V
+        is the cost to go. Squares of these have no floor from the noise.
+        """
+        if self.surprise is None:
+            return self
+        value = self.require_value()
+        before = torch.cat([torch.zeros_like(value[:1]), self.surprise.cumsum(0)])
+        end = self.terminal_cost - self.surprise.sum(0)
+        return Trajectory(self.t, self.x, self.u, self.running_cost, end, value - before)
 
 
 FIXED_STEP_METHODS = tuple(TABLEAUX)
@@ -181,11 +208,10 @@ class Rollout(nn.Module):
         V, noise = self.closed_loop.V, self.problem.noise
         if increments is None or noise is None or V is None:
             return trajectory
-        trajectory = trajectory._replace(martingale=martingale(V, noise, t, x.detach(), increments))
+        surprise, value = None, trajectory.require_value()
         if with_surprises:
-            value = trajectory.require_value()
-            trajectory = trajectory._replace(surprise=surprises(V, noise, t, x, value, increments))
-        return trajectory
+            surprise = surprises(V, noise, t, x, value, increments)
+        return NoisyTrajectory.of(trajectory, martingale(V, noise, t, x.detach(), increments), surprise)
 
     @property
     def takes_steps_of_problem(self) -> bool:

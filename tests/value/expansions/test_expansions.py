@@ -40,7 +40,7 @@ def test_what_is_optimal_needs_one_pass_backwards_and_no_search(swings, monkeypa
     monkeypatch.setattr(
         dynamic_programming, "_line_search", lambda *given: searched.append(len(given[2].cost)) or search(*given)
     )
-    monkeypatch.setattr(dynamic_programming, "_backward", lambda *given: passes.append(given[-1]) or backward(*given))
+    monkeypatch.setattr(dynamic_programming, "_backward", lambda *given: passes.append(given[5]) or backward(*given))
     exact = optimal_trajectories(problem, x0, optimum.path.u).path.u
     searched.clear(), passes.clear()
     again = optimal_trajectories(problem, x0, exact)

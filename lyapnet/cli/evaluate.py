@@ -58,7 +58,8 @@ def evaluate(
         check_multiple(controller, until, count)
     report, notes = given.report, Console(stderr=True, highlight=False, markup=False)
     report(f"closed loops from {samples:,} states of X₀")
-    measured = evaluation(controller, samples, seed, optimum, partial(report, "optima of states"), paths)
+    stage = "optima of states" if controller.problem.noise is None else "paths of the noise"
+    measured = evaluation(controller, samples, seed, optimum, partial(report, stage), paths)
     result = measured.result()
     if not as_json:
         report.rest()

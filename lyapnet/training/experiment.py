@@ -225,11 +225,13 @@ def _finish(trainer: L.Trainer, plan: Plan, console: Console) -> dict[str, Any]:
         members = zip(configs_of_seeds(config), runs, loggers, plan.module.members, strict=True)
         for one, run, own, member in members:
             report(f"what follows T, for seed {one.seed}")
-            controller, optimum_of = load(run.best, **vars(plan.parts)), partial(report, f"optima for seed {one.seed}")
+            controller = load(run.best, **vars(plan.parts))
+            found = "optima" if controller.problem.noise is None else "paths of the noise"
+            progress = partial(report, f"{found} for seed {one.seed}")
             controller.share_code_of(member.rollout)
             note_in_checkpoint(run.best, **{AFTER_HORIZON: controller.after_horizon()._asdict()})
             report(f"the best checkpoint of seed {one.seed}, on {options.test_states} states of X₀")
-            results.append(evaluate(controller, options.test_states, one.seed, options.optimum, optimum_of))
+            results.append(evaluate(controller, options.test_states, one.seed, options.optimum, progress))
             log_result(own, one, results[-1], trainer.global_step)
     result = results[0] if config.seeds == 1 else over_seeds(results)
     write_json(plan.run.folder / EVALUATION, result)

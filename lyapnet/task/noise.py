@@ -3,11 +3,14 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from lyapnet.base.contracts import called
+from lyapnet.base.errors import UsageError
 from lyapnet.base.linear_algebra import apply
 from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import State
@@ -39,11 +42,6 @@ class Noise(nn.Module, ABC):
     def displacement(self, x: State, increment: Float[Tensor, "*batch sources"]) -> State:
         """σ(x)ΔW."""
         return apply(self(x), increment)
-
-    def half_trace(self, x: State, hessian: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch"]:
-        """½ tr(σσᵀH), the rate at which noise raises the mean of a function with Hessian H."""
-        sigma = self(x)
-        return (sigma * (hessian @ sigma)).sum((-2, -1)) / 2
 
 
 class StateNoise(Noise):
@@ -78,12 +76,23 @@ class SystemNoise(Noise):
     Args:
         system: the system.
         like: a state (n,), at which the number of sources is read off.
+
+    Raises:
+        UsageError: the method fails, or returns no matrix with a column.
     """
 
     def __init__(self, system: ControlAffineSystem, like: State):
         super().__init__()
         self.system = system
-        self.sources = system.noise(like).shape[-1]  # pyright: ignore[reportCallIssue, reportAttributeAccessIssue]
+        name, noise = f"{type(system).__name__}.noise(x)", system.noise
+        sigma: Any = called(name, noise, [like[None]])  # pyright: ignore[reportArgumentType]
+        if not isinstance(sigma, Tensor) or not sigma.ndim or not sigma.shape[-1]:
+            got = tuple(sigma.shape) if isinstance(sigma, Tensor) else type(sigma).__name__
+            raise UsageError(
+                f"Expected {name} of shape (*batch, {system.n}, k) with a column for each of k ≥ 1 sources, got {got}; "
+                "correct it, or leave the method out if there is no noise."
+            )
+        self.sources = sigma.shape[-1]
 
     def forward(self, x: State) -> NoiseMatrix:
         return self.system.noise(x)  # pyright: ignore[reportCallIssue]

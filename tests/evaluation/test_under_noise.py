@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+import yaml
 from torch.testing import assert_close
 
 import lyapnet
 from lyapnet.base.errors import DivergenceError, OracleError, UsageError
 from lyapnet.claims.sampling_certificates import StatisticalCertificate
 from lyapnet.claims.statistical import count_successes
+from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
 from lyapnet.evaluation.oracles import oracle_of
@@ -267,3 +269,30 @@ def test_a_path_that_diverges_is_not_drawn_again():
     for x0, increments in calls:
         for x, w in zip(x0, increments.unbind(1), strict=True):
             assert torch.equal(whole[tuple(x.tolist())], w)
+
+
+def test_noise_without_a_column_or_that_fails_is_refused_by_name():
+    class Empty(Linear):
+        def noise(self, x):
+            return x[..., None][..., :0]
+
+    class Failing(Linear):
+        def noise(self, x):
+            raise KeyError("wind")
+
+    cost = QuadraticCost([[1.0]], [[1.0]], [[1.0]])
+    for cls, message in ((Empty, "k ≥ 1 sources"), (Failing, "Failing.noise")):
+        with pytest.raises(UsageError, match=message):
+            Problem(cls([[0.0]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), Horizon(5, 0.1, "euler"))
+
+
+@pytest.mark.gate
+def test_a_run_without_noise_is_no_start_for_one_with_noise(tmp_path, capsys):
+    short = {"training": {"iterations": 1}, "evaluation": {"test_states": 2, "validation_states": 2, "animate": False}}
+    for name, noise in (("quiet", {}), ("noisy", TASK["noise"])):
+        content = {**TASK, **short, "experiment": name, "noise": noise, "loggers": ["csv"], "logs": str(tmp_path)}
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
+    checkpoint = f"{tmp_path}/quiet/version_0/checkpoints/best.ckpt"
+    assert main(["train", "--config", f"{tmp_path}/quiet.yaml"]) == 0
+    assert main(["train", "--config", f"{tmp_path}/noisy.yaml", "--finetune", checkpoint]) == 2
+    assert "Expected a task without noise" in capsys.readouterr().err

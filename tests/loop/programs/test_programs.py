@@ -22,6 +22,7 @@ from lyapnet.loop.programs.terms import (
     terminal_residual,
     violation,
 )
+from lyapnet.loop.programs.value import lost
 from lyapnet.loop.rollout import Rollout, Trajectory
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
@@ -398,3 +399,10 @@ def test_a_bound_asks_for_a_terminal_weight_unless_V_ends_as_the_terminal_cost()
     program.check_terminal(exact=True)
     with pytest.raises(UsageError, match=r"Expected program.terminal > program.bound = 0.5, got 0.5"):
         program.check_terminal(exact=False)
+
+
+def test_lost_trajectories_cost_far_more_than_V_and_not_merely_much():
+    values, cost = torch.tensor([[1.0, 1.0, 100.0], [0.0, 0.0, 0.0]]), torch.tensor([1.0, 3.0, 110.0])
+    running = torch.stack([torch.zeros(3), cost])
+    path = Trajectory(torch.arange(2.0), torch.zeros(2, 3, 1), torch.zeros(1, 3, 1), running, torch.zeros(3), values)
+    assert lost(values, path).tolist() == [False, True, False]

@@ -54,7 +54,8 @@ def test_every_config(path):
         return
     config.seeds = 1
     names = [fact.name for fact in facts_before_optima(config)]
-    assert names[:4] == ["system", "goal", "modes", "controllable"]
+    noise = ["noise"] if config.noise else []
+    assert names[: 4 + len(noise)] == ["system", *noise, "goal", "modes", "controllable"]
     assert "stiffness" in names
 
 

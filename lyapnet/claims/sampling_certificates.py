@@ -59,7 +59,12 @@ class SampledCertificate(Certificate):
     @property
     def _sample(self) -> str:
         """The sample, in words."""
-        return f"{self.claim.samples} states drawn uniformly from X₀ (seed {self.options['seed']})"
+        paths = ", each with one path of the noise" if self._noisy else ""
+        return f"{self.claim.samples} states drawn uniformly from X₀ (seed {self.options['seed']}){paths}"
+
+    @property
+    def _noisy(self) -> bool:
+        return self.controller.problem.noise is not None
 
     def in_formulas(self) -> list[str]:
         limits = asdict(self.claim.tolerances)
@@ -118,11 +123,16 @@ class StatisticalCertificate(SampledCertificate):
     def in_words(self) -> str:
         bound, successes = floored(self.claim.probability_lower_bound), self.claim.successes["all"]
         return (
-            f"With confidence {self._confidence}, at least {bound} of X₀ by volume succeeds: the closed loop satisfies "
+            f"With confidence {self._confidence}, {self._share_in_words(bound)}: the closed loop satisfies "
             "the conditions below at the nodes of the horizon. It is the exact one-sided Clopper-Pearson bound for "
             f"{successes} successes in {self._sample}. The confidence is over the draw{self._other_draws}. Like the "
             f"rollouts, the claim is about this model, this Δt and this integrator.{self.parameters_text}"
         )
+
+    def _share_in_words(self, share: str) -> str:
+        if self._noisy:
+            return f"a random state of X₀ under random noise succeeds with probability at least {share}"
+        return f"at least {share} of X₀ by volume succeeds"
 
     @property
     def _other_draws(self) -> str:
@@ -136,7 +146,8 @@ class StatisticalCertificate(SampledCertificate):
 
     def in_formulas(self) -> list[str]:
         bound = floored(self.claim.probability_lower_bound)
-        return [*super().in_formulas(), f"P(x₀ succeeds) ≥ {bound}  for x₀ uniform on X₀"]
+        noise = " and the noise" if self._noisy else ""
+        return [*super().in_formulas(), f"P(x₀ succeeds) ≥ {bound}  for x₀ uniform on X₀{noise}"]
 
     def verdict_text(self) -> str:
         why = {
@@ -144,10 +155,11 @@ class StatisticalCertificate(SampledCertificate):
             "falsified": "the share is smaller, at the same confidence",
             "unknown": "these samples do not decide it",
         }[self.verdict]
-        return f"The verdict is on the claim that at least {self.claim.share:.6g} of X₀ succeeds: {why}."
+        return f"The verdict is on the claim that {self._share_in_words(f'{self.claim.share:.6g}')}: {why}."
 
     @property
     def headline(self) -> str:
-        bound = f"at least {floored(self.claim.probability_lower_bound)} of X₀, confidence {self._confidence}"
+        share = f"{floored(self.claim.probability_lower_bound)} of X₀" + " and the noise" * self._noisy
+        bound = f"at least {share}, confidence {self._confidence}"
         counted = f"{self.claim.successes['all']} of {self.claim.samples} states succeed"
         return f"statistical, {self.verdict}: {bound}\n{counted}"

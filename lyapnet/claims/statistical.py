@@ -15,6 +15,7 @@ from lyapnet.loop.programs import EVENTS, Tolerances
 from lyapnet.loop.programs.terms import hinge, satisfied
 from lyapnet.loop.rollout import Trajectory
 from lyapnet.prover.verdict import Verdict
+from lyapnet.task.domain import SLACK
 from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 
@@ -210,6 +211,9 @@ def _events(
         return torch.cat(
             [_events(rollout, half, path, tolerances, problem) for half, path in zip(halves, paths, strict=True)]
         )
+    valid = torch.ones(len(x0), 1, dtype=torch.bool)
+    if problem.domain is not None:  # f, g or the cost is not defined outside
+        valid = ~problem.domain.left(trajectory.x, SLACK).cpu()[:, None]
     J, trajectory = trajectory.cost, trajectory.compensated()  # V decreases in expectation; a cost is that of a path
     values = trajectory.require_value()
     decrease = terminal = constraints = torch.ones_like(values[0], dtype=torch.bool)
@@ -220,5 +224,5 @@ def _events(
     if problem.constraints is not None:
         constraints = problem.constraints.worst(trajectory.x).amax(0) <= 0
     cost = (1 + tolerances.cost) * values[0] >= J
-    single = torch.stack([decrease, terminal, cost, constraints], -1)
-    return torch.cat([single, single.all(-1, keepdim=True)], -1).cpu()
+    single = torch.stack([decrease, terminal, cost, constraints], -1).cpu() & valid
+    return torch.cat([single, single.all(-1, keepdim=True)], -1)

@@ -92,12 +92,12 @@ def _print_further_tables(result: dict[str, Any], controller: "Controller", coun
     from lyapnet.evaluation.robustness import nominal
     from lyapnet.evaluation.tables import after_horizon_table, robustness_table
 
-    console = Console(highlight=False, markup=False)
+    console, noisy = Console(highlight=False, markup=False), controller.problem.noise is not None
     if "robustness" in result:
         member = nominal(controller) if controller.system.constants else {}
-        console.print(robustness_table(result["robustness"], count, member))
+        console.print(robustness_table(result["robustness"], count, member, noisy))
     if "afterwards" in result:
-        console.print(after_horizon_table(result["afterwards"], count))
+        console.print(after_horizon_table(result["afterwards"], count, noisy))
 
 
 def _write_figures(

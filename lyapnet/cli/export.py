@@ -33,7 +33,8 @@ def export(
     given.report.rest()
     notes = Console(highlight=False, markup=False)
     if beyond is None:
-        notes.print(f"law: {controller.after_horizon()}", soft_wrap=True)
+        quiet = "" if controller.problem.noise is None else "; these closed loops are without noise"
+        notes.print(f"law: {controller.after_horizon()}{quiet}", soft_wrap=True)
     for path in paths:
         notes.print(f"wrote {path}", soft_wrap=True)
     notes.print(str(agreement), soft_wrap=True)

@@ -262,14 +262,24 @@ class Controller:
 
     @overload
     def rollout(
-        self, x0: Tensor, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+        self,
+        x0: Tensor,
+        steps: int | None = None,
+        *,
+        noise: Tensor | np.ndarray | int | None = None,
+        **parameters: float,
     ) -> Trajectory: ...
     @overload
     def rollout(
-        self, x0: ArrayLike, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+        self,
+        x0: ArrayLike,
+        steps: int | None = None,
+        *,
+        noise: Tensor | np.ndarray | int | None = None,
+        **parameters: float,
     ) -> ArrayTrajectory: ...
     def rollout(
-        self, x0: Any, steps: int | None = None, *, noise: Tensor | int | None = None, **parameters: float
+        self, x0: Any, steps: int | None = None, *, noise: Tensor | np.ndarray | int | None = None, **parameters: float
     ) -> Any:
         """The closed loop from x₀ (*batch, n): a Trajectory of tensors, an ArrayTrajectory of arrays and lists.
 
@@ -304,7 +314,7 @@ class Controller:
         """The closed loops under given noise, see Rollout.forward."""
         return self._rollout(x0, increments, with_surprises)
 
-    def _increments(self, x0: Tensor, steps: int | None, given: Tensor | int | None) -> Tensor | None:
+    def _increments(self, x0: Tensor, steps: int | None, given: Tensor | np.ndarray | int | None) -> Tensor | None:
         """ΔW of each step from a batch of states; None without noise."""
         noise, horizon = self.problem.noise, self.horizon
         if given is None:
@@ -315,9 +325,13 @@ class Controller:
             raise ValueError(
                 f"Expected the {horizon.steps} steps of the horizon with noise, got {steps}; leave it out."
             )
-        if isinstance(given, Tensor):
-            return given
-        return noise.draw(horizon.steps, horizon.dt, x0, stream(given, NOISE))
+        if isinstance(given, int) and not isinstance(given, bool) and given >= 0:
+            return noise.draw(horizon.steps, horizon.dt, x0, stream(given, NOISE))
+        shape = (horizon.steps, *x0.shape[:-1], noise.sources)
+        if not isinstance(given, Tensor | np.ndarray) or tuple(given.shape) != shape:
+            got = tuple(given.shape) if isinstance(given, Tensor | np.ndarray) else repr(given)
+            raise ValueError(f"Expected noise as a seed ≥ 0, or as ΔW of shape {shape}, got {got}; give one of them.")
+        return torch.as_tensor(given).to(x0)
 
     def _cut(self, whole: Trajectory, steps: int) -> Trajectory:
         """The first steps of a trajectory."""

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from lyapnet.base.errors import DivergenceError, OracleError
 from lyapnet.base.files import plain
@@ -19,11 +18,9 @@ from lyapnet.evaluation.after_horizon import share_at_goal
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
-from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 from lyapnet.evaluation.under_noise import NoiseMeasures, measure_under_noise
-from lyapnet.loop.rollout import Trajectory
 from lyapnet.task.constraints import names_of
-from lyapnet.task.domain import BORDER_ROUNDING, SLACK
 from lyapnet.task.problem import Problem
 from lyapnet.value.after_horizon import LOOPS
 
@@ -79,7 +76,7 @@ class Evaluation(NamedTuple):
             **({"terminal_errors": self._terminal_errors()} if self.problem.has_goal else {}),
             **used,
             **counts,
-            **({} if self.noise is None else {"noise": self.noise._asdict()}),
+            **({} if self.noise is None else {"noise": plain(self.noise._asdict())}),
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
@@ -186,7 +183,7 @@ def evaluation(
     trajectory = controller.rollout(x0)
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)
-    cost, left = _within_domain(controller.problem, trajectory)
+    cost, left = cost_within_domain(controller.problem, trajectory)
     table = dataclasses.replace(table, cost=cost, left=left)
     first, paper = table.rows(slice(0, samples)), table.rows(slice(samples, None))
     corner, problem = dearest_corner(controller), controller.problem
@@ -228,14 +225,6 @@ def _evaluation_under_noise(
     return Evaluation(first, paper, notes, *further, about, noise)
 
 
-def _within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
-    """J_N of closed loops, infinite if they are far outside the domain, and whether they leave it; None without one."""
-    if problem.domain is None:
-        return trajectory.expected_cost, None
-    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
-    return trajectory.expected_cost.masked_fill(far, torch.inf), left
-
-
 def dearest_corner(controller: Controller, noise: int | None = None) -> Corner:
     """The corner of X₀ with the most expensive closed loop, among the corners along its first CORNER_AXES axes.
 
@@ -246,7 +235,7 @@ def dearest_corner(controller: Controller, noise: int | None = None) -> Corner:
     with torch.no_grad():
         value = controller.value(0.0, x0)
         try:
-            cost = _within_domain(controller.problem, controller.rollout(x0, noise=noise))[0]
+            cost = cost_within_domain(controller.problem, controller.rollout(x0, noise=noise))[0]
         except DivergenceError:
             cost = torch.full_like(value, torch.inf)
     i = int(cost.argmax())

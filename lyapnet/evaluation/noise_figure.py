@@ -1,5 +1,6 @@
 """A figure of closed loops under noise: bands of many paths from a few initial states."""
 
+import numpy as np
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
@@ -38,7 +39,7 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
     panels = list(figure.subplots(rows, columns, sharex=True, squeeze=False).flatten(order="F"))
     for panel, (label, paths) in zip(panels, curves, strict=False):
         for k, color in enumerate((BLUE, ORANGE)):
-            low, middle, high = (numpy_of(part) for part in _levels(paths[..., k]))
+            low, middle, high = np.quantile(numpy_of(paths[..., k]), (BAND[0], 0.5, BAND[1]), axis=1)
             at = t[: len(middle)]
             panel.fill_between(at, low, high, color=color, alpha=0.25, linewidth=0)
             panel.plot(at, middle, color=color, linewidth=1.2, label=f"from state {k + 1}: median, 5 to 95 % of paths")
@@ -59,8 +60,3 @@ def bands(trajectory: Trajectory, problem: Problem) -> Figure:
         panel.tick_params(labelbottom=True)
     legend_below(figure, handles, columns=2)
     return figure
-
-
-def _levels(paths: Tensor) -> Tensor:
-    """(lower edge, median, upper edge) of the band of paths (nodes, paths)."""
-    return torch.quantile(paths.detach().double(), torch.tensor([BAND[0], 0.5, BAND[1]]).to(paths.device).double(), 1)

@@ -12,6 +12,7 @@ from lyapnet.evaluation.optimality import in_spreads, mean_optimum, ratio_of_mea
 from lyapnet.loop.programs import Program
 from lyapnet.loop.programs.terms import falls, hinge, largest_rise, satisfied
 from lyapnet.loop.rollout import Trajectory
+from lyapnet.task.domain import BORDER_ROUNDING, SLACK
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import ControlSet
 
@@ -143,6 +144,17 @@ def measure(
         worst_time=worst_time,
         has_goal=problem.has_goal,
     )
+
+
+def cost_within_domain(problem: Problem, trajectory: Trajectory) -> tuple[PerState, Tensor | None]:
+    """J_N of closed loops, infinite if they are far outside the domain, and whether they leave it; None without one.
+
+    With noise it is a sample of E J_N.
+    """
+    if problem.domain is None:
+        return trajectory.expected_cost, None
+    far, left = (problem.domain.left(trajectory.x, slack) for slack in (SLACK, BORDER_ROUNDING))
+    return trajectory.expected_cost.masked_fill(far, torch.inf), left
 
 
 def _worst(problem: Problem, trajectory: Trajectory) -> tuple[Tensor | None, Tensor | None]:

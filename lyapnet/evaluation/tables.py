@@ -34,6 +34,7 @@ ROWS = {
     "satisfied_fraction_1e-3": "… within 0.1 %",
 }
 REFERENCES = ("held", "lqr")  # reference costs, shown as a ratio if the optimum is known
+WITHOUT_NOISE = "closed loops without the task's noise"
 LEFT_DOMAIN = "left_domain_fraction"
 SHARES_IF_PRESENT = {
     "violated_fraction": "constraints violated, share of states",
@@ -59,7 +60,8 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
         table.add_row(f"{name}: greatest h, when", f"{found['worst']:.4g}, {found['time']:.4g} s")
     if corner := result.get("worst_corner"):  # since version 0.3
         cost = "not finite" if corner["cost"] is None else f"{corner['cost']:.4g}"
-        table.add_row(f"dearest of {corner['count']} corners of X₀: cost J, V(0, x₀)", f"{cost}, {corner['value']:.4g}")
+        what = "J − M of one path" if "noise" in result else "cost J"
+        table.add_row(f"dearest of {corner['count']} corners of X₀: {what}, V(0, x₀)", f"{cost}, {corner['value']:.4g}")
     table.caption = _caption([result])
     return table
 
@@ -68,17 +70,30 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
     """The rows of a task with noise."""
     if (noise := result.get("noise")) is None:
         return {}
-    levels = noise["quantiles"]
+    levels, optimum = noise["quantiles"], result.get("optimal_cost_mean")
+    relative = (
+        {"… relative to the optimum": f"± {noise['half_width'] / optimum:.2g}"}
+        if optimum and noise["half_width"]
+        else {}
+    )
     return {
         f"E J with its 95 % interval, {noise['paths']} paths from each state": (
-            f"{result['cost_mean']:.5g} ± {noise['half_width']:.2g}"
+            _interval(noise["mean"], noise["half_width"])
         ),
+        **relative,
         "… from costs alone, without V as a control variate": (
-            f"{noise['plain_mean']:.5g} ± {noise['plain_half_width']:.2g}"
+            _interval(noise["plain_mean"], noise["plain_half_width"])
         ),
-        f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(f"{level:.4g}" for level in levels.values()),
+        f"cost J of a path, quantiles {', '.join(levels)}": ", ".join(
+            "infinite" if level is None else f"{level:.4g}" for level in levels.values()
+        ),
         "paths lost, which cost half more than V and not by their noise": f"{noise['lost_fraction']:.2%}",
     }
+
+
+def _interval(mean: float | None, half_width: float | None) -> str:
+    """A mean with its interval; both are None if a path has no finite cost."""
+    return "not finite" if mean is None or half_width is None else f"{mean:.5g} ± {half_width:.2g}"
 
 
 def table_over_seeds(title: str, result: dict[str, Any]) -> Table:
@@ -128,8 +143,12 @@ def _caption(results: list[dict[str, Any]]) -> Text | None:
     return Text(caption) if notes else None  # Text, because [oracle] in a string would be markup
 
 
-def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float]) -> Table:
-    """The table of costs under disturbances; for a family, in the task of one member."""
+def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[str, float], noisy: bool) -> Table:
+    """The table of costs under disturbances; for a family, in the task of one member.
+
+    Args:
+        noisy: whether the task has noise, which these costs are without.
+    """
     named = ", ".join(f"{name} = {value:g}" for name, value in member.items())
     title = f"{samples} states each" + f" of the member {named}" * bool(named)
     headings = ("cost J", "optimum J*", "J / J*", "‖x(T)‖")
@@ -139,17 +158,23 @@ def robustness_table(rows: list[dict[str, Any]], samples: int, member: Mapping[s
         keys = ("cost_mean", "optimal_cost_mean", "cost_ratio", "terminal_error")
         cost, *others = (measured_or_not(key, row[key]) for key in keys)
         table.add_row(row["disturbance"], "diverged" if row["cost_mean"] is None else cost, *others)
-    table.caption = "J*: of the disturbed task, without noise"
+    costs = f"J and J*: {WITHOUT_NOISE}. " if noisy else ""
+    table.caption = f"{costs}J*: the optimum if the disturbance is known"
     return table
 
 
-def after_horizon_table(rows: list[dict[str, Any]], samples: int) -> Table:
-    """The table of distances after T under each law, from after_horizon.in_plain_data."""
+def after_horizon_table(rows: list[dict[str, Any]], samples: int, noisy: bool) -> Table:
+    """The table of distances after T under each law, from after_horizon.in_plain_data.
+
+    Args:
+        noisy: whether the task has noise, which these closed loops are without.
+    """
     columns = [Column(f"at {at['time']:g} s", justify="right") for at in rows[0]["distances"]]
     table = Table("beyond", *columns, title=f"what follows T: mean ‖x − x*‖ of {samples} closed loops")
+    refused = [WITHOUT_NOISE] if noisy else []
     for row in rows:
         table.add_row(row["beyond"], *("–" if at["mean"] is None else f"{at['mean']:.3g}" for at in row["distances"]))
-    refused = [f"{row['beyond']}: {row['refused']}" for row in rows if row["refused"]]
+    refused += [f"{row['beyond']}: {row['refused']}" for row in rows if row["refused"]]
     table.caption = Text("\n".join(refused)) if refused else None
     return table
 

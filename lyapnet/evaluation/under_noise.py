@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from scipy.special import stdtrit
 from torch import Tensor
 
 from lyapnet.base.random_streams import NOISE, TEST, stream
@@ -13,9 +15,9 @@ from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.oracles import Report, silent
 from lyapnet.evaluation.references import costs_of_lqr
-from lyapnet.evaluation.states import StateTable, measure
+from lyapnet.evaluation.states import StateTable, cost_within_domain, measure
 
-NORMAL_95 = 1.96  # standard errors on each side of a mean that hold 95 % of a normal distribution
+CONFIDENCE = 0.95  # of the intervals of E J
 QUANTILES = (0.05, 0.5, 0.95)  # of the costs of all paths
 LOST_EXCESS = 0.5  # (J − M − V(0, x₀)) / V(0, x₀), V at least its mean on X₀, above which a path counts as lost
 
@@ -28,6 +30,7 @@ class NoiseMeasures(NamedTuple):
     """
 
     paths: int  # from each initial state
+    mean: float  # of J − M: E J
     half_width: float  # of the 95 % interval of E J, averaged over the states
     plain_mean: float  # mean of J itself
     plain_half_width: float  # of its 95 % interval
@@ -54,34 +57,56 @@ def measure_under_noise(
         progress(path, paths)
         noise = problem.noise.draw(horizon.steps, horizon.dt, x0, stream(seed, TEST, NOISE, path))
         trajectory = controller.closed_loops(x0, noise, with_surprises=path == 0)
-        tables.append(measure(problem, controller.program, trajectory))
-        plain.append(trajectory.cost)
+        expected, left = cost_within_domain(problem, trajectory)
+        tables.append(replace(measure(problem, controller.program, trajectory), cost=expected, left=left))
+        plain.append(trajectory.cost.where(expected.isfinite(), torch.inf))
         other = costs_of_lqr(problem, x0, noise)
-        lqr += [] if other is None else [other - trajectory.cost]
+        lqr += [] if other is None else [other]
     table = average(tables)
     cost, J = torch.stack([each.cost for each in tables])[:, :counted], torch.stack(plain)[:, :counted]
     value = table.value[:counted]
-    levels = torch.quantile(J.double().flatten(), torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
+    levels = np.quantile(
+        J.double().numpy(force=True), QUANTILES, method="inverted_cdf"
+    ).tolist()  # of finite costs or not
     measures = NoiseMeasures(
-        paths, _half_width(cost), float(J.mean()), _half_width(J),
+        paths, float(cost.mean()), _half_width(cost), float(J.mean()), _half_width(J),
         {f"{q:.0%}": level for q, level in zip(QUANTILES, levels, strict=True)},
         float((cost - value > LOST_EXCESS * value.maximum(value.mean())).double().mean()),
     )  # fmt: skip
-    return table, measures, table.cost + torch.stack(lqr).mean(0) if lqr else None
+    return table, measures, _cost_on_same_paths(table.cost, plain, lqr) if lqr else None
+
+
+def _cost_on_same_paths(cost: PerState, J: list[Tensor], others: list[Tensor]) -> PerState:
+    """E J of another law, from an estimate of E J of this one and the costs of both on the same paths."""
+    difference = (torch.stack(others) - torch.stack(J)).mean(0)
+    return torch.where(difference.isfinite(), cost + difference, torch.stack(others).mean(0))
 
 
 def _half_width(samples: Tensor) -> float:
-    """The half-width of the 95 % interval of the mean over the states of expectations, from samples (paths, states)."""
-    if len(samples) < 2:
+    """The half-width of the 95 % interval of the mean over the states of expectations, from samples (paths, states).
+
+    By Student's t, with the degrees of freedom of a sum of variances.
+
+    Source: Welch, "The generalization of 'Student's' problem when several different population variances are involved",
+    Biometrika 1947.
+    """
+    if len(samples) < 2 or not samples.isfinite().all():
         return math.inf
-    return NORMAL_95 * float((samples.var(0) / len(samples)).sum().sqrt()) / samples.shape[1]
+    variances = samples.double().var(0) / len(samples)  # of the mean of each state
+    if not (total := float(variances.sum())):
+        return 0.0
+    freedom = (len(samples) - 1) * total**2 / float((variances**2).sum())
+    return float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * math.sqrt(total) / samples.shape[1]
 
 
 AVERAGED = ("cost", "terminal_state", "terminal_error", "at_limits")  # columns of a table that are averaged over paths
 
 
 def average(tables: Sequence[StateTable]) -> StateTable:
-    """One table of several of the same states: means of AVERAGED columns, the largest h, the rest of the first."""
+    """One table of several of the same states: means of AVERAGED columns, the largest h, the rest of the first.
+
+    A state has left the domain if one of its paths has.
+    """
     first = tables[0]
 
     def stacked(name: str) -> Tensor:
@@ -91,4 +116,6 @@ def average(tables: Sequence[StateTable]) -> StateTable:
     if first.worst is not None:
         merged["worst"], at = stacked("worst").max(0)
         merged["worst_time"] = stacked("worst_time").gather(0, at[None])[0]
+    if first.left is not None:
+        merged["left"] = stacked("left").any(0)
     return replace(first, **merged)

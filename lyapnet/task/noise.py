@@ -65,6 +65,8 @@ class StateNoise(Noise):
         noisy = [i for i, s in enumerate(strengths) if s]
         self.sources = len(noisy)
         self.register_buffer("sigma", torch.diag(torch.tensor(strengths))[:, noisy], persistent=False)
+        if not self.sigma.any(0).all():
+            raise ValueError(f"Expected strengths above rounding, got {[*strengths]}; leave noise out if none.")
 
     def forward(self, x: State) -> NoiseMatrix:
         return self.sigma.expand(*x.shape[:-1], -1, -1)

@@ -392,7 +392,8 @@ class Problem(nn.Module):
         if own.constraints is not None:
             numbers["h"] = own.constraints(x)
         if own.noise is not None:
-            sigma = own.noise(x)
+            at = torch.cat([x, own.goal.to(x)[None], own.goal + 2 * (x - own.goal)]) if own.has_goal else x
+            sigma = own.noise(at)  # outside of X₀ too, where it may be larger
             numbers["σσᵀ"] = sigma @ sigma.mT
         if own.controls.limits is not None:
             for side, limit in zip(LIMITS, own.controls.limits, strict=True):
@@ -409,7 +410,7 @@ class Problem(nn.Module):
         if "u*" in record:
             own = {"u*": unsaid["u*"], **own}
         if "σσᵀ" in record or "σσᵀ" in own:
-            none = torch.zeros(3, self.system.n, self.system.n).tolist()
+            none = torch.zeros_like(torch.as_tensor(own.get("σσᵀ", record.get("σσᵀ")))).tolist()
             unsaid["σσᵀ"], own = none, {"σσᵀ": none, **own}
         if "h" in record:
             own = {"h": [[0.0]] * 3, **own}

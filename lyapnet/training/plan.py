@@ -174,7 +174,8 @@ def _load_initial_weights(config: Config, module: TrainingModule, checkpoint: Pa
                     f"Expected a family in {names}, as of {str(checkpoint)!r}, got one in {own}; give the same names "
                     "in the same order, or start anew without --finetune."
                 )
-            if config.noise and not given.noise:  # its V may be 0 at the goal by construction
+            noisy = module.members[0].problem.noise is not None
+            if noisy and "σσᵀ" not in content[KEY].get("problem", {}):  # its V may be 0 at the goal by construction
                 raise UsageError(
                     f"Expected a task without noise, as of {str(checkpoint)!r}, got noise, which costs something at "
                     "the goal too; start anew without --finetune."

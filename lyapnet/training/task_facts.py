@@ -184,14 +184,16 @@ def _system_fact(problem: Problem) -> Fact:
 
 def _noise_fact(problem: Problem, noise: Noise) -> Fact:
     """The strength of the noise of each state at the goal, and the cost of noise there by the linearised problem."""
-    system, strengths = problem.system, torch.linalg.vector_norm(noise(problem.goal), dim=-1).tolist()
+    system, at = problem.system, problem.goal if problem.has_goal else problem.initial_states.center
+    place = "the goal" if problem.has_goal else "the centre of X₀"
+    strengths = torch.linalg.vector_norm(noise(at), dim=-1).tolist()
     listed = ", ".join(
         f"{name} {strength:.3g}" for name, strength in zip(system.state_names, strengths, strict=True) if strength
     )
-    found = f"{_format_count(noise.sources, 'source')}; per √s: {listed or 'none at the goal'}"
+    found = f"{_format_count(noise.sources, 'source')}; per √s at {place}: {listed or 'none'}"
     if problem.has_goal and not isinstance(around := riccati_or_reason(problem), Missing):
         found += f"; from the goal it costs {float(around.value[0]):.4g} up to T"
-    return Fact("noise", found)
+    return Fact("noise", f"{found}; costs of starts, below, are those without noise")
 
 
 def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:

@@ -24,7 +24,7 @@ REMEDY = "to choose another, load with beyond=hold, receding, riccati or error"
 
 
 class AfterHorizon(NamedTuple):
-    """A law after T, and how many test loops it keeps near the goal."""
+    """A law after T, and how many test loops it keeps near the goal; loops are those without noise."""
 
     beyond: str  # a key of LAWS
     held: int  # number of test loops that it holds up to MULTIPLE T

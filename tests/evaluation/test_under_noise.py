@@ -1,5 +1,8 @@
 """What evaluations report of tasks with noise, against closed forms and a grid; and what must fail."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +18,7 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.noise_figure import PATHS, bands, states_to_draw
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.tables import evaluation_table
-from lyapnet.evaluation.under_noise import measure_under_noise
+from lyapnet.evaluation.under_noise import _half_width, measure_under_noise
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.task.cost import QuadraticCost
@@ -24,6 +27,7 @@ from lyapnet.task.noise import StateNoise
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box, Unbounded
 from lyapnet.task.systems import Linear, Pendulum
+from lyapnet.training.task_facts import _noise_fact
 from lyapnet.value.expansions import Expansion, optimal_trajectories, riccati
 from tests.grid_solver import solve_on_grid
 from tests.problems import OfExpansion
@@ -37,6 +41,10 @@ TASK = {
     "noise": {"velocity": 0.4},
 }
 DISCRETE = {"rollout": {"gradient": "discrete"}}
+
+
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
 
 
 def task(**changes) -> Problem:
@@ -173,6 +181,72 @@ def test_a_rollout_takes_a_seed_or_increments():
         controller.rollout(x0, steps=3, noise=0)
 
 
+@pytest.mark.parametrize("noise", [-1, 1.5, True, torch.tensor(0), torch.zeros(30, 2, 1), np.zeros((29, 1, 1)), "0"])
+def test_noise_of_another_kind_or_shape_is_one_line(noise):
+    with pytest.raises(ValueError, match=r"Expected noise as a seed ≥ 0, or as ΔW of shape \(30, 1, 1\)"):
+        controller_of(task()).rollout(torch.zeros(1, 2), noise=noise)
+
+
+def test_arrays_of_increments_are_taken():
+    controller, increments = controller_of(task()), 0.1 * np.ones((30, 1, 1))
+    x = controller.rollout(np.zeros((1, 2)), noise=increments).x
+    assert_close(torch.tensor(x), controller.rollout(torch.zeros(1, 2), noise=torch.tensor(increments)).x)
+
+
+def test_a_trajectory_with_another_field_keeps_its_martingale():
+    path = controller_of(task()).closed_loops(
+        torch.zeros(2, 2), task().noise.draw(30, 0.1, torch.zeros(2, 2), seeded(0))
+    )
+    other = path._replace(terminal_cost=path.terminal_cost + 1)
+    assert_close(other.expected_cost, path.expected_cost + 1)
+
+
+@pytest.mark.parametrize(("states", "paths"), [(1, 2), (1, 4), (8, 2), (64, 2)])
+def test_an_interval_covers_the_mean_in_95_percent_of_draws_also_for_few_paths(states, paths):
+    draws = torch.randn(4000, paths, states, dtype=torch.float64, generator=seeded(0))
+    draws = draws * torch.linspace(0.5, 2, states)
+    covered = [abs(float(draw.mean())) <= _half_width(draw) for draw in draws]
+    assert 0.94 < sum(covered) / 4000 < 0.975
+    normal = [abs(float(draw.mean())) <= 1.96 * float(draw.var(0).sum().div(paths).sqrt()) / states for draw in draws]
+    assert states * (paths - 1) > 20 or sum(normal) < sum(covered) - 80
+
+
+def test_an_interval_of_an_infinite_cost_is_infinite_and_of_equal_costs_zero():
+    assert _half_width(torch.tensor([[1.0], [torch.inf]])) == torch.inf
+    assert _half_width(torch.ones(3, 2)) == 0
+
+
+def of_root() -> Problem:
+    """x' = u with a cost that is √x: the domain ends at 0, which noise crosses."""
+    content = {
+        "system": {"name": "integrator_chain", "parameters": {"length": 1}},
+        "cost": {"Q": [1.0], "R": 1.0, "Q_T": [1.0]},
+        "initial_states": {"lower": 0.5, "upper": 1.0},
+        "target": [0.8],
+        "domain": {"lower": {"x1": 0.0}},
+        "horizon": {"steps": 20, "dt": 0.05},
+        "noise": {"x1": 1.0},
+        "network": {"name": "fcn"},
+        "program": {"name": "value"},
+        "rollout": {"gradient": "discrete"},
+    }
+    return build_problem(config_from_plain({"experiment": "root", **content}))
+
+
+def test_paths_that_leave_the_domain_cost_infinitely_and_fail_claims():
+    problem = of_root()
+    controller = Controller(problem, OfExpansion(problem, riccati(problem.without_noise())))
+    result = lyapnet.evaluate(controller, samples=16, paths=4)
+    assert result["left_domain_fraction"] > 0.5
+    assert result["cost_mean"] is result["noise"]["mean"] is result["noise"]["half_width"] is None
+    assert any("domain left" in str(cell) for cell in evaluation_table("title", result).columns[0]._cells)
+    found = lyapnet.certify(controller, lyapnet.Statistical(samples=200, share=0.01, confidence=0.9, radius=100.0))
+    assert isinstance(found, StatisticalCertificate)
+    x0 = problem.initial_states.sample(2000, seeded(3))
+    inside = (controller.rollout(x0, noise=4).x[..., 0] >= -0.01).all(0).double().mean()
+    assert found.claim.successes["terminal"] / 200 < float(inside) + 0.15 < 0.9
+
+
 def test_bands_show_both_states_and_the_cost():
     problem = task()
     x0 = states_to_draw(problem.initial_states.sample(12, torch.Generator().manual_seed(0)))
@@ -199,12 +273,60 @@ def test_what_knows_no_noise_is_refused_by_name(changes, message):
         task(**changes)
 
 
+@pytest.mark.parametrize(("fold", "affine"), [(1.0, False), (-3.0, False), (None, True)])
+def test_noise_that_is_affine_on_X0_alone_has_no_oracle(fold, affine):
+    class Folded(Linear):
+        def noise(self, x):
+            return (0.5 * (1 - x) if fold is None else (fold - x).relu() if fold > 0 else (x - fold).relu())[..., None]
+
+    cost = QuadraticCost([[1.0]], [[0.5]], [[2.0]])
+    box = Box([1.2], [2.0]) if fold == 1.0 else Box([-1.0], [1.0])
+    problem = Problem(Folded([[0.0]], [[1.0]]), cost, Unbounded(), box, Horizon(20, 0.1, "euler"))
+    if affine:
+        assert oracle_of(problem)(box.center[None]).isfinite().all()
+    else:
+        with pytest.raises(OracleError, match="σ affine in x"):
+            oracle_of(problem)
+
+
+def test_noise_without_a_slope_at_the_goal_counts_as_constant_there():
+    class Root(Linear):
+        def noise(self, x):
+            return 0.3 * x.abs().sqrt()[..., None]
+
+    cost = QuadraticCost([[1.0]], [[0.5]], [[2.0]])
+    problem = Problem(Root([[0.0]], [[1.0]]), cost, Unbounded(), Box([-1.0], [1.0]), Horizon(20, 0.1, "euler"))
+    assert_close(riccati(problem).hessian, riccati(problem.without_noise()).hessian)
+
+
+def test_noise_that_is_no_method_is_refused():
+    for attribute in (lambda x: x[..., None], torch.nn.Linear(2, 2), 0.3):
+        system = Pendulum()
+        system.noise = attribute
+        cost, box = QuadraticCost(torch.eye(2), torch.eye(1), torch.eye(2)), Box([-1.0, -1.0], [1.0, 1.0])
+        with pytest.raises(UsageError, match=r"Expected Pendulum.noise as a method"):
+            Problem(system, cost, Unbounded(), box, Horizon(10, 0.1, "euler"))
+
+
 def test_noise_is_part_of_the_record_of_a_problem():
     problem, quiet = task(), task(noise={})
     assert problem.differences(problem.record()) == []
     assert problem.differences(quiet.record()) == ["σσᵀ"]
     assert quiet.differences(problem.record()) == ["σσᵀ"]
     assert quiet.differences(quiet.record()) == []
+
+
+def test_noise_outside_of_X0_is_part_of_the_record():
+    class Far(Linear):
+        def noise(self, x):
+            return (x.abs() - 1).relu()[..., None]
+
+    cost, box = QuadraticCost([[1.0]], [[0.5]], [[2.0]]), Box([-1.0], [1.0])
+    far, quiet = (
+        Problem(cls([[0.0]], [[1.0]]), cost, Unbounded(), box, Horizon(20, 0.1, "euler")) for cls in (Far, Linear)
+    )
+    assert far.differences(quiet.record()) == ["σσᵀ"]
+    assert quiet.differences(far.record()) == ["σσᵀ"]
 
 
 class Gusty(Pendulum):
@@ -287,12 +409,50 @@ def test_noise_without_a_column_or_that_fails_is_refused_by_name():
 
 
 @pytest.mark.gate
-def test_a_run_without_noise_is_no_start_for_one_with_noise(tmp_path, capsys):
+def test_a_run_without_noise_is_no_start_for_one_with_noise(tmp_path, capsys, monkeypatch):
     short = {"training": {"iterations": 1}, "evaluation": {"test_states": 2, "validation_states": 2, "animate": False}}
-    for name, noise in (("quiet", {}), ("noisy", TASK["noise"])):
+    module = (
+        "import torch\nfrom lyapnet.task.systems import DoubleIntegrator\n\n\nclass Windy(DoubleIntegrator):\n"
+        "    def noise(self, x):\n        return 0.4 * torch.ones_like(x)[..., None]\n"
+    )
+    (tmp_path / "windy.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, noise in (("quiet", {}), ("noisy", TASK["noise"]), ("windy", {})):
         content = {**TASK, **short, "experiment": name, "noise": noise, "loggers": ["csv"], "logs": str(tmp_path)}
+        if name == "windy":
+            content["system"] = {"name": "windy:Windy"}
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(content))
     checkpoint = f"{tmp_path}/quiet/version_0/checkpoints/best.ckpt"
     assert main(["train", "--config", f"{tmp_path}/quiet.yaml"]) == 0
-    assert main(["train", "--config", f"{tmp_path}/noisy.yaml", "--finetune", checkpoint]) == 2
-    assert "Expected a task without noise" in capsys.readouterr().err
+    for name in ("noisy", "windy"):
+        assert main(["train", "--config", f"{tmp_path}/{name}.yaml", "--finetune", checkpoint]) == 2
+        assert "Expected a task without noise" in capsys.readouterr().err
+
+
+def test_the_example_of_the_page_is_a_system_with_noise():
+    page = Path(__file__).parents[2] / "docs" / "noise.md"
+    (example,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    names: dict = {}
+    exec(example, names)
+    x = torch.tensor([[0.0, 2.0]])
+    assert_close(names["Drone"]().noise(x), torch.tensor([[[0.0], [0.5]]]))
+
+
+def test_a_task_without_a_goal_says_its_noise():
+    problem = task(cost={"name": "tests.evaluation.test_under_noise:Profit"}, rollout={"gradient": "discrete"})
+    assert not problem.has_goal
+    assert "at the centre of X₀: velocity 0.4" in _noise_fact(problem, problem.noise).found
+    assert "at the goal: velocity 0.4; from the goal it costs" in _noise_fact(task(), task().noise).found
+
+
+class Profit(lyapnet.Cost):
+    """−x₀ at the end."""
+
+    def state(self, x):
+        return torch.zeros_like(x[..., 0])
+
+    def R(self, x):
+        return torch.full_like(x[..., 0], 0.1)[..., None, None]
+
+    def terminal(self, x):
+        return -x[..., 0]

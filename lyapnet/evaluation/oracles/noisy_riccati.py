@@ -14,6 +14,7 @@ from lyapnet.task.systems import is_linear
 from lyapnet.value.expansions import Expansion, riccati
 
 AFFINE_TOLERANCE = 1e-9  # relative difference below which σ at the middle of two states counts as the mean of both
+FAR = 8.0  # half the side of a box around X₀ and the goal, in extents of both, in which σ has to be affine too
 
 
 class NoisyRiccatiOracle(Oracle):
@@ -49,8 +50,13 @@ def noisy_riccati(problem: Problem, free: bool) -> NoisyRiccatiOracle:
 
 
 def _is_affine(problem: Problem, noise: Noise) -> bool:
-    """Whether σ at the middle of two states is the mean of both, at some states of X₀."""
-    one, other = problem.initial_states.sample(64, torch.Generator().manual_seed(0)).to(problem.goal).split(32)
+    """Whether σ at the middle of two states is the mean of both: states of X₀, of a much larger box, and the goal."""
+    generator, goal = torch.Generator().manual_seed(0), problem.goal
+    near = problem.initial_states.sample(128, generator).to(goal)
+    extent = torch.cat([near, goal[None]]).sub(goal).abs().amax(0).clamp_min(torch.finfo(goal.dtype).tiny)
+    extent = extent.where(extent > extent.max() * AFFINE_TOLERANCE, 1.0)  # of a state that X₀ fixes at the goal
+    far = goal + FAR * extent * (2 * torch.rand(near.shape, generator=generator, dtype=near.dtype) - 1)
+    one, other = torch.cat([near, far, near, far]), torch.cat([near.flip(0), far.flip(0), far, goal.expand_as(far)])
     mean = (noise(one) + noise(other)) / 2
     error = (noise((one + other) / 2) - mean).abs().max()
     return bool(error <= AFFINE_TOLERANCE * mean.abs().max())

@@ -74,6 +74,9 @@ class NoisyTrajectory(Trajectory):
         own.martingale, own.surprise = martingale, surprise
         return own
 
+    def _replace(self, **fields: Any) -> "NoisyTrajectory":
+        return self.of(super()._replace(**fields), self.martingale, self.surprise)
+
     @property
     def expected_cost(self) -> PerState:
         """J_N − M, which has the mean of J_N and varies less."""
@@ -203,7 +206,7 @@ class Rollout(nn.Module):
             x, running_cost, value, u = self._integrate(x0, t)
         else:
             raise ValueError(f"Expected no increments with gradient {self.gradient}, got some; take discrete.")
-        _require_finite(x, running_cost, t)
+        _require_finite(x, running_cost, t, noisy=increments is not None)
         trajectory = Trajectory(t, x, u, running_cost, self.closed_loop.cost.terminal(x[-1]), value)
         V, noise = self.closed_loop.V, self.problem.noise
         if increments is None or noise is None or V is None:
@@ -270,7 +273,7 @@ _REMEDY = (
 )
 
 
-def _require_finite(x: StatePath, running_cost: ValuePath, t: Times) -> None:
+def _require_finite(x: StatePath, running_cost: ValuePath, t: Times, noisy: bool) -> None:
     finite = (torch.isfinite(x).all(-1) & torch.isfinite(running_cost)).reshape(len(t), -1)
     if finite.all():
         return
@@ -278,7 +281,8 @@ def _require_finite(x: StatePath, running_cost: ValuePath, t: Times) -> None:
     first_steps = (~finite[:, broken]).int().argmax(0)
     earliest = int(first_steps.argmin())
     step, x0 = int(first_steps[earliest]), x[0].reshape(finite.shape[1], -1)[broken[earliest]]
+    remedy = f"{_REMEDY}; or noise is too strong for Δt" if noisy else _REMEDY
     raise DivergenceError(
         f"Expected a finite closed loop, got a non-finite state or running cost at step {step} (t = {t[step]:.4g} s) "
-        f"from x0 = {[round(v, 6) for v in x0.tolist()]} ({len(broken)} of {finite.shape[1]} trajectories); {_REMEDY}."
+        f"from x0 = {[round(v, 6) for v in x0.tolist()]} ({len(broken)} of {finite.shape[1]} trajectories); {remedy}."
     )

@@ -64,8 +64,18 @@ class ControlAffineSystem(nn.Module, ABC):
 
     @property
     def noisy(self) -> bool:
-        """Whether the system declares noise by a method `noise(x)`."""
-        return callable(getattr(type(self), "noise", None))
+        """Whether the system declares noise by a method `noise(x)`.
+
+        Raises:
+            UsageError: noise is an attribute, which is no method.
+        """
+        name, method = type(self).__name__, callable(getattr(type(self), "noise", None))
+        if hasattr(self, "noise") and not method:
+            raise UsageError(
+                f"Expected {name}.noise as a method, σ(x) of shape (*batch, n, k), got an attribute; write "
+                "def noise(self, x), or give the attribute another name if there is no noise."
+            )
+        return method
 
     @property
     def n(self) -> int:

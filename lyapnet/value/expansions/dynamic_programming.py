@@ -321,12 +321,15 @@ def _recursion(
 
 
 def _noise_maps(problem: Problem, noise: Noise, x: StatePath) -> Tensor:
-    """√Δt (σ_j, ∂σ_j/∂x, 0), (N, *batch, k, n, 1 + n + m), for each column σ_j of σ: (1, δx, δu) ↦ its displacement."""
+    """√Δt (σ_j, ∂σ_j/∂x, 0), (N, *batch, k, n, 1 + n + m), for each column σ_j of σ: (1, δx, δu) ↦ its displacement.
+
+    Where σ has no finite slope, as √x at 0, it is taken as constant.
+    """
     with torch.enable_grad():
         z = x.detach().requires_grad_()
         sigma = noise(z).mT  # (N, *batch, k, n)
         slope = jacobian(sigma.flatten(-2), z).unflatten(-2, sigma.shape[-2:])
-    none = x.new_zeros(*sigma.shape, problem.system.m)
+    slope, none = slope.nan_to_num(0.0, 0.0, 0.0), x.new_zeros(*sigma.shape, problem.system.m)
     return math.sqrt(problem.horizon.dt) * torch.cat([sigma[..., None], slope, none], -1).detach()
 
 

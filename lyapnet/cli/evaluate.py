@@ -108,6 +108,7 @@ def _write_figures(
     from lyapnet.evaluation.after_horizon_figure import distances
     from lyapnet.evaluation.noise_figure import bands, states_to_draw
     from lyapnet.evaluation.path_figure import has_plane, paths
+    from lyapnet.evaluation.plants_figure import cost_against_parameters
 
     x0, problem = measured.table.x0[:12], controller.problem
     seed = None if problem.noise is None else measured.seed
@@ -122,6 +123,8 @@ def _write_figures(
         drawn["noise"] = bands(controller.rollout(states_to_draw(x0), noise=seed), problem)
     if measured.result()["optimal_cost_mean"] is not None:
         drawn["optimality"] = figures.optimality(measured.table)
+    if measured.plants is not None and measured.plants.optimal_cost is not None:
+        drawn["plants"] = cost_against_parameters(measured.plants)
     if any(one.distance is not None for one in later):
         drawn["afterwards"] = distances(later, controller)
     folder.mkdir(parents=True, exist_ok=True)

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
 from lyapnet.base.random_streams import NOISE, stream
-from lyapnet.experiment.assembly import Parts, build_problem, build_rollout, member
+from lyapnet.experiment.assembly import Parts, build_plants, build_problem, build_rollout, member
 from lyapnet.experiment.config import Config, SystemConfig
 from lyapnet.loop.programs import Program, ValueProgram
+from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.loop.rollout import ClosedLoop, Rollout, Trajectory
 from lyapnet.loop.rollout.runge_kutta import Step
 from lyapnet.task.cost import Cost
@@ -188,6 +189,11 @@ class Controller:
     def step(self) -> Step:
         """(t, Δt, x) ↦ (x', stages, ∫ℓ, u, V), one step of the rollouts; rk4 for an adaptive method."""
         return Step(self._rollout.stepped, TABLEAUX.get(self._rollout.solver_arguments["method"], TABLEAUX["rk4"]))
+
+    @property
+    def plants(self) -> RandomPlants | None:
+        """The plants of its config's `randomise`, with parameters that it was not told; None if there are none."""
+        return None if self._config is None else build_plants(self._config, self._rollout)
 
     @property
     def law(self) -> ContinuedPolicy:

@@ -15,6 +15,7 @@ from lyapnet.base.tables import csv_text
 from lyapnet.base.types import PerState, State
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.after_horizon import share_at_goal
+from lyapnet.evaluation.on_plants import OnPlants, measure_on_plants
 from lyapnet.evaluation.optimality import in_spreads, ratio_of_means
 from lyapnet.evaluation.oracles import Report, RiccatiOracle, oracle_of, silent
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
@@ -53,6 +54,7 @@ class Evaluation(NamedTuple):
     after: str  # name of the law after T
     optimum_of: str = ""  # model of the optimum: its steps, or continuous time; empty if none was computed
     noise: NoiseMeasures | None = None  # with noise; costs are then expectations
+    plants: OnPlants | None = None  # with random plants; all other measures are those on the model
 
     def result(self) -> dict[str, Any]:
         """The summary, as `lyapnet evaluate --json` prints it.
@@ -77,6 +79,7 @@ class Evaluation(NamedTuple):
             **used,
             **counts,
             **({} if self.noise is None else {"noise": plain(self.noise._asdict())}),
+            **({} if self.plants is None else {"plants": plain(self.plants.summary())}),
             **({} if self.at_goal is None else {"at_goal_fraction": self.at_goal, "after_T": self.after}),
             **({"optimum_of": self.optimum_of} if self.optimum_of else {}),
             **self._note(),
@@ -180,6 +183,15 @@ def evaluation(
     x0 = controller.initial_states.sample(samples + PAPER_STATES, stream(seed, TEST))
     if controller.problem.noise is not None:
         return _evaluation_under_noise(controller, x0, samples, seed, optimum, progress, paths)
+    plants = controller.plants
+    on_plants = None if plants is None else measure_on_plants(plants, x0[:samples], seed, optimum, progress)
+    return _evaluation_on_model(controller, x0, samples, seed, optimum, progress)._replace(plants=on_plants)
+
+
+def _evaluation_on_model(
+    controller: Controller, x0: State, samples: int, seed: int, optimum: bool, progress: Report
+) -> Evaluation:
+    """The measures without noise, on the model."""
     trajectory = controller.rollout(x0)
     with torch.no_grad():
         table = measure(controller.problem, controller.program, trajectory)

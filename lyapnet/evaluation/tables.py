@@ -47,7 +47,7 @@ def evaluation_table(title: str, result: dict[str, Any]) -> Table:
     table = Table("measure", "value", title=f"{title}\n{result['samples']} unseen states of X₀, seed {result['seed']}")
     for key, label in _rows(result).items():
         table.add_row(label, _entry(key, result[key]))
-    for label, entry in _noise_rows(result).items():
+    for label, entry in {**_noise_rows(result), **_plant_rows(result)}.items():
         table.add_row(label, entry)
     for name, error in result.get("terminal_errors", {}).items():
         table.add_row(f"terminal error, mean |{name}|", f"{error:.4g}")
@@ -88,6 +88,24 @@ def _noise_rows(result: dict[str, Any]) -> dict[str, str]:
             "infinite" if level is None else f"{level:.4g}" for level in levels.values()
         ),
         "paths lost, which cost half more than V and not by their noise": f"{noise['lost_fraction']:.2%}",
+    }
+
+
+def _plant_rows(result: dict[str, Any]) -> dict[str, str]:
+    """The rows of a task with random plants."""
+    if (found := result.get("plants")) is None:
+        return {}
+    ratios = {
+        "… / optimum of each plant, ratio of the means (largest)": " ".join(
+            [measured_or_not("cost_ratio", found["cost_ratio"]), f"({measured_or_not('', found['largest_ratio'])})"]
+        )
+    }
+    share = found["finite_fraction"]
+    return {
+        "on random plants, of which the law is told nothing: cost J, mean": (
+            f"not finite on {1 - share:.1%}" if share < 1 else f"{found['cost_mean']:.4g}"
+        ),
+        **(ratios if found["optimal_cost_mean"] is not None else {}),
     }
 
 

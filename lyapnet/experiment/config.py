@@ -290,6 +290,10 @@ class Config:
     noise: dict[str, float] = setting(
         {}, "σ of states that noise drives, each as STATE: σ in its unit per √s; see the page on noise.", at_least=0
     )
+    randomise: dict[str, list[float]] = setting(
+        {}, "Ranges [least, greatest] of parameters of the plant that V and the law are not told; see the page on "
+        "plants that differ.",
+    )  # fmt: skip
     network: NetworkConfig = field(default_factory=NetworkConfig)
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -26,8 +26,9 @@ def build_module(config: Config, parts: Parts | None = None) -> TrainingModule:
     if config.seeds == 1:
         learner = build_learner(config, problem, parts)
         module = ValueModule(
-            problem, learner.V, learner.program, learner.rollout, learner.pointwise, options, config.seed
-        )
+            problem, learner.V, learner.program, learner.rollout, learner.pointwise, options, config.seed,
+            learner.plants,
+        )  # fmt: skip
     else:
         members = [build_learner(each, problem, parts, label_of(each)) for each in configs_of_seeds(config)]
         module = EnsembleModule(members, options)

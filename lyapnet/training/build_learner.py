@@ -11,6 +11,7 @@ from lyapnet.base.errors import UsageError
 from lyapnet.base.files import read_file
 from lyapnet.experiment.assembly import (
     Parts,
+    build_plants,
     build_problem,
     build_program,
     build_rollout,
@@ -40,7 +41,8 @@ def build_learner(config: Config, problem: Problem, parts: Parts | None = None, 
     parts = parts or Parts()
     V = build_value_function(config, problem, parts.network)
     rollout, program = build_rollout(config, problem, V), parts.program or build_program(config)
-    learner = Learner(problem, V, rollout, program, build_pointwise(config, rollout, program), config.seed, label)
+    pointwise, plants = build_pointwise(config, rollout, program), build_plants(config, rollout)
+    learner = Learner(problem, V, rollout, program, pointwise, config.seed, label, plants)
     learner.metadata = {"config": to_plain(config), "problem": problem.record()}
     return learner
 

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.base.errors import CompilationError, UntraceableError, UsageError
-from lyapnet.base.random_streams import NOISE, POINTS, VALIDATION, stream
+from lyapnet.base.random_streams import NOISE, PLANTS, POINTS, VALIDATION, stream
 from lyapnet.base.types import PerState, State
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
+from lyapnet.loop.random_plants import RandomPlants, StateOfPlant
 from lyapnet.loop.rollout import Rollout, Trajectory
 from lyapnet.task.cost import PenaltyCost, spread
 from lyapnet.task.problem import Problem
@@ -32,6 +33,7 @@ class Learner(nn.Module):
         pointwise: the program's condition at points off the closed loops, if it is a term of the loss.
         seed: seed of these points.
         label: name of this learner in messages and file names; "" for a single one.
+        plants: the plants of its closed loops, if they differ from the model.
 
     Raises:
         UsageError: the problem has constraints but no penalty for them.
@@ -40,6 +42,7 @@ class Learner(nn.Module):
     problem: Problem
     V: ValueFunction
     rollout: Rollout
+    plants: RandomPlants | None
     program: Program
     pointwise: PointwiseCondition | None
     seed: int
@@ -56,6 +59,7 @@ class Learner(nn.Module):
         pointwise: PointwiseCondition | None = None,
         seed: int = 0,
         label: str = "",
+        plants: RandomPlants | None = None,
     ):
         super().__init__()
         if problem.constraints is not None and not isinstance(problem.cost, PenaltyCost):
@@ -63,7 +67,7 @@ class Learner(nn.Module):
                 "Expected a relaxed problem for training with constraints, got the problem itself; pass "
                 "problem.relaxed(weight=…), w in cost per second, or train from a config, which finds w."
             )
-        self.problem, self.V, self.rollout = problem, V, rollout
+        self.problem, self.V, self.rollout, self.plants = problem, V, rollout, plants
         V.made_for = type(rollout.closed_loop.policy)
         self.program: Program = program if problem.has_goal else program.without_goal(problem.no_goal)
         self.pointwise, self.seed, self.label = pointwise, seed, label
@@ -102,15 +106,26 @@ class Learner(nn.Module):
         return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
 
     def roll_out(self, x0: State, *draw: int) -> Trajectory:
-        """The closed loop from x₀, under noise if the problem has some.
+        """The closed loop from x₀, under noise if the problem has some, and on random plants if there are some.
 
         Args:
-            draw: identifies the random stream of the noise, which also depends on the seed.
+            draw: identifies the random stream of both, which also depends on the seed.
         """
         noise, horizon = self.problem.noise, self.problem.horizon
+        if self.plants is not None:
+            return self.plants(self.with_plants(x0, *draw))
         if noise is None:
             return self.rollout(x0)
         return self.rollout(x0, noise.draw(horizon.steps, horizon.dt, x0, stream(self.seed, NOISE, *draw)))
+
+    def with_plants(self, x0: State, *draw: int) -> StateOfPlant:
+        """(x₀, p) of the closed loops that `roll_out` computes from x₀ (b, n); x₀ without random plants."""
+        return x0 if self.plants is None else self.plants.draw(x0, stream(self.seed, PLANTS, *draw))
+
+    @property
+    def problem_of_loops(self) -> Problem:
+        """The problem that the closed loops solve: that of the random plants, or that of V."""
+        return self.problem if self.plants is None else self.plants.problem
 
     def train_on(self, trajectory: Trajectory, draw: Sequence[int] = (POINTS,)) -> Tensor:
         """The loss of a training batch; its terms are stored in `output`.

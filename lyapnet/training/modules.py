@@ -20,6 +20,7 @@ from lyapnet.base.errors import CheckpointError, DivergenceError, UsageError
 from lyapnet.base.random_streams import POINTS, TRAINING, VALIDATION
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
 from lyapnet.loop.programs import PointwiseCondition, Program
+from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.loop.rollout import ADAPTIVE_METHODS, Rollout
 from lyapnet.task.cost import PenaltyCost
 from lyapnet.task.problem import Problem
@@ -53,14 +54,8 @@ class TrainingModule(L.LightningModule):
 
     def compile_for(self, batch_size: int) -> None:
         """Compile the closed loop for batches of this size; members share the code. See DiscreteAdjoint.compile."""
-        first, *others = [member.rollout.discrete for member in self.members]
-        if first is None:
-            return
-        X0 = self.members[0].problem.initial_states
-        first.compile(X0.center.expand(batch_size, -1).contiguous())
-        for loop in others:
-            if loop is not None and not loop.share_code(first, X0.sample(batch_size, torch.Generator().manual_seed(0))):
-                loop.compile_like(first)
+        _compile_alike([member.rollout for member in self.members], batch_size)
+        _compile_alike([member.plants.rollout for member in self.members if member.plants is not None], batch_size)
 
     def training_step(self, x0: Tensor, batch_idx: int) -> dict[str, Tensor]:
         """The sum of the losses on their initial states of all members that still train."""
@@ -239,9 +234,22 @@ class TrainingModule(L.LightningModule):
         return key
 
 
+def _compile_alike(rollouts: Sequence[Rollout], batch_size: int) -> None:
+    """Compile some closed loops of one problem for batches of this size; they share the code."""
+    loops = [rollout.discrete for rollout in rollouts if rollout.discrete is not None]
+    if not loops:
+        return
+    first, *others = loops
+    X0 = rollouts[0].problem.initial_states
+    first.compile(X0.center.expand(batch_size, -1).contiguous())
+    for loop in others:
+        if not loop.share_code(first, X0.sample(batch_size, torch.Generator().manual_seed(0))):
+            loop.compile_like(first)
+
+
 def _is_alias(key: str) -> bool:
     """Whether the key is a second name of a weight of V, by way of the closed loop."""
-    return re.match(r"members\.\d+\.rollout\.", key) is not None
+    return re.match(r"members\.\d+\.(rollout|plants)\.", key) is not None
 
 
 class ValueModule(TrainingModule):
@@ -259,6 +267,7 @@ class ValueModule(TrainingModule):
         pointwise: the program's condition at points off the closed loops, if it is a term of the loss.
         optimizer: the options of the optimizer.
         seed: seed of these points.
+        plants: the plants of the closed loops, if they differ from the model.
 
     Raises:
         UsageError: f, g, the cost or V break their contracts.
@@ -273,6 +282,7 @@ class ValueModule(TrainingModule):
         pointwise: PointwiseCondition | None = None,
         optimizer: OptimizerOptions | None = None,
         seed: int = 0,
+        plants: RandomPlants | None = None,
     ):
         problem.check()
         if not any(p.is_floating_point() for p in V.parameters()):
@@ -280,7 +290,7 @@ class ValueModule(TrainingModule):
         problem.check_value_function(V)
         law = known_law(problem, V) or HJBPolicy
         rollout = Rollout(problem, law(problem, V), gradient="discrete") if rollout is None else rollout
-        member = Learner(problem, V, rollout, program, pointwise, seed)
+        member = Learner(problem, V, rollout, program, pointwise, seed, plants=plants)
         super().__init__([member], optimizer or OptimizerOptions())
 
     @property

@@ -1,6 +1,7 @@
 """The callback that computes the optimal cost of the validation states before the first step."""
 
 import time
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from lyapnet.base.errors import OracleError
+from lyapnet.base.random_streams import VALIDATION
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.training.curves import data_of, members_of
 from lyapnet.training.learner import Learner
@@ -41,8 +43,7 @@ class ValidationOptimum(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         members = members_of(pl_module)
         if self.cost is None and self.wanted:
-            states = data_of(trainer).validation_batch()
-            found = self._solve(members[0], states) if trainer.is_global_zero else None
+            found = self._solve(members, data_of(trainer).validation_batch()) if trainer.is_global_zero else None
             self.cost = trainer.strategy.broadcast(found)
         if self.cost is not None:
             for member, cost in zip(members, self.cost.to(pl_module.device), strict=True):
@@ -50,14 +51,16 @@ class ValidationOptimum(Callback):
         if trainer.is_global_zero:
             self.stages("curves and figures of the start")
 
-    def _solve(self, member: Learner, states: Tensor) -> Tensor | None:
+    def _solve(self, members: Sequence[Learner], states: Tensor) -> Tensor | None:
         """J* (members, b) for states (members, b, n), or (1, b) for (b, n); NaN after the first COMPARED_STATES states.
 
-        None if the problem has no oracle.
+        On random plants it is the optimum of the plant from each state. None if the problem has no oracle.
         """
-        started = time.perf_counter()
+        started, first = time.perf_counter(), members[0]
+        own = states.reshape(-1, *states.shape[-2:])
+        states = torch.stack([each.with_plants(x0, VALIDATION) for each, x0 in zip(members, own, strict=True)])
         try:
-            oracle = oracle_of(member.problem, member.rollout.method)
+            oracle = oracle_of(first.problem_of_loops, first.rollout.method)
             compared = states[..., :COMPARED_STATES, :]
             optima = oracle.solve(compared.flatten(0, -2), progress=partial(self.stages, "optima of validation states"))
         except OracleError as error:

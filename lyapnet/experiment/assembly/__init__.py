@@ -5,12 +5,14 @@ from lyapnet.experiment.assembly.entries import entry_per_state
 from lyapnet.experiment.assembly.family import knows, member
 from lyapnet.experiment.assembly.learner import build_program, build_rollout, build_value_function
 from lyapnet.experiment.assembly.named_parts import parts_named, parts_of
+from lyapnet.experiment.assembly.plants import build_plants
 from lyapnet.experiment.assembly.problem import build_problem, build_system, operating_point, with_parameters
 
 __all__ = [
     "DTYPES",
     "REGISTRIES",
     "Parts",
+    "build_plants",
     "build_problem",
     "build_program",
     "build_rollout",

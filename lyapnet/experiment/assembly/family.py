@@ -3,7 +3,7 @@
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -35,13 +35,11 @@ def family_of(
     """
     if isinstance(cost, MadeOfAnother) and innermost(cost).goal is not None:
         raise UsageError("Expected a cost about the origin for a family, got one about a goal of its own.")
-    ranges = _checked_ranges(config.family)
+    ranges = checked_ranges(config.family, "family")
     targets = _target_indices(ranges, system)
-    low, high = (torch.tensor([r[side] for r in ranges.values()], dtype=torch.float64) for side in (0, 1))
     units = [system.state_units[targets[name]] if name in targets else "" for name in ranges]
-    family = FamilySystem(system, list(ranges), units)
-    box = Box(torch.cat([initial_states.lower, low]), torch.cat([initial_states.upper, high]))
-    _check_members(config, family, box)
+    family, box = members_of(config, system, ranges, units, initial_states)
+    low, high = box.lower[system.n :], box.upper[system.n :]
     center = (low + high) / 2
     shift = torch.zeros(system.n, len(ranges), dtype=torch.float64)
     for k, name in enumerate(ranges):
@@ -53,6 +51,26 @@ def family_of(
         if config.target_control is None:
             _require_one_control(family, cost, shift, center, low, high)
     return family, FamilyCost(cost, shift, center, _weight_of_members(cost, family)), box
+
+
+def members_of(
+    config: Config,
+    system: ControlAffineSystem,
+    ranges: Mapping[str, Sequence[float]],
+    units: Sequence[str],
+    initial_states: Box,
+    key: str = "a family",
+) -> tuple[FamilySystem, Box]:
+    """The family of a system with parameters in some ranges [least, greatest], and the box X₀ × P.
+
+    Raises:
+        UsageError: a member breaks the contract of FamilySystem.
+    """
+    low, high = (torch.tensor([r[side] for r in ranges.values()], dtype=torch.float64) for side in (0, 1))
+    family = FamilySystem(system, list(ranges), units)
+    box = Box(torch.cat([initial_states.lower.to(low), low]), torch.cat([initial_states.upper.to(high), high]))
+    _check_members(config, family, box, key)
+    return family, box
 
 
 def member(
@@ -97,15 +115,20 @@ def knows(config: Config, name: str, value: float) -> bool:
     return least - room <= value <= greatest + room
 
 
-def _checked_ranges(family: Mapping[str, list[float]]) -> dict[str, list[float]]:
-    for name, bounds in family.items():
+def checked_ranges(ranges: Mapping[str, list[float]], key: str) -> dict[str, list[float]]:
+    """The ranges [least, greatest] of the parameters of a section, by name.
+
+    Raises:
+        UsageError: a name is reserved, or a range is none.
+    """
+    for name, bounds in ranges.items():
         if name in RESERVED_NAMES:
             raise UsageError(
-                f"Expected parameters of a family other than {', '.join(RESERVED_NAMES)}, got {name}; rename it."
+                f"Expected parameters in {key} other than {', '.join(RESERVED_NAMES)}, got {name}; rename it."
             )
         if len(bounds) != 2 or not -math.inf < bounds[0] <= bounds[1] < math.inf:
-            raise UsageError(f"Expected family.{name} as [least, greatest], got {bounds}; give two finite numbers.")
-    return dict(family)
+            raise UsageError(f"Expected {key}.{name} as [least, greatest], got {bounds}; give two finite numbers.")
+    return dict(ranges)
 
 
 def _target_indices(names: Mapping[str, object], system: ControlAffineSystem) -> dict[str, int]:
@@ -119,18 +142,19 @@ def _target_indices(names: Mapping[str, object], system: ControlAffineSystem) ->
     return {name: known[name] for name in targets}
 
 
-def _check_members(config: Config, family: FamilySystem, box: Box) -> None:
+def _check_members(config: Config, family: FamilySystem, box: Box, key: str) -> None:
     """Compare members with newly constructed systems, see `check_members`."""
     if not family.parameters_in_f:
         return
     cls, given = type(family.system), config.system.parameters
 
     def build(values: Mapping[str, float]) -> ControlAffineSystem:
-        with section("family"):
+        with section(key.removeprefix("a ")):
             return cls(**{**given, **values})
 
     inside = box.sample(TEST_STATES, torch.Generator().manual_seed(0))
-    check_members(family, build, torch.cat([box.lower[None], box.upper[None], inside]))
+    states = torch.cat([box.lower[None], box.upper[None], inside])
+    check_members(family, build, states, f"parameters of {key}")
 
 
 def _require_one_control(

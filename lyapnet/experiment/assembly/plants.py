@@ -1,0 +1,46 @@
+"""Builds the random plants of a config."""
+
+import copy
+
+from lyapnet.base.errors import UsageError
+from lyapnet.experiment.assembly.classes import float64_defaults
+from lyapnet.experiment.assembly.family import checked_ranges, members_of
+from lyapnet.experiment.config import Config
+from lyapnet.loop.random_plants import RandomPlants
+from lyapnet.loop.rollout import Rollout
+from lyapnet.task.constraints import OfFirstStates
+from lyapnet.task.family import FamilyCost
+
+
+def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
+    """The plants of `randomise`, with parameters that V and the law are not told; None if there are none.
+
+    The cost stays that of the model, also where it depends on a parameter, as R: inverse_mass does.
+
+    Args:
+        rollout: the closed loop with the model.
+
+    Raises:
+        UsageError: a name is no parameter of f and g, a range is invalid, or the task can have no such plants.
+    """
+    if not config.randomise:
+        return None
+    _require_support(config)
+    problem, ranges = rollout.problem, checked_ranges(config.randomise, "randomise")
+    n, k, like = problem.system.n, len(ranges), problem.initial_states.lower
+    with float64_defaults():  # as when the problem is built
+        exact = copy.deepcopy(problem.system).double()
+        system, box = members_of(config, exact, ranges, [""] * k, problem.initial_states, "randomise")
+    cost = FamilyCost(problem.cost, like.new_zeros(n, k), box.center[n:].to(like)).to(like)
+    constraints = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
+    plants = problem.replaced(system=system.to(like), cost=cost, initial_states=box.to(like), constraints=constraints)
+    return RandomPlants(plants, rollout)
+
+
+def _require_support(config: Config) -> None:
+    """Raise UsageError for settings that know no random plants."""
+    for key, given in (("family", config.family), ("noise", config.noise)):
+        if given:
+            raise UsageError(f"Expected randomise without {key}, got both; leave one of them out.")
+    if config.horizon.stationary:
+        raise UsageError("Expected horizon.stationary: false with randomise, got true; give a horizon that ends.")

@@ -133,6 +133,18 @@ def test_limits_of_states_and_controls_choose():
         problem_of(target={"output voltage": 15}, controls={"lower": 0, "upper": 0.2})
 
 
+def test_distances_are_in_units_of_x0_and_angles_are_modulo_a_turn():
+    """Extents: the widths 4 and 2, the centre 3 of a state that X₀ fixes, and 1 of one that it fixes at zero."""
+    points = search(Cartpole(), [-1.0, -1.0, 3.0, 0.0], [3.0, 1.0, 3.0, 0.0])
+    assert points.distance(torch.tensor([1.0, 0.0, 3.0, 0.0])) == 0
+    parts = [(3.0, 0.0, 3.0, 0.0), (1.0, -4 * math.pi + 0.5, 3.0, 0.0), (1.0, 0.0, -3.0, 0.0), (1.0, 0.0, 3.0, 0.25)]
+    assert [points.distance(torch.tensor(x)) for x in parts] == pytest.approx([0.5, 0.25, 2.0, 0.25])
+    assert points.distance(torch.tensor([3.0, 2 * math.pi - 0.5, 9.0, 1.0])) == pytest.approx(
+        math.sqrt(0.5**2 + 0.25**2 + 2**2 + 1**2)
+    )
+    assert points.distance(torch.tensor([1.0 + 2 * math.pi, 0.0, 3.0, 0.0])) == pytest.approx(math.pi / 2), "no angle"
+
+
 def test_upright_is_nearer_than_hanging():
     upright, hanging = search(Cartpole(), [-1.0] * 4, [1.0] * 4).find({0: 0.5})
     assert_close(upright.x, torch.tensor([0.5, 0, 0, 0]), rtol=0, atol=1e-12)

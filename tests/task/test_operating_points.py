@@ -123,6 +123,20 @@ def test_of_several_it_is_the_nearest_to_the_centre_and_others_are_listed(caplog
     assert "the nearest to X₀'s centre of 2; also z = -2" in note
 
 
+class Heavy(Level):
+    """Each of the two points needs its own, large control: u = 1e5 z holds y."""
+
+    def f(self, x):
+        return torch.stack([3 - x[..., 0] ** 2, -1e5 * x[..., 0]], -1)
+
+
+def test_a_point_that_is_found_again_is_the_same_in_units_of_its_controls_too():
+    found = search(Heavy(), [0.5, -1.0], [1.5, 1.0], ControlBox(-1e6, 1e6)).find({1: 0.3})
+    root = math.sqrt(3)
+    assert_close(torch.stack([point.x[0] for point in found]), torch.tensor([root, -root]), rtol=1e-9, atol=0)
+    assert_close(torch.stack([point.u[0] for point in found]), 1e5 * torch.tensor([root, -root]), rtol=1e-9, atol=0)
+
+
 def test_limits_of_states_and_controls_choose():
     inside = {"lower": [-1.5, -1], "upper": [0.9, 1]}
     both = problem_of(system=Level(), target={"y": 0.1}, initial_states=inside)

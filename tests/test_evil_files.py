@@ -119,8 +119,9 @@ def test_modules_that_checkpoints_name(named, trained, marker, capsys):
     write_checkpoint(content, Path("evil.ckpt"))
     for verb, arguments in VERBS.items():
         status, said = innocent_after(arguments("evil.ckpt"), marker, capsys)
-        # fine-tuning takes the weights alone, and the others have no use for callbacks and loggers
+        # fine-tuning takes the weights of V alone, and the others have no use for callbacks and loggers
         assert status or verb == "finetune" or named in ("callbacks", "loggers"), said
+        assert verb != "finetune" or bool(status) == (named in ("system", "network", "loggers")), said
     importlib.import_module("trap")  # the twin
     assert marker.exists()
 

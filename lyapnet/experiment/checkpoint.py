@@ -132,7 +132,7 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
     """Read a torch file that contains only tensors, numbers, strings, lists and dictionaries.
 
     Raises:
-        UsageError: no such file.
+        UsageError: no such file, or a config.
         CheckpointError: the file is truncated, foreign, or contains anything else; no code of it was executed.
     """
     path = Path(path)
@@ -150,6 +150,11 @@ def read_plain_data(path: str | Path, device: str | torch.device = "cpu") -> Any
         raise UsageError(
             f"Expected a checkpoint file, got {str(path)!r} ({_describe_error(error)}); use another."
         ) from error
+    if path.suffix in (".yaml", ".yml"):
+        raise UsageError(
+            f"Expected a checkpoint file, got {str(path)!r}, which is a config; train it, and pass "
+            "checkpoints/best.ckpt of its run."
+        )
     if not path.stat().st_size:
         raise CheckpointError(
             f"Expected a lyapnet checkpoint, got {str(path)!r}, which is empty; use another of the run."

@@ -8,12 +8,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from lyapnet.base.contracts import called, check_function, check_memory, copied
+from lyapnet.base.contracts import check_function, check_memory, check_result, copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.findings import Findings
 from lyapnet.base.linear_algebra import apply, convex_or
 from lyapnet.base.types import Control, PerState, State
 from lyapnet.task.constraints import Constraints
+from lyapnet.task.contracts import (
+    check_shapes_of_controls,
+    check_shapes_of_cost,
+    check_shapes_of_system,
+    contracts_of_cost,
+    contracts_of_system,
+)
 from lyapnet.task.cost import Cost, PenaltyCost, reason_for_no_goal
 from lyapnet.task.domain import Border, Domain, DomainCost, as_written, find_borders, size_of, within
 from lyapnet.task.horizon import TABLEAUX, Horizon, weighted_sum
@@ -123,6 +130,7 @@ class Problem(nn.Module):
         """States (b, n) of X₀, and states reached from there by random constant controls in GOAL_TEST_STEPS steps."""
         generator = torch.Generator().manual_seed(0)
         x = self.initial_states.sample(TRIED, generator)
+        self.check_shapes(x)  # wrong ones may broadcast, and grow by a factor in each step
         u = self.controls.project(self.rest + torch.randn(TRIED, self.system.m, generator=generator).to(x))
         states, N = [x], min(self.horizon.steps, GOAL_TEST_STEPS)
         for n in range(1, N + 1):
@@ -276,14 +284,9 @@ class Problem(nn.Module):
         name = type(system).__name__
         generator = torch.Generator().manual_seed(0)
         x = own.initial_states.sample(256, generator)
-        for symbol, function, shape in (
-            (f"{name}.f(x)", system.f, (n,)),
-            (f"{name}.g(x)", system.g, (n, m)),
-            (f"q(x) of {type(cost).__name__}", cost.state, ()),
-            (f"φ(x) of {type(cost).__name__}", cost.terminal, ()),
-            (f"R(x) of {type(cost).__name__}", cost.R, (m, m)),
-        ):
-            check_function(symbol, function, [x[:TRIED]], shape)
+        own.check_shapes(x[:TRIED])
+        for contract in (*contracts_of_system(system), *contracts_of_cost(cost, m)):
+            check_function(contract.name, contract.function, [x[:TRIED]], contract.shape)
         if own.noise is not None:
             check_function(f"{name}.noise(x)", own.noise, [x[:TRIED]], (n, own.noise.sources))
         cost.check(x)
@@ -295,13 +298,22 @@ class Problem(nn.Module):
                 "another system may have to override its dynamics too."
             )
         u = own.controls.minimise(cost.R(x), 100 * b)
-        inside = u.shape == b.shape and torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9)
-        if not inside:
+        if not torch.allclose(u, own.controls.project(u), rtol=1e-6, atol=1e-9):
             raise UsageError(
-                f"Expected {type(own.controls).__name__}.minimise(R, b) in the set and of shape {tuple(b.shape)}, got "
-                f"{tuple(u.shape)} or a control outside; correct it."
+                f"Expected {type(own.controls).__name__}.minimise(R, b) in the set, got a control outside, which "
+                "project(u) moves; correct one of them."
             )
         check_memory(own.parts, lambda: own.call(x[:TRIED]), lambda: own.call(own.initial_states.ends(TRIED)))
+
+    def check_shapes(self, x: State) -> None:
+        """Check the shapes of f, g, ẋ, q, φ, R and of U's functions at states (b, n), in their precision, on the CPU.
+
+        Raises:
+            UsageError: one is wrong; says which one, and its shape.
+        """
+        check_shapes_of_system(self.system, x)
+        check_shapes_of_cost(self.cost, self.system.m, x)
+        check_shapes_of_controls(self.controls, x.new_ones(len(x), self.system.m))
 
     @property
     def parts(self) -> dict[str, nn.Module]:
@@ -349,6 +361,11 @@ class Problem(nn.Module):
         x = self.initial_states.sample(TRIED, generator).double().cpu()
         t = self.horizon.duration * torch.rand(TRIED, generator=generator, dtype=torch.float64)
         check_function(f"{name}.forward(t, x)", own, [t, x], ())
+        both = f"{name}.value_and_state_gradient(t, x)"
+        value, V_x = (
+            check_result(f"{both}[{i}]", lambda t, x, i=i: own.value_and_state_gradient(t, x)[i], [t, x], shape)
+            for i, shape in enumerate([(), (self.system.n,)])
+        )
         leaf = x.clone().requires_grad_()
         with torch.enable_grad():
             (expected,) = torch.autograd.grad(own(t, leaf).sum(), leaf, materialize_grads=True)
@@ -358,14 +375,10 @@ class Problem(nn.Module):
             lambda: own.value_and_state_gradient(t, x),
             lambda: own.value_and_state_gradient(t.flip(0), ends),
         )
-        value, V_x = called(f"{name}.value_and_state_gradient(t, x)", own.value_and_state_gradient, [t, x])
-        same = V_x.shape == x.shape and torch.allclose(
-            V_x, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().max())
-        )
+        same = torch.allclose(V_x, expected, rtol=1e-6, atol=1e-6 * float(expected.abs().max()))
         if not same or not torch.allclose(value, own(t, x), rtol=1e-6):
             raise UsageError(
-                f"Expected {name}.value_and_state_gradient(t, x) as V and its gradient in x, got others than "
-                "autograd's: correct it, or leave it out."
+                f"Expected {both} as V and its gradient in x, got others than autograd's: correct it, or leave it out."
             )
 
     def record(self) -> dict[str, list[Any]]:

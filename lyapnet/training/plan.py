@@ -15,7 +15,7 @@ import torch
 from lyapnet.base.errors import LyapnetError, UsageError
 from lyapnet.base.sizes import check_training_sizes
 from lyapnet.controller.loading import config_of, load_value_function, require_parts
-from lyapnet.experiment.assembly import Parts, parts_of
+from lyapnet.experiment.assembly import REGISTRIES, Parts, parts_of
 from lyapnet.experiment.assembly.target import named_entries
 from lyapnet.experiment.checkpoint import KEY, read_checkpoint
 from lyapnet.experiment.config import Config, differing_keys, load_config
@@ -94,7 +94,7 @@ def plan_run(
     require_parts(config, parts, config.experiment)
     module = build_module(config, parts)
     if not resume:
-        _load_initial_weights(config, module, finetune)
+        _load_initial_weights(config, parts, module, finetune)
         run, lock = new_run(config, finetune)
         return Plan(config, parts, module, callbacks, run, lock=lock)
     run = last_run(config) if resume == LAST else TrainingRun(Path(resume).resolve().parent.parent)
@@ -105,7 +105,7 @@ def plan_run(
     with ExitStack() as stack:
         lock = None if is_further_process() else stack.enter_context(RunLock(run.folder))
         if resume == LAST and not run.begun:
-            _restart(run, config, module)
+            _restart(run, config, parts, module)
             plan = Plan(config, parts, module, callbacks, run, anew=True, lock=lock)
         else:
             content = _read_to_resume(checkpoint, run)
@@ -154,20 +154,21 @@ def _read_to_resume(checkpoint: Path, run: TrainingRun) -> dict[str, Any]:
         raise type(error)(f"{error} The best one is there: go on from it with --resume {run.best}.") from error
 
 
-def _restart(run: TrainingRun, config: Config, module: TrainingModule) -> None:
+def _restart(run: TrainingRun, config: Config, parts: Parts, module: TrainingModule) -> None:
     """Start a run again that was stopped before its first checkpoint."""
     written = run.folder / CONFIG
     if written.exists():
         _require_same_experiment(config, load_config(written), written)
-    _load_initial_weights(config, module, run.finetuned_from)
+    _load_initial_weights(config, parts, module, run.finetuned_from)
 
 
-def _load_initial_weights(config: Config, module: TrainingModule, checkpoint: Path | None) -> None:
+def _load_initial_weights(config: Config, parts: Parts, module: TrainingModule, checkpoint: Path | None) -> None:
     """Load the weights of a checkpoint into every member, if one is given."""
     if checkpoint is not None:
         content = read_checkpoint(checkpoint)
         if content[KEY].get("config") is not None:
             given = config_of(content, checkpoint)  # raises if this version cannot read it
+            _require_own_classes(given, parts, config, checkpoint)
             if [*given.family] != [*config.family]:  # V identifies parameters by their order
                 names, own = (", ".join(family) or "none" for family in (given.family, config.family))
                 raise UsageError(
@@ -190,6 +191,20 @@ def _load_initial_weights(config: Config, module: TrainingModule, checkpoint: Pa
                 _warn_of_other_target(given.target, module.members[0].problem, checkpoint)
         for member in module.members:
             load_value_function(member.V, content, checkpoint)
+
+
+def _require_own_classes(given: Config, parts: Parts, config: Config, checkpoint: Path) -> None:
+    """Raise UsageError where V was trained with a user's system or network, and the config names one of lyapnet's.
+
+    Another cost, program or set is allowed: the meaning of the states and of the weights does not depend on them.
+    """
+    for part in ("system", "network"):
+        name, own = getattr(given, part).name, getattr(config, part).name
+        if name not in REGISTRIES[part][0] and getattr(parts, part) is None:
+            raise UsageError(
+                f"Expected {part}.name as module:Class for {str(checkpoint)!r}, which was trained with {name}, got "
+                f"{own}; name your own class, or start anew without --finetune: a file's class is never imported."
+            )
 
 
 def _require_same_experiment(config: Config, stored: Config, origin: Path) -> None:

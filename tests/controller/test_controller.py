@@ -24,7 +24,7 @@ from lyapnet.loop.rollout import Rollout
 from lyapnet.task.systems import DoubleIntegrator, Linear
 from lyapnet.value.after_horizon import LAWS
 from lyapnet.value.policy import HJBPolicy
-from tests.problems import Quadratic, problem_of
+from tests.problems import Quadratic, problem_of, untrained
 
 CONF = Path(__file__).parents[2] / "conf"
 SMALL = [
@@ -157,6 +157,19 @@ def test_arrays_and_lists_in_arrays_out(x, controller):
     for array, expected in pairs:
         assert isinstance(array, np.ndarray | np.generic)
         np.testing.assert_allclose(array, expected.numpy(), rtol=1e-6)
+
+
+def test_a_member_outside_the_family_is_noted_once(caplog):
+    """Its ends count as inside, up to the rounding of ten nines."""
+    of_family = untrained("pendulum_swingup", "family={mass: [0.5, 2.0]}", "network.hidden=[4]")
+    for mass in (0.5, 1.0, 2.0, 2.0 * (1 + 1e-10)):
+        of_family.value(0.0, [0.1, 0.0], mass=mass)
+    assert not caplog.records
+    of_family.value(0.0, [[0.1, 0.0], [0.2, 0.0]], mass=[1.0, 2.1])
+    of_family.policy(0.0, [0.1, 0.0], mass=0.4)
+    assert [record.getMessage() for record in caplog.records] == [
+        "note: V was told mass in [0.5, 2.0], and is asked outside of that; what it says there is extrapolated."
+    ]
 
 
 def test_integers_are_states_too(controller):

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from PIL import Image
 
 from lyapnet.base.errors import UsageError
@@ -13,7 +14,16 @@ from lyapnet.cli import main
 from lyapnet.controller.controller import Controller
 from lyapnet.evaluation import animation
 from lyapnet.evaluation.animation import Film
-from lyapnet.task.systems import SYSTEMS, ControlAffineSystem, IntegratorChain, Pendulum, Quadrotor, Reacher
+from lyapnet.evaluation.scenes import set_stage
+from lyapnet.task.systems import (
+    SYSTEMS,
+    ControlAffineSystem,
+    DoubleIntegrator,
+    IntegratorChain,
+    Pendulum,
+    Quadrotor,
+    Reacher,
+)
 from tests.problems import Quadratic, problem_of, untrained
 
 FIXTURE = "tests/fixtures/version_0.1/certified/checkpoints/best.ckpt"
@@ -89,6 +99,14 @@ def test_helpers():
     turned = corners_of(rectangle((0, 0), 2, 0, np.pi / 2))
     assert turned[1] == pytest.approx((0, 1))
     assert corners_of(Disk((1, 1), 2)).tolist() == [[-1, -1], [3, 3]]
+
+
+def test_a_stage_is_a_square_around_its_points():
+    """Of points within 4 m × 1 m: 1.1 times the longer side, about the middle of both."""
+    panel = Figure().subplots()
+    set_stage(panel, problem_of(DoubleIntegrator()), np.array([[1.0, 7.0], [5.0, 8.0], [2.0, 7.5]]))
+    assert panel.get_xlim() == pytest.approx((3 - 2.2, 3 + 2.2))
+    assert panel.get_ylim() == pytest.approx((7.5 - 2.2, 7.5 + 2.2))
 
 
 # films

@@ -12,7 +12,8 @@ from lyapnet.evaluation import evaluate, oracle_of
 from lyapnet.evaluation.references import costs_of_lqr, costs_of_plant
 from lyapnet.evaluation.tables import evaluation_table
 from lyapnet.loop.programs.terms import falls, largest_rise
-from lyapnet.task.sets import ControlBox
+from lyapnet.task.cost import Cost
+from lyapnet.task.sets import ControlBox, ControlSet
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.policy import SampledPolicy
 from tests.problems import Formula, Quadratic, problem_of
@@ -97,6 +98,41 @@ def test_a_plant_that_diverges_is_not_a_number():
     problem = problem_of(DoubleIntegrator(), None, 60, 0.1)
     result = evaluate(Controller(problem, Formula(lambda t, x: -30 * (x**2).sum(-1)), policy=SampledPolicy), 2)
     assert result["held_cost_mean"] is None or result["held_cost_mean"] > 1e6
+
+
+class Ball(ControlSet):
+    """|u| ≤ 1, as a set without limits of its own."""
+
+    def minimise(self, R, b):
+        return self.project(-b / (2 * R[..., 0]))
+
+    def contains(self, u):
+        return (u.abs() <= 1).all(-1)
+
+    def project(self, u):
+        return u.clamp(-1, 1)
+
+
+class Profit(Cost):
+    """q has a slope at the origin: a task without a goal."""
+
+    def state(self, x):
+        return (x**2).sum(-1) - x[..., 0]
+
+    def R(self, x):
+        return torch.ones_like(x[..., :1, None])
+
+    def terminal(self, x):
+        return (x**2).sum(-1)
+
+
+def test_without_a_goal_or_known_limits_there_is_no_lqr():
+    x0 = torch.zeros(2, 2)
+    limited = ControlBox([-1.0], [1.0])
+    for cost, controls, there in ((None, limited, True), (None, Ball(), False), (Profit(), limited, False)):
+        problem = problem_of(DoubleIntegrator(), cost, controls=controls)
+        assert problem.has_goal == (cost is None)
+        assert (costs_of_lqr(problem, x0) is not None) == there
 
 
 def test_lqr_is_the_optimum_of_a_linear_task_alone():

@@ -11,13 +11,14 @@ from torch.testing import assert_close
 
 from lyapnet.base.errors import OracleError
 from lyapnet.evaluation.oracles import continuous_riccati, discrete_riccati, oracle_of, transcription
+from lyapnet.evaluation.oracles.cache import OptimaCache
 from lyapnet.evaluation.oracles.multistart import EXPLORED, EXPLORED_AGAIN, Candidate, MultiStart
 from lyapnet.evaluation.oracles.transcription import Transcription
 from lyapnet.experiment.assembly import build_problem
 from lyapnet.experiment.config import load_config
 from lyapnet.task.cost import QuadraticCost
 from lyapnet.task.horizon import Horizon
-from lyapnet.task.sets import Box
+from lyapnet.task.sets import Box, Unbounded
 from lyapnet.task.systems import Cartpole, DoubleIntegrator, Linear, Reacher
 from tests.problems import problem_of
 
@@ -358,6 +359,17 @@ def test_what_is_on_disk_is_not_solved_again(solved):
     for change in ("horizon.steps=11", "horizon.dt=0.011", "system.parameters.a2=0.0481", "cost.Q_T=[100,100,1,2]"):
         other = unsolvable(transcription_of("reacher", "horizon.steps=10", change)[0])
         assert other.solve(x0).failures == 3
+
+
+def test_kept_controls_of_another_shape_or_type_are_none():
+    cache, x0 = OptimaCache([], 3, 2, Unbounded()), torch.zeros(4, dtype=torch.float64)
+    u = torch.arange(6, dtype=torch.float64).reshape(3, 2)
+    assert cache.read(x0) is None
+    for other in (u.float(), u[:2], u.mT, u / 0):
+        cache.write(x0, other)
+        assert cache.read(x0) is None
+    cache.write(x0, u)
+    assert torch.equal(cache.read(x0), u)
 
 
 @pytest.mark.parametrize("damage", [lambda c: c[: len(c) // 2], lambda c: b"", lambda c: c[:150] + b"?" + c[151:]])

@@ -247,6 +247,14 @@ def test_paths_that_leave_the_domain_cost_infinitely_and_fail_claims():
     assert found.claim.successes["terminal"] / 200 < float(inside) + 0.15 < 0.9
 
 
+def test_the_two_states_of_a_figure_are_far_apart_in_units_of_their_extents():
+    """A and B are 1.02 extents apart, C and D 1; in their own units D is farther from C, by far."""
+    A, B, C, D = [0.0, 600.0], [1.0, 400.0], [0.5, 0.0], [0.5, 1000.0]
+    drawn = states_to_draw(torch.tensor([C, A, D, B]))
+    assert sorted(drawn[0].tolist()) == [A, B]
+    assert torch.equal(drawn, drawn[:1].expand(PATHS, 2, 2))
+
+
 def test_bands_show_both_states_and_the_cost():
     problem = task()
     x0 = states_to_draw(problem.initial_states.sample(12, torch.Generator().manual_seed(0)))
@@ -282,6 +290,24 @@ def test_noise_that_is_affine_on_X0_alone_has_no_oracle(fold, affine):
     cost = QuadraticCost([[1.0]], [[0.5]], [[2.0]])
     box = Box([1.2], [2.0]) if fold == 1.0 else Box([-1.0], [1.0])
     problem = Problem(Folded([[0.0]], [[1.0]]), cost, Unbounded(), box, Horizon(20, 0.1, "euler"))
+    if affine:
+        assert oracle_of(problem)(box.center[None]).isfinite().all()
+    else:
+        with pytest.raises(OracleError, match="σ affine in x"):
+            oracle_of(problem)
+
+
+@pytest.mark.parametrize(("power", "affine"), [(1, True), (2, False)])
+def test_noise_has_to_be_affine_in_a_state_that_x0_fixes_too(power, affine):
+    """σ = 0.1 x₂ᵖ, and x₂ is zero in all of X₀."""
+
+    class Beside(Linear):
+        def noise(self, x):
+            return 0.1 * torch.stack([x[..., 1] ** power, torch.zeros_like(x[..., 1])], -1)[..., None]
+
+    cost = QuadraticCost(torch.eye(2), [[0.5]], torch.eye(2))
+    system, box = Beside([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]]), Box([-1.0, 0.0], [1.0, 0.0])
+    problem = Problem(system, cost, Unbounded(), box, Horizon(20, 0.1, "euler"))
     if affine:
         assert oracle_of(problem)(box.center[None]).isfinite().all()
     else:

@@ -127,6 +127,16 @@ def test_weights_that_are_no_dictionary_are_refused(tmp_path, content):
     is_one_line_that_names(path, raised.value)
 
 
+def test_a_config_in_the_place_of_a_checkpoint_is_refused(tmp_path):
+    """By its name, before it is read: an empty one is no damaged checkpoint either."""
+    for content in ("horizon: {steps: 10}", ""):
+        (tmp_path / "experiment.yaml").write_text(content)
+        with pytest.raises(
+            UsageError, match=r"Expected a checkpoint file, got '.*experiment.yaml', which is a config; "
+        ):
+            read_checkpoint(tmp_path / "experiment.yaml")
+
+
 def test_folder_is_refused(tmp_path):
     with pytest.raises(UsageError) as raised:
         lyapnet.load(tmp_path)

@@ -15,7 +15,7 @@ from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.experiment.assembly import Parts, build_problem
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.rollout import Rollout
-from lyapnet.task.domain import SLACK, Border, Domain, DomainCost, as_written
+from lyapnet.task.domain import SLACK, Border, Domain, DomainCost, as_written, size_of
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.problem import Problem
 from lyapnet.value.expansions import optimal_trajectories, path_under
@@ -163,6 +163,39 @@ def test_the_price_is_smooth_and_zero_within():
     path = torch.tensor([[3.0], [1 - 2 * SLACK * 0.9]]).expand(2, 2)[..., None].expand(2, 2, 2).clone()
     path[1, 1, 0] = 1 - 2 * SLACK * 1.1
     assert domain.left(path).tolist() == [False, True]
+
+
+class Flat(lyapnet.Cost):
+    """q and φ are the same at each state, and R = 1."""
+
+    def __init__(self, q, phi):
+        super().__init__()
+        self.q, self.phi = q, phi
+
+    def state(self, x):
+        return x.new_full(x.shape[:-1], self.q)
+
+    def R(self, x):
+        return torch.ones(*x.shape[:-1], 1, 1).to(x)
+
+    def terminal(self, x):
+        return x.new_full(x.shape[:-1], self.phi)
+
+
+@pytest.mark.parametrize(("q", "phi", "price"), [(2.0, 3.0, 4.0), (-2.0, 3.0, 4.0), (-2.0, -3.0, 4.0), (0.0, 0.0, 1.0)])
+def test_what_a_state_outside_pays_is_that_of_a_whole_loop(q, phi, price):
+    """T |q| + |φ| with T = 0.5 s, or 1 where that is zero, for each step at a distance of a state's size."""
+    problem = written(lambda x, y: torch.log(x), Flat(q, phi))
+    cost = problem.within(problem.borders()).cost
+    d, s = torch.tensor([0.0, 1e-3, 1.0, 5.0], dtype=torch.float64), 1e-3
+    x = torch.stack([-0.6 * d, torch.full_like(d, 0.5)], -1)  # x is at most 0.6 in X₀
+    paid = price * ((d**2 + s**2).sqrt() - s)
+    assert_close(cost.state(x), q + paid / 0.1, rtol=1e-12, atol=1e-12)
+    assert_close(cost.terminal(x), phi + paid, rtol=1e-12, atol=1e-12)
+
+
+def test_a_state_that_is_zero_in_all_of_x0_has_a_size_of_one():
+    assert size_of(lyapnet.Box([0.0, -3.0, 2.0], [0.0, 1.0, 2.0])).tolist() == [1.0, 3.0, 2.0]
 
 
 def test_a_path_that_leaves_has_no_finite_cost_and_an_optimum_stays():

@@ -123,6 +123,20 @@ def test_of_several_it_is_the_nearest_to_the_centre_and_others_are_listed(caplog
     assert "the nearest to X₀'s centre of 2; also z = -2" in note
 
 
+class Heavy(Level):
+    """Each of the two points needs its own, large control: u = 1e5 z holds y."""
+
+    def f(self, x):
+        return torch.stack([3 - x[..., 0] ** 2, -1e5 * x[..., 0]], -1)
+
+
+def test_a_point_that_is_found_again_is_the_same_in_units_of_its_controls_too():
+    found = search(Heavy(), [0.5, -1.0], [1.5, 1.0], ControlBox(-1e6, 1e6)).find({1: 0.3})
+    root = math.sqrt(3)
+    assert_close(torch.stack([point.x[0] for point in found]), torch.tensor([root, -root]), rtol=1e-9, atol=0)
+    assert_close(torch.stack([point.u[0] for point in found]), 1e5 * torch.tensor([root, -root]), rtol=1e-9, atol=0)
+
+
 def test_limits_of_states_and_controls_choose():
     inside = {"lower": [-1.5, -1], "upper": [0.9, 1]}
     both = problem_of(system=Level(), target={"y": 0.1}, initial_states=inside)
@@ -131,6 +145,18 @@ def test_limits_of_states_and_controls_choose():
     assert float(problem_of(system=Level(), target={"y": 0.1}, initial_states=inside, constraints=limited).goal[0]) == 2
     with pytest.raises(UsageError, match=r"among those that are admitted, got \[0\.339"):
         problem_of(target={"output voltage": 15}, controls={"lower": 0, "upper": 0.2})
+
+
+def test_distances_are_in_units_of_x0_and_angles_are_modulo_a_turn():
+    """Extents: the widths 4 and 2, the centre 3 of a state that X₀ fixes, and 1 of one that it fixes at zero."""
+    points = search(Cartpole(), [-1.0, -1.0, 3.0, 0.0], [3.0, 1.0, 3.0, 0.0])
+    assert points.distance(torch.tensor([1.0, 0.0, 3.0, 0.0])) == 0
+    parts = [(3.0, 0.0, 3.0, 0.0), (1.0, -4 * math.pi + 0.5, 3.0, 0.0), (1.0, 0.0, -3.0, 0.0), (1.0, 0.0, 3.0, 0.25)]
+    assert [points.distance(torch.tensor(x)) for x in parts] == pytest.approx([0.5, 0.25, 2.0, 0.25])
+    assert points.distance(torch.tensor([3.0, 2 * math.pi - 0.5, 9.0, 1.0])) == pytest.approx(
+        math.sqrt(0.5**2 + 0.25**2 + 2**2 + 1**2)
+    )
+    assert points.distance(torch.tensor([1.0 + 2 * math.pi, 0.0, 3.0, 0.0])) == pytest.approx(math.pi / 2), "no angle"
 
 
 def test_upright_is_nearer_than_hanging():

@@ -774,6 +774,10 @@ class Cart(ControlAffineSystem):
     def g(self, x):
         return torch.tensor([[0.0], [1.0]]).to(x).expand(*x.shape, 1)
 
+class Sledge(Cart):
+    def f(self, x):
+        return 0.9 * super().f(x)
+
 class Network(FCN):
     pass
 """
@@ -827,6 +831,22 @@ def test_finetuning_another_task_starts_from_the_weights(override, finished):
     before = finished.last.read_bytes()
     finetunes(finished, finished.last, override)
     assert finished.last.read_bytes() == before
+
+
+def test_finetuning_needs_a_system_and_a_network_of_the_users_where_the_checkpoint_has_them(tmp_path):
+    """As --system and --network of the commands that load: what the file names is never imported."""
+    system, network = {"name": "own:Cart"}, {"name": "own:Network", "hidden": [4]}
+    desk = Desk(tmp_path, system=system, cost={"Q": [1, 1], "R": [1], "Q_T": [1, 1]}, network=network)
+    (tmp_path / "own.py").write_text(OWN)
+    assert desk.train("training.iterations=2", prepare=without_figures)[0] == 0
+    for override in ("system.name=double_integrator", "network.name=fcn"):
+        status, _, errors = desk.train("--finetune", str(desk.last), override)
+        key, name = override.split("=")
+        assert status == 2
+        assert errors.splitlines()[-1].startswith(f"error: Expected {key} as module:Class for {str(desk.last)!r}, ")
+        assert f", got {name}; " in errors
+    tuned = ("--finetune", str(desk.last), "training.iterations=2", "experiment=tuned")
+    assert desk.train(*tuned, "system.name=own:Sledge", prepare=without_figures)[0] == 0
 
 
 def test_finetuning_from_the_value_to_the_lyapunov_program(tmp_path):

@@ -62,17 +62,7 @@ def check_function(
         UsageError: a condition is broken; says which one, and where.
     """
     given = [argument.detach().clone().requires_grad_() for argument in arguments]
-    value = called(name, function, given)
-    batch = len(given[0])
-    got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
-    if got != ((batch, *shape), given[0].dtype):
-        shapes = " and ".join(str(tuple(argument.shape)) for argument in given)
-        precision = "append .to(x), which gives it the precision of x"
-        advice = precision if got[0] == (batch, *shape) else _advice(got[0], batch, tuple(shape))
-        raise UsageError(
-            f"Expected {name} as a tensor of {(batch, *shape)} and {given[0].dtype} for arguments of shape {shapes}, "
-            f"got {got}; {advice}."
-        )
+    value, batch = check_result(name, function, given, shape), len(given[0])
     if any(not torch.equal(one, before) for one, before in zip(given, arguments, strict=True)):
         raise UsageError(f"Expected {name} to leave its arguments as they are, got others; clone them first.")
     value = value.detach()
@@ -89,6 +79,38 @@ def check_function(
     _check_independence(name, function, arguments, value)
     if differentiable:
         check_derivative(name, lambda *batches: called(name, function, batches), arguments)
+
+
+def check_result(
+    name: str,
+    function: Callable[..., Any],
+    arguments: Sequence[Tensor],
+    shape: Sequence[int],
+    dtype: torch.dtype | None = None,
+) -> Tensor:
+    """Call a user's function, and return its result if that has one entry of a given shape for each state.
+
+    Args:
+        name: name of the function in messages, such as "Pendulum.f(x)".
+        arguments: batches (b, …).
+        shape: shape of one state's result.
+        dtype: dtype of the result; None: that of the arguments.
+
+    Raises:
+        UsageError: the function fails, or its result has another type, shape or dtype.
+    """
+    value = called(name, function, arguments)
+    batch, dtype = len(arguments[0]), dtype or arguments[0].dtype
+    got = (tuple(value.shape), value.dtype) if isinstance(value, Tensor) else type(value).__name__
+    if got != ((batch, *shape), dtype):
+        shapes = " and ".join(str(tuple(argument.shape)) for argument in arguments)
+        precision = "return a comparison" if dtype == torch.bool else "append .to(x), which gives it the precision of x"
+        advice = precision if got[0] == (batch, *shape) else _advice(got[0], batch, tuple(shape))
+        raise UsageError(
+            f"Expected {name} as a tensor of {(batch, *shape)} and {dtype} for arguments of shape {shapes}, got {got}; "
+            f"{advice}."
+        )
+    return value
 
 
 def called(name: str, function: Callable[..., Any], arguments: Sequence[Tensor]) -> Any:

@@ -9,8 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lyapnet.base.contracts import initialised
+from lyapnet.base.contracts import copied, initialised
 from lyapnet.base.errors import LyapnetError, UsageError
+from lyapnet.base.types import State
 from lyapnet.experiment.assembly.classes import DTYPES, Parts, float64_defaults, instance_of, section
 from lyapnet.experiment.assembly.constraints import ball_of, build_constraints, choose_margins
 from lyapnet.experiment.assembly.domain import in_domain
@@ -21,6 +22,7 @@ from lyapnet.experiment.assembly.noise import build_noise
 from lyapnet.experiment.assembly.stationary import without_end
 from lyapnet.experiment.assembly.target import Trim, about_target, trim
 from lyapnet.experiment.config import Config, ControlsConfig, CostConfig, InitialStatesConfig, SystemConfig
+from lyapnet.task.contracts import check_shapes_of_controls, check_shapes_of_cost, check_shapes_of_system
 from lyapnet.task.cost import (
     COSTS,
     Cost,
@@ -32,7 +34,7 @@ from lyapnet.task.cost import (
     RegulatorTail,
 )
 from lyapnet.task.horizon import TABLEAUX, Horizon
-from lyapnet.task.problem import Problem
+from lyapnet.task.problem import TRIED, Problem
 from lyapnet.task.sets import Box, ControlBox, ControlSet
 from lyapnet.task.systems import ControlAffineSystem, Linear
 
@@ -54,6 +56,7 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         initial_states = build_initial_states(config.initial_states, system)
+        x = _checked_states(system, initial_states)
         with section("horizon"):
             method = config.rollout.method
             held = method if method in TABLEAUX else "rk4"  # for an adaptive method
@@ -64,8 +67,10 @@ def build_problem(config: Config, parts: Parts | None = None) -> Problem:
             cost = build_cost(_cost_section(config), system) if cost is None else cost.double()
             if config.cost.huber is not None and not isinstance(parts.cost, MadeOfAnother):
                 cost = PseudoHuberCost(cost, config.cost.huber)
+        check_shapes_of_cost(copied(cost), system.m, x)
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
+        check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
         if config.family:
             system, cost, initial_states = family_of(config, system, cost, controls, initial_states)
         elif not isinstance(parts.cost, MadeOfAnother):  # a composite cost from the user is not changed
@@ -97,9 +102,18 @@ def operating_point(config: Config, parts: Parts | None = None) -> tuple[Control
         system = build_system(config.system) if system is None else system.double()
         system.check_coordinates()
         initial_states = build_initial_states(config.initial_states, system)
+        x = _checked_states(system, initial_states)
         with section("controls"):
             controls = build_controls(config.controls, system) if controls is None else controls.double()
+        check_shapes_of_controls(copied(controls), x.new_ones(len(x), system.m))
         return system, trim(config, system, controls, initial_states)
+
+
+def _checked_states(system: ControlAffineSystem, initial_states: Box) -> State:
+    """States of X₀ at which f, g and ẋ have the right shapes; a UsageError where they do not."""
+    x = initial_states.sample(TRIED, torch.Generator().manual_seed(0))
+    check_shapes_of_system(copied(system), x)
+    return x
 
 
 def _cost_section(config: Config) -> CostConfig:

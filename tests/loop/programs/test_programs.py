@@ -385,6 +385,8 @@ def test_tolerances_of_the_programs():
     """A value function need not fall along its own closed loop; a Lyapunov function must."""
     assert ValueProgram().tolerances() == Tolerances(radius=None, decrease=None, cost=0.05)
     assert LyapunovProgram().tolerances(0.1, 0.0) == Tolerances(radius=0.1, decrease=0.01, cost=0.0)
+    assert LyapunovProgram().tolerances() == Tolerances(radius=None, decrease=0.01, cost=0.05)
+    assert Tolerances() == Tolerances(radius=None, decrease=0.01, cost=0.0, constraints=False)
     assert ValueProgram().tolerances(0.1).asked == ["terminal", "cost"]
     assert LyapunovProgram().tolerances().asked == ["decrease", "cost"]
     for name in ("radius", "decrease", "cost"):

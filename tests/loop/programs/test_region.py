@@ -17,7 +17,7 @@ from lyapnet.training.build import build_module
 from lyapnet.training.start import choose_start
 from lyapnet.value.policy import HJBPolicy
 from tests.fits import shorten_fits
-from tests.problems import problem_of
+from tests.problems import Formula, problem_of
 
 A, B, Q = [[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], torch.eye(2).double()
 P = torch.tensor(solve_continuous_are(A, B, Q.numpy(), [[1.0]]))
@@ -79,6 +79,26 @@ def test_the_condition_is_the_share_outside_where_V_falls_fast_enough(of):
     outside = 1 - inscribed(P, (2.0, 3.0)) / 24
     assert float(exact(stream(1), COST, COST)) == pytest.approx(0.06 * outside, rel=0.2)  # the step is smoothed
     assert float(of(0.5 * P, growth=0.0, share=1.0)(stream(1), COST, COST)) > 0.1  # half of V pays for half of ℓ
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("size", [1.0, 7.0])
+def test_the_level_and_the_ceiling_in_closed_form(size, monkeypatch):
+    """Of a V that is c everywhere, ρ = (1024 c⁻³⁰)^(−1/30) = c 2^(−1/3), and all of D is at V = c: above 1.15 ρ."""
+    problem = problem_of(DoubleIntegrator()).in_steps(stationary=True)
+    rollout = Rollout(problem, HJBPolicy(problem, Formula(lambda t, x: size + 0 * x.sum(-1))))
+    condition = RegionCondition(rollout, RegionProgram(growth=0.5), Box([-2.0, -3.0], [2.0, 3.0]), 5.0, 64, floor=0.2)
+    outside = 1 / (1 + math.exp(-8 * math.log(2) / 3))  # σ(8 log(c/ρ)) at each point of D
+    assert float(condition(stream(0), COST, COST)) == pytest.approx(0.5 * outside, rel=1e-12)
+    given = []
+    monkeypatch.setattr(condition, "condition", lambda generator, *numbers: given.extend(numbers) or COST)
+    condition(stream(0), COST, COST)
+    assert [float(number) for number in given] == pytest.approx([0.2 * float(COST), 1.15 * size * 2 ** (-1 / 3)])
+
+
+def test_the_defaults_of_the_program():
+    assert RegionProgram() == RegionProgram(share=0.4, growth=0.06)
+    assert RegionProgram.recommended == {"constraint": 0, "trajectory_cost": 1, "share": 0.4, "growth": 0.06}
 
 
 def test_its_boundary_has_points_on_each_side(of):

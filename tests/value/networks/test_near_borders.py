@@ -6,6 +6,7 @@ from torch.testing import assert_close
 from lyapnet.task.domain import Border
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.networks import ExpansionNetwork, Scaling
+from lyapnet.value.networks.near_borders import NearBorders
 
 LOWER, UPPER = Border("volume", "lower", 0.5, ""), Border("share", "upper", 1.0, "")
 TIMES = torch.linspace(0, 2, 3, dtype=torch.float64)
@@ -26,6 +27,19 @@ def states(b=64):
     torch.manual_seed(1)
     decades = 10 ** (4 * torch.rand(b, 2) - 4)
     return torch.stack([0.5 + decades[:, 0], torch.randn(b), 1 - decades[:, 1]], -1).double()
+
+
+def test_its_inputs_by_hand():
+    """Distances 1, 10 and 100: logarithms 0, l and 2l of mean l and standard deviation l √(2/3)."""
+    below = torch.tensor([[0.5 + 1, 0.0], [0.5 + 10, 0.0], [0.5 + 100, 0.0]]).double()
+    inputs = NearBorders([(0, LOWER)]).double()
+    inputs.fit(below)
+    expected = torch.tensor([-1.0, 0.0, 1.0, -0.5]).double() / (0.35 * (2 / 3) ** 0.5)
+    between = torch.tensor([[0.5 + 10**0.5, 7.0]]).double()
+    assert_close(inputs(torch.cat([below, between]))[:, 0], expected, atol=1e-9, rtol=1e-9)
+    upper = NearBorders([(1, UPPER)]).double()
+    upper.fit((0.5 - below.flip(-1)) + torch.tensor([0.5, 1.0]).double())  # as far from 1, on the other side
+    assert_close(upper(torch.tensor([[0.0, 1 - 10.0], [0.0, 1 - 100.0]]).double())[:, 0], expected[1:3])
 
 
 def test_the_slope_is_that_of_the_value():

@@ -194,14 +194,15 @@ def _reprove_noisy(controller: Controller, path: Path, budget: Budget, report: R
     content = part_of(read_proofs(path), "noisy", path)
     with refusing(path):
         of, seconds = content["of"][0], float(content["seconds"])
-        lower, upper = (torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper"))
-        numbers = [float(of[name]) for name in ("probability", "alpha", "delta", "risk", "decay")]
-        if of["degree"] != 2 or not 0 < numbers[0] < 1:
+        states = Box(*(torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper")))
+        probability, alpha, delta = float(of["probability"]), float(of["alpha"]), float(of["delta"])
+        risk, decay = float(of["risk"]), float(of["decay"])
+        if of["degree"] != 2 or not 0 < probability < 1:
             raise ValueError("forms of unknown degree, or no probability")
-        states = Box(lower, upper)
     claim = prove_noisy_funnel(
-        controller.closed_loop, controller.problem, *numbers, states, budget, _generator(), report, path, True
-    )
+        controller.closed_loop, controller.problem, probability, alpha, delta, risk, decay, states, budget,
+        _generator(), report, path, True,
+    )  # fmt: skip
     reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or some of X₀ leaves with a higher probability"
     return Checked(NoisyCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, seconds)
 

@@ -51,7 +51,7 @@ class NoisyDecrease(DecreaseCondition):
                 "funnel without noise."
             )
         self.noise, self.decay, self.probability, self.duration = closed_loop.noise, decay, probability, duration
-        self.risk, self.level, self.leak = 0.0, math.inf, math.inf
+        self.risk, self.largest, self.level, self.leak = 0.0, math.nan, math.inf, math.inf
 
     def aim(self, risk: float, largest: float) -> None:
         """Set λ, and for it ρ and η, so that closed loops from V(0, x₀) ≤ largest leave with probability 1 − p at most.
@@ -60,13 +60,13 @@ class NoisyDecrease(DecreaseCondition):
         """
         if not 0 < risk < math.inf:
             raise UsageError(f"Expected risk > 0, got {risk}; give it in 1/cost.")
-        self.risk, leaves = risk, 1 - self.probability
+        self.risk, self.largest, leaves = risk, largest, 1 - self.probability
         self.level = largest - math.log((1 - LEAKING) * leaves) / risk
         self.leak = LEAKING * leaves / (risk * self.duration)
 
     @property
     def facts(self) -> dict[str, Any]:
-        names = ("alpha", "delta", "decay", "probability", "risk")
+        names = ("alpha", "delta", "decay", "probability", "risk", "largest")
         return {name: getattr(self, name) for name in names}
 
     def forward(self, t: Time, x: State) -> PerState:

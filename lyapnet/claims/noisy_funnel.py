@@ -30,6 +30,7 @@ from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.condition import own_constraints
+from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress
 from lyapnet.prover.verdict import time_spent
 from lyapnet.task.constraints import names_of
@@ -139,7 +140,10 @@ def prove_noisy_funnel(
     constants = list(loop.system.constants)
     require_smooth(condition, over_time(problem.initial_states, duration))
 
-    def level_of(largest: float, X0: Box) -> float:
+    kept = None if keep is None or not keep.exists() else _kept_largest(keep)
+
+    def level_of(found: float, X0: Box) -> float:
+        largest = found if kept is None else max(found, kept)  # a bound that is a little higher is a bound too
         if risk is None:
             box = partial(enclosing_box, condition.height, X0, goal, duration, constants=constants)
             boxes = [states] if states is not None else (box(level=each * largest) for each in LARGER)
@@ -148,9 +152,10 @@ def prove_noisy_funnel(
             condition.aim(risk, largest)
         return condition.level
 
-    left_out, X0, largest, D, domain, sides, levels, assumed = find_setting(
+    left_out, X0, _, D, domain, sides, levels, assumed = find_setting(
         condition, problem, duration, states, budget, report, level_of
     )
+    largest = condition.largest
     if constants:
         require_still(lambda t, x: (condition.noise(x)[..., constants, :],), domain)
     wanted, gap = condition.level, condition.level - largest
@@ -180,6 +185,17 @@ def prove_noisy_funnel(
         set_up=spent, assumed=assumed, probability=probability, risk=condition.risk, leak=condition.leak, decay=decay,
         rim=rim, end=end,
     )  # fmt: skip
+
+
+def _kept_largest(path: Path) -> float:
+    """The bound of max V(0, ·) on X₀ in a file, which may be the result of fewer boxes than there is time for now.
+
+    Raises:
+        UsageError: the file holds another proof.
+    """
+    content = part_of(read_proofs(path), NoisyDecrease.proves, path, "take a new file")
+    with refusing(path):
+        return float(content["of"][0]["largest"])
 
 
 def _likely_level(condition: NoisyDecrease, rho: float) -> float:

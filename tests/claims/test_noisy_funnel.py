@@ -387,7 +387,10 @@ def test_a_narrowing_funnel_is_certified():
     claim = prove(decay=DECAY * rate, risk=0.5 * largest_risk())
     assert claim.verdict == "certified"
     assert claim.level(DURATION) == pytest.approx(claim.rho * math.exp(-DECAY * rate * DURATION))
-    assert (claim.end.widths < certified().end.widths).all()
+    wide = certified().end
+    assert wide is not None
+    assert claim.end is not None
+    assert (claim.end.widths < wide.widths).all()
     left, _ = paths(task(), value(), torch.tensor([1.0, 0.7]).expand(1000, -1), decay=claim.decay)(claim.rho, 0.0)
     assert float(left.double().mean()) < 0.01
     assert prove(decay=1.5 * rate, risk=0.5 * largest_risk()).verdict == "falsified"

@@ -18,6 +18,8 @@ from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
 from lyapnet.claims.least_cost import DEGREE, RiseCondition, prove_lower_bound
+from lyapnet.claims.noisy_certificate import NoisyCertificate
+from lyapnet.claims.noisy_funnel import prove_noisy_funnel
 from lyapnet.claims.plants import plants_of
 from lyapnet.claims.preconditions import over_time, require_no_noise
 from lyapnet.claims.region import prove_region
@@ -39,16 +41,17 @@ Report = Callable[[Progress], None] | None
 def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
     """Check whether a file proves its claim; return the object that `lyapnet certify check --json` prints.
 
-    The parameters of the claim (α, δ, D, w; λ, B, Y, c) are read from the file, and the condition is built from the
-    controller. Everything else is computed again: the levels on X₀ and on the boundary of D, the bounds of the
-    condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The verdict is certified
-    or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is certified up to the
-    ρ of the file, and the result has the share of X₀ in it.
+    The parameters of the claim (α, δ, D, w; λ, B, Y, c; λ, a, the probability) are read from the file, and the
+    condition is built from the controller. Everything else is computed again: the levels on X₀ and on the boundary of
+    D, the bounds of the condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The
+    verdict is certified or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is
+    certified up to the ρ of the file, and the result has the share of X₀ in it.
     """
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
         kind, reprove = kind_of(path)
-        require_no_noise(controller.problem, kind)
+        if kind != NoisyCertificate.kind:
+            require_no_noise(controller.problem, kind)
         found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report)
         numbers, reason = found.numbers, found.reason
         share = found.seconds / found.searched if found.searched > 0 else None
@@ -61,7 +64,11 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
 
 def labels_of(result: Mapping[str, Any]) -> dict[str, str]:
     """The labels of the numbers of a check in a table."""
-    kinds = {"region": RegionCertificate.labels, "two-sided": labels_of_both(SoundCertificate)}
+    kinds = {
+        "region": RegionCertificate.labels,
+        "noisy": NoisyCertificate.labels,
+        "two-sided": labels_of_both(SoundCertificate),
+    }
     labels = kinds.get(result["of"], SoundCertificate.labels)
     return {"of": "of", **labels, "share_of_search": "seconds for the leaves / for their search"}
 
@@ -183,10 +190,28 @@ def _reprove_region(controller: Controller, path: Path, budget: Budget, report: 
     return Checked(RegionCertificate(controller, claim, {}).numbers(), reason, seconds, kept.seconds)
 
 
+def _reprove_noisy(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+    content = part_of(read_proofs(path), "noisy", path)
+    with refusing(path):
+        of, seconds = content["of"][0], float(content["seconds"])
+        states = Box(*(torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper")))
+        probability, alpha, delta = float(of["probability"]), float(of["alpha"]), float(of["delta"])
+        risk, decay = float(of["risk"]), float(of["decay"])
+        if of["degree"] != 2 or not 0 < probability < 1:
+            raise ValueError("forms of unknown degree, or no probability")
+    claim = prove_noisy_funnel(
+        controller.closed_loop, controller.problem, probability, alpha, delta, risk, decay, states, budget,
+        _generator(), report, path, True,
+    )  # fmt: skip
+    reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or some of X₀ leaves with a higher probability"
+    return Checked(NoisyCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, seconds)
+
+
 KINDS: dict[tuple[str, ...], tuple[str, Reprove]] = {
     ("above",): ("sound", _reprove_funnel),
     ("above", "below"): ("two-sided", _reprove_two_sides),
     ("region",): ("region", _reprove_region),
+    ("noisy",): ("noisy", _reprove_noisy),
 }
 """Names of the proofs in a file ↦ (kind of the claim, the function that proves it again)."""
 

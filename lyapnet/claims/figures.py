@@ -345,8 +345,7 @@ def _levels(claim: ProvedFunnel, fine: bool) -> list[Level]:
     times = zip((0.0, 0.25, 0.5, 0.75, 1.0), (BLUE, SKY, GREEN, ORANGE, PURPLE), strict=True)
     at = [(share * claim.duration, colour) for share, colour in times if fine or share in (0, 1)]
     funnel = [
-        Level(t, claim.rho + claim.delta * t, colour, f"V(t, ·) ≤ ρ + δt at t = {t:.3g} s", proved=True)
-        for t, colour in at
+        Level(t, claim.level(t), colour, f"V(t, ·) ≤ {claim.formula} at t = {t:.3g} s", proved=True) for t, colour in at
     ]
     wanted = Level(0.0, claim.wanted, GREY, "V(0, ·) ≤ ρ for all of X₀, not proved", proved=False)
     return (funnel if claim.volume_share else []) + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
@@ -369,9 +368,10 @@ def _draw_over_time(
     t, x = (torch.linspace(*ends, 201).to(initial_states.lower) for ends in ((0, claim.duration), (low, high)))
     if claim.volume_share:
         with torch.no_grad():
-            excess = V(t[None].expand(201, 201), x[:, None, None].expand(201, 201, 1)) - claim.rho - claim.delta * t
+            levels = t.new_tensor([claim.level(each) for each in t.tolist()])
+            excess = V(t[None].expand(201, 201), x[:, None, None].expand(201, 201, 1)) - levels
         _draw_sublevel(panel, [numpy_of(t), numpy_of(x)], numpy_of(excess), BLUE, filled=True)
-        handles["funnel"] = Patch(color=BLUE, alpha=0.4, label="V(t, ·) ≤ ρ + δt")
+        handles["funnel"] = Patch(color=BLUE, alpha=0.4, label=f"V(t, ·) ≤ {claim.formula}")
     ends = [float(initial_states.lower[0]), float(initial_states.upper[0])]
     handles["X₀"] = panel.plot([0, 0], ends, color="black", linewidth=4, label="X₀", clip_on=False)[0]
     if (found := claim.counterexample) is not None:

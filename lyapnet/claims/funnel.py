@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -93,6 +93,11 @@ class ProvedFunnel:
     disturbance: State | None = None  # w: the claim holds for all ẋ = f + gu + w(t) with |w_i(t)| ≤ w_i
     set_up: float = 0.0  # seconds of the budget before the first box
     assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
+    formula: ClassVar[str] = "ρ + δt"  # of `level`, for figures
+
+    def level(self, t: float) -> float:
+        """The level of V(t, ·) that bounds the funnel at t."""
+        return self.rho + self.delta * t
 
     @property
     def verdict(self) -> Verdict:
@@ -175,7 +180,7 @@ def prove_funnel(
         found = find_counterexample(condition, bounded_condition(condition, domain), *domain, needed, generator)
     names, violation = names_of(problem.constraints), find_violation(condition.closed_loop, problem, generator)
     share = 1.0 if rho >= wanted else share_of(condition.V, x_low, x_high, rho, budget)
-    excess = _terminal_excess(condition, D, duration, rho, budget)
+    excess = terminal_excess(condition, D, duration, rho, budget)
     return ProvedFunnel(
         alpha=alpha, delta=delta, duration=duration, states=D, rho=rho, wanted=wanted,
         least=largest_sample(condition.V, initial_states), volume_share=share, terminal_excess=excess,
@@ -226,12 +231,14 @@ def find_setting(
     states: Box | None,
     budget: Budget,
     report: Callable[[Progress], None] | None = None,
+    level_of: Callable[[float, Box], float] | None = None,
 ) -> Setting:
     """Trace V and h of a condition once, check the condition, and find the sets and levels of a claim about it.
 
     Args:
         duration: T; or 0 for a claim about t = 0 only.
         states: D; by default a box around {W ≤ max W(0, ·) on X₀}, estimated from samples.
+        level_of: (max W(0, ·) on X₀, X₀) ↦ the level of W that D has to enclose in its place.
         budget: the budget of the claim; a share of it is for levels.
         report: called with the name of each stage.
 
@@ -248,7 +255,8 @@ def find_setting(
     tell(report, budget, "the largest V on X₀")
     wanted = -minimum(lambda t, x: -condition.height(t, x), *at_time(0.0, X0.lower, X0.upper), levels)
     tell(report, budget, "the set D; checks of the law and the condition on it")
-    states = slice_at_zero(states or enclosing_box(condition.height, X0, goal, duration, wanted, constants), left_out)
+    level = wanted if level_of is None else level_of(wanted, X0)
+    states = slice_at_zero(states or enclosing_box(condition.height, X0, goal, duration, level, constants), left_out)
     domain = domain_around(states, X0, duration, left_out, constants)
     require_own_gradient(condition.V, domain)
     check_states(condition, domain)
@@ -348,7 +356,7 @@ def share_of(V: Value, x_low: State, x_high: State, rho: float, budget: Budget) 
     return share_below(V, lower[0], upper[0], rho, Budget(budget.left, chunk=budget.chunk))
 
 
-def _terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
+def terminal_excess(condition: DecreaseCondition, states: Box, duration: float, rho: float, budget: Budget) -> float:
     """An upper bound of κ = max φ(x) − V(T, x)/α over x ∈ D with W(T, x) ≤ ρ; ∞ if ρ = −∞."""
     if rho == -float("inf"):
         return float("inf")

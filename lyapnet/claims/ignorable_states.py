@@ -10,7 +10,7 @@ from lyapnet.task.cost import innermost, is_quadratic
 
 
 def ignorable_states(closed_loop: ClosedLoop, constraints: Constraints | None = None) -> list[int]:
-    """The indices of the states on which none of f, g, ℓ, φ, V, u and h depends.
+    """The indices of the states on which none of f, g, ℓ, φ, V, u, h and σ depends.
 
     The state is set to nan: a result that stays finite does not depend on it. Jumps would hide the nan, since nan > 0
     is false and the sign of nan is 0; if there are jumps, no state counts as ignorable.
@@ -54,7 +54,8 @@ def _parts_without_cost(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tenso
     """The values in the condition and V, without q and φ: a quadratic cost is checked by its matrices."""
     system, V, u = closed_loop.system, closed_loop.V, closed_loop.policy(t, x)
     assert V is not None
-    return system.f(x), system.g(x), system.dynamics(x, u), closed_loop.cost.R(x), V(t, x), u
+    noise = [] if closed_loop.noise is None else [closed_loop.noise(x)]
+    return *noise, system.f(x), system.g(x), system.dynamics(x, u), closed_loop.cost.R(x), V(t, x), u
 
 
 def _all_parts(closed_loop: ClosedLoop, t: torch.Tensor, x: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -120,6 +120,48 @@ class Funnel(Claim):
 
 
 @dataclass(frozen=True, kw_only=True)
+class NoisyFunnel(Claim):
+    """A funnel that closed loops under noise leave with a small probability, and their expected cost: proved.
+
+    lyapnet.claims.noisy_funnel.ProvedNoisyFunnel states the conditions.
+    """
+
+    kind: ClassVar[str] = "noisy"
+    allows_noise: ClassVar[bool] = True
+
+    probability: float = option(
+        0.99, "Probability of staying in the funnel up to T, from each state of X₀.", above=0, below=1,
+        remedy="for example 0.99",
+    )  # fmt: skip
+    alpha: float = option(
+        0.95, "Share of ℓ that V pays for.", above=0, at_most=1,
+        remedy="V can pay for no more than the whole running cost",
+    )  # fmt: skip
+    delta: float | None = option(None, SLACK, at_least=0, remedy=RATE)
+    risk: float | None = option(
+        None, "λ of exp(λV), in 1/cost; found if none. A larger one needs a lower funnel.", above=0,
+        remedy="give it in 1/cost",
+    )  # fmt: skip
+    decay: float = option(
+        0.0, "a, at which the funnel {V ≤ ρe^(−at)} narrows, in 1/s.", at_least=0, remedy="give it in 1/s"
+    )  # fmt: skip
+    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
+
+    def establish(self, controller: "Controller", run: Run) -> "Certificate":
+        from lyapnet.claims.arguments import box_of, slack_of
+        from lyapnet.claims.noisy_certificate import NoisyCertificate
+        from lyapnet.claims.noisy_funnel import prove_noisy_funnel
+        from lyapnet.claims.preconditions import require_goal
+
+        require_goal(controller.problem, self.kind)
+        found = prove_noisy_funnel(
+            controller.closed_loop, controller.problem, self.probability, self.alpha, slack_of(self.delta, controller),
+            self.risk, self.decay, box_of(self.states), run.budget, run.generator, run.report, run.keep,
+        )  # fmt: skip
+        return NoisyCertificate(controller, found, run.options(self))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Region(Claim):
     """A region of attraction of the receding law u(0, x), for all times: proved.
 

@@ -53,6 +53,7 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
         results = [loop.slope(x, policy(t, x)), loop.cost.terminal(x)]
         results += [] if V is None else [V(t, x)]
         results += [] if constraints is None else [constraints(x)]
+        results += [] if loop.noise is None else [loop.noise(x)]
         # methods that are inherited from the base class follow from V(t, x) and policy(t, x)
         if V is not None and type(V).value_and_state_gradient is not ValueFunction.value_and_state_gradient:
             results.append(V.value_and_state_gradient(t, x)[1])
@@ -63,7 +64,7 @@ def check_loop(loop: ClosedLoop, constraints: nn.Module | None, domain: tuple[Co
     def call(points: Tensor) -> None:
         called("f, g, the cost, V and u", everything, [points[:, 0], points[:, 1:]])
 
-    parts = [loop.system, loop.cost, loop.V, constraints, loop.policy]
+    parts = [loop.system, loop.cost, loop.V, constraints, loop.policy, loop.noise]
     named = {type(part).__name__: part for part in parts if part is not None}
     memory = check_memory(named, lambda: call(points), lambda: call(ends))
     if reaches_own_code(named):

@@ -79,9 +79,9 @@ def _samples(lower: Corner, upper: Corner, goal: State, constants: Sequence[int]
     return closer.reshape(-1, len(goal)), scales.repeat_interleave(SAMPLES)
 
 
-def extent_of(V: Value, states: Box, level: float, budget: Budget) -> Box:
-    """A box around {x ∈ D: V(0, x) ≤ level}, as tight as the budget allows; at worst D."""
-    (lower,), (upper,) = at_time(0.0, states.lower, states.upper)
+def extent_of(V: Value, states: Box, level: float, budget: Budget, t: float = 0.0) -> Box:
+    """A box around {x ∈ D: V(t, x) ≤ level}, as tight as the budget allows; at worst D."""
+    (lower,), (upper,) = at_time(t, states.lower, states.upper)
     question = HullBelow(V, BoundedFunction(lambda t, x: (V(t, x),), (lower, upper)), level)
     search = searched(question, single(lower, upper), Budget(budget.left, chunk=budget.chunk))
     low, high = question.around(search.frontier)

@@ -1,4 +1,4 @@
-"""lyapnet certify sampled | statistical | sound | region | tube | check."""
+"""lyapnet certify sampled | statistical | sound | noisy | region | tube | check."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.claim import Claim, flag_of
-from lyapnet.claims.kinds import Funnel, LowerBound, Region, Sampled, Statistical, Tube
+from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Region, Sampled, Statistical, Tube
 from lyapnet.cli.by_kind import ByKind
 from lyapnet.cli.claims import (
     Law,
@@ -64,6 +64,20 @@ def sound(
     if two_sided and (refining.refine or claim.disturbance):
         raise UsageError("Expected --two-sided alone, got --refine or --disturbance; these are about one side.")
     _prove(given, [claim, *([LowerBound()] if two_sided else [])], search, refining, output)
+
+
+@app.command()
+@of_a_controller
+def noisy(
+    given: Given,
+    claim: NoisyFunnel,
+    search: SearchAnywhere,
+    output: Output,
+    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None,
+    debug: Debug = False,
+) -> None:
+    """A funnel that noise leaves with a small probability, and the expected cost: proved."""
+    _prove(given, [claim], search, Refining(keep=keep), output)
 
 
 @app.command()

@@ -40,14 +40,14 @@ def find_counterexample(
 def lowest_violation(
     condition: DecreaseCondition, bounded: BoundedFunction, points: Points, level: float
 ) -> Counterexample | None:
-    """The point of lowest W among the given ones with W ≤ level and c > 0, confirmed by a lower bound of c; or None."""
+    """The point of lowest W among the given ones with W ≤ level and c > 0, confirmed by a bound of c or Ẇ; or None."""
     c, W = _values(condition, points)
     candidates = torch.nonzero((c > 0) & (level >= W)).flatten()
     candidates = candidates[W[candidates].argsort()][:256]
     if not len(candidates):
         return None
-    (c_low, _), *_ = bounded.bounds(points[candidates], points[candidates])
-    candidates = candidates[c_low > 0]
+    (c_low, _), _, (rise_low, _), *_ = bounded.bounds(points[candidates], points[candidates])
+    candidates = candidates[torch.maximum(c_low, rise_low) > 0]
     if not len(candidates):
         return None
     first = candidates[0]

@@ -79,7 +79,9 @@ def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner,
 
 
 FORMAT = b"lyapnet proof 3\n"
-DESCRIPTIONS = {"above": "a funnel", "below": "a bound from below", "region": "a region"}
+DESCRIPTIONS = {
+    "above": "a funnel", "below": "a bound from below", "region": "a region", "noisy": "a funnel under noise",
+}  # fmt: skip
 """Name of a proof ↦ what it proves, in words."""
 TWO_SIDED = {"above", "below"}
 """The two proofs of a two-sided claim, which share a file."""
@@ -167,7 +169,8 @@ class KeptProof:
         Raises:
             UsageError: the file holds another proof, an unfinished one, or none.
         """
-        content = part_of(self._proofs, self.about["proves"], self.path)
+        name = self.about["proves"]
+        content, kind = part_of(self._proofs, name, self.path), "noisy" if name == "noisy" else "sound"
         with refusing(self.path):
             if content["of"][:1] != [self.about]:
                 raise UsageError(
@@ -179,7 +182,7 @@ class KeptProof:
         if waiting and not partial:
             raise UsageError(
                 f"Expected a finished proof in {str(self.path)!r}, got an unfinished one (undecided boxes: {waiting}); "
-                f"go on with lyapnet certify sound CKPT --keep {shlex.quote(str(self.path))} and the same options."
+                f"go on with lyapnet certify {kind} CKPT --keep {shlex.quote(str(self.path))} and the same options."
             )
         return claimed
 

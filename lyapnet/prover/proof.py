@@ -185,7 +185,10 @@ class WhereItHolds(Question):
         chosen = ~((c_high <= 0) & (rise_high <= 0)) & (boxes.key <= self.level)
         for constraints in h:
             chosen &= ~(constraints.interval()[0] > 0).any(-1)
-        return boxes[chosen], axis_to_cut(self.on_device, c, boxes, chosen)
+        axis, other = axis_to_cut(self.on_device, c, boxes, chosen), (c_high <= 0)[chosen]
+        if bool(other.any()):  # there only Ẇ ≤ 0 is undecided
+            axis = torch.where(other, axis_to_cut(self.on_device, rise, boxes, chosen, 2), axis)
+        return boxes[chosen], axis
 
     def look_at(self, boxes: Boxes) -> None:
         if len(boxes.key):  # own systems and costs need not accept empty batches

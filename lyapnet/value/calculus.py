@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from lyapnet.base.linear_algebra import apply
-from lyapnet.base.types import Control, PerState, State, Time, Value
+from lyapnet.base.types import Control, Noise, PerState, State, Time, Value
 from lyapnet.task.systems import ControlAffineSystem
 
 
@@ -63,6 +63,27 @@ def time_derivative(V: ValueFunction, system: ControlAffineSystem, t: Time, x: S
     """V̇ = V_t + V_xᵀ(f(x) + g(x)u), with the same V_x as in control laws, so that interval bounds see terms cancel."""
     V_t, V_x = gradients(V, t, x)[0], V.value_and_state_gradient(t, x)[1]
     return V_t + (V_x * system.dynamics(x, u)).sum(-1)
+
+
+def noise_derivative(V: ValueFunction, sigma: Noise, t: Time, x: State) -> PerState:
+    """½ tr(σσᵀV_xx) = ½ Σ_j σ_jᵀ V_xx σ_j, what the noise σ(x) dW adds to the mean rate of V, by Itô's formula.
+
+    Only the second derivatives along the columns of σ are computed: σ_jᵀV_xx is the gradient of V_xᵀσ_j for fixed σ_j.
+    """
+    recording, columns = torch.is_grad_enabled(), sigma.unbind(-1)
+    with torch.enable_grad():
+        # a copy of x, on which σ does not depend: the gradient must not include that of σ(x)
+        at = x.clone() if recording and x.requires_grad else x.detach().requires_grad_()
+        V_x = V.value_and_state_gradient(t, at)[1]
+        bends = [_gradient((V_x * column).sum(), at, recording) for column in columns]
+    return sum(((bend * column).sum(-1) for bend, column in zip(bends, columns, strict=True)), 0 * x[..., 0]) / 2
+
+
+def _gradient(y: Tensor, x: State, recording: bool) -> State:
+    """∂y/∂x, and 0 if y does not depend on x; the graph of y is kept."""
+    if not y.requires_grad:
+        return torch.zeros_like(x)
+    return torch.autograd.grad(y, x, create_graph=recording, retain_graph=True, materialize_grads=True)[0]
 
 
 def _differentiable(leaf: Tensor, recording: bool) -> Tensor:

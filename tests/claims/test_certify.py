@@ -12,7 +12,10 @@ from lyapnet.claims.claim import flags_of
 from tests.claims.planted import problem, riccati, stationary
 from tests.pages import PAGES, ROOT
 
-KINDS = (lyapnet.Sampled, lyapnet.Statistical, lyapnet.Funnel, lyapnet.LowerBound, lyapnet.Region, lyapnet.Tube)
+KINDS = (
+    lyapnet.Sampled, lyapnet.Statistical, lyapnet.Funnel, lyapnet.NoisyFunnel, lyapnet.LowerBound, lyapnet.Region,
+    lyapnet.Tube,
+)  # fmt: skip
 FROM_PYTHON, CERTIFY = PAGES[ROOT / "docs" / "from_python.md"], PAGES[ROOT / "docs" / "certify.md"]
 
 
@@ -71,7 +74,10 @@ def test_the_page_lists_the_fields(kind):
     assert re.findall(r"`(\w+)`", row) == [f.name for f in dataclasses.fields(kind)]
 
 
-@pytest.mark.parametrize(("kind", "section"), [(lyapnet.Funnel, "## Sound"), (lyapnet.Region, "## Region of")])
+@pytest.mark.parametrize(
+    ("kind", "section"),
+    [(lyapnet.Funnel, "## Sound"), (lyapnet.NoisyFunnel, "## Under noise"), (lyapnet.Region, "## Region of")],
+)
 def test_the_tables_of_options_have_the_fields(kind, section):
     text = CERTIFY[CERTIFY.index(f"\n{section}") :]
     table = text[text.index("| option |") :].partition("\n\n")[0]

@@ -11,7 +11,7 @@ from typer.main import get_command
 from lyapnet.base.errors import UsageError
 from lyapnet.claims import checking, funnel
 from lyapnet.claims.claim import flags_of
-from lyapnet.claims.kinds import Funnel, LowerBound, Region, Sampled, Statistical, Tube
+from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Region, Sampled, Statistical, Tube
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.cli import certify, main
 from lyapnet.cli.options import read_set
@@ -21,7 +21,7 @@ from tests.claims import planted
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-CLAIMS = {claim.kind: claim for claim in (Sampled, Statistical, Funnel, Region, Tube)}
+CLAIMS = {claim.kind: claim for claim in (Sampled, Statistical, Funnel, NoisyFunnel, Region, Tube)}
 
 pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
@@ -86,6 +86,8 @@ REFUSED = [
     ("certify sound --set=-0.5:0.5,-2:2", "Expected a set around X₀"),
     ("certify sound --set=-2:2", "Expected a set of 2 states, got 1"),
     ("certify sound --alpha=1.5", "Expected --alpha in (0, 1], got 1.5"),
+    ("certify noisy", "Expected a task with noise for a noisy certificate, got one without"),
+    ("certify noisy --probability=1", "Expected --probability strictly between 0 and 1, got 1"),
     ("certify sound --alpha=0", "Expected --alpha in (0, 1], got 0"),
     ("certify sound --delta=-1", "Expected --delta ≥ 0, got -1"),
     ("certify sound --delta=nan", "Expected --delta ≥ 0, got nan"),
@@ -98,7 +100,7 @@ REFUSED = [
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
     (
         "certify sond",
-        "Expected sampled, statistical, sound, region, tube, check or a checkpoint, got 'sond'; did you mean sound?",
+        "Expected sampled, statistical, sound, noisy, region, tube, check or a checkpoint, got 'sond'; did you mean sound?",
     ),
     ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),

@@ -100,7 +100,8 @@ REFUSED = [
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
     (
         "certify sond",
-        "Expected sampled, statistical, sound, noisy, region, tube, check or a checkpoint, got 'sond'; did you mean sound?",
+        "Expected sampled, statistical, sound, noisy, region, tube, check or a checkpoint, got 'sond'; did you mean "
+        "sound?",
     ),
     ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),

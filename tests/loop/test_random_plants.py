@@ -9,7 +9,8 @@ from lyapnet.experiment.assembly import build_plants, build_problem, build_rollo
 from lyapnet.experiment.config import config_from_plain
 from lyapnet.loop.random_plants import RandomPlants
 from lyapnet.loop.rollout import Rollout
-from lyapnet.task.systems import Pendulum
+from lyapnet.task.family import FamilySystem
+from lyapnet.task.systems import Pendulum, Quadrotor
 from lyapnet.training.build import build_module
 
 TASK = {
@@ -137,3 +138,14 @@ def test_single_precision_and_constraints_and_limits_have_plants_too():
 def test_what_can_have_no_plants_is_refused_by_name(changes, message):
     with pytest.raises(UsageError, match=message):
         plants_of(**changes)
+
+
+def test_every_number_of_the_quadrotor_can_be_drawn():
+    """f and g of a batch of plants are those of quadrotors built one by one."""
+    system = FamilySystem(Quadrotor(), ["mass", "gravity", "carried"], ["", "", ""])
+    z = torch.cat([torch.randn(5, 12, generator=seeded()), 1 + torch.rand(5, 3, generator=seeded(1))], -1).double()
+    for row in z:
+        mass, gravity, carried = row[12:].tolist()
+        alone = Quadrotor(mass, gravity, carried)
+        assert_close(system.f(z[None])[0, :, :12][z.eq(row).all(-1)][0], alone.f(row[:12]))
+        assert_close(system.g(z)[z.eq(row).all(-1)][0, :12], alone.g(row[:12]))

@@ -203,11 +203,11 @@ class Quadrotor(ControlAffineSystem):
 
     def f(self, x: State) -> State:
         direction = self._direction(x)
-        falling = self.gravity * (self.carried * direction - torch.tensor(UPWARD).to(x))
+        falling = _column(self.gravity) * (_column(self.carried) * direction - torch.tensor(UPWARD).to(x))
         return torch.cat([x[..., 6:], falling, torch.zeros_like(falling)], -1)
 
     def g(self, x: State) -> InputMatrix:
-        direction = self._direction(x)[..., None] / self.mass
+        direction = (self._direction(x) / _column(self.mass))[..., None]
         zeros = torch.zeros_like(direction)
         turning = torch.eye(3, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 3, 3)
         pushing = torch.cat([zeros, zeros, direction, zeros], -2)
@@ -219,3 +219,8 @@ class Quadrotor(ControlAffineSystem):
 
     def _direction(self, x: State) -> Tensor:
         return to_body_frame(x[..., 3:6])[..., 2, :]
+
+
+def _column(parameter: float | Tensor) -> float | Tensor:
+    """A parameter as a factor of vectors: a number, or in a family one for each state."""
+    return parameter[..., None] if isinstance(parameter, Tensor) else parameter

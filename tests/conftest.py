@@ -87,8 +87,9 @@ ARGUMENTS = {
 
 @pytest.fixture(scope="session", autouse=True)
 def _cache(tmp_path_factory):
-    """A cache of their own for all tests and the processes they start."""
-    os.environ["LYAPNET_CACHE"] = str(tmp_path_factory.mktemp("cache"))
+    """A cache of their own for all tests and the processes they start; xdist's workers share it."""
+    folder = tmp_path_factory.getbasetemp()
+    os.environ["LYAPNET_CACHE"] = str((folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder) / "cache")
 
 
 @pytest.fixture(scope="module", autouse=True)

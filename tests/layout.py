@@ -8,6 +8,7 @@ import ast
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
@@ -23,14 +24,22 @@ def sources(package: Path = PACKAGE) -> dict[str, str]:
 
 def imports(source: str, modules: Mapping[str, str]) -> Iterator[str]:
     """Full names that a source imports, wherever in it: a name of `modules` where it is one, else the module's."""
+    for module, name in _import_statements(source):
+        full = f"{module}.{name}"
+        yield full if name and full in modules else module
+
+
+@cache  # of each source: a package is asked about many times
+def _import_statements(source: str) -> tuple[tuple[str, str], ...]:
+    """(module, name that is imported from it, or "" where it is imported itself) of a source's imports."""
+    found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, "Expected absolute imports, got a relative one; write the full name."
-            for alias in node.names:
-                full = f"{node.module}.{alias.name}"
-                yield full if full in modules else str(node.module)
+            found += [(str(node.module), alias.name) for alias in node.names]
+    return tuple(found)
 
 
 def room(name: str) -> str:

@@ -119,41 +119,47 @@ def test_mathematics_that_imports_the_edge_is_found(module, line):
     assert [name for name, _ in edge_imports({**sources(), module: line})] == [module]
 
 
-def loaded(*statements):
-    """The modules that are loaded after the statements, in a fresh interpreter."""
-    program = "\n".join([*statements, "import sys", "print(*sys.modules)"])
+STAGES = {  # what is imported in turn in a fresh interpreter
+    "command line": "import lyapnet, lyapnet.cli",
+    "facts": "import lyapnet.training.config_facts, lyapnet.training.stage_messages, lyapnet.experiment.config",
+    "assembly": "import lyapnet.experiment.assembly, lyapnet.training.build_learner, lyapnet.training.task_facts",
+    "figures": "import lyapnet.evaluation.figures",
+    "training": "lyapnet.train",
+    "comparison": "import lyapnet.lab.comparison.execution",
+}
+WITHOUT_UNIX = "import sys, psutil\nsys.modules |= dict.fromkeys(['fcntl', 'resource'])"  # psutil imports them itself
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    """Stage ↦ the modules that are loaded after it and those before it, where no module of Unix alone is found."""
+    program = "\n".join([WITHOUT_UNIX, *(f"{line}\nprint(*sys.modules)" for line in STAGES.values())])
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    return set(done.stdout.split())
+    return dict(zip(STAGES, (set(line.split()) for line in done.stdout.splitlines()), strict=True))
 
 
 @pytest.mark.gate
-def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library():
+def test_importing_lyapnet_and_its_command_line_loads_no_heavy_library(loaded):
     heavy = {"torch", "lightning", "matplotlib", "tensorboard", "gymnasium", "casadi"}
-    assert not heavy & loaded("import lyapnet", "import lyapnet.cli")
-    assert heavy & loaded("import lyapnet.evaluation.figures") == {"torch", "matplotlib"}
+    assert not heavy & loaded["command line"]
+    assert heavy & loaded["figures"] == {"torch", "matplotlib"}
 
 
 @pytest.mark.gate
-def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning():
-    assert "torch" not in loaded(
-        "import lyapnet.training.config_facts, lyapnet.training.stage_messages, lyapnet.experiment.config"
+def test_check_says_what_is_written_without_torch_and_the_rest_without_lightning(loaded):
+    assert "torch" not in loaded["facts"]
+    assert not {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"} & loaded["assembly"]
+
+
+@pytest.mark.gate
+def test_training_and_comparing_import_no_module_of_unix_alone(loaded):
+    assert {"lyapnet.training.run_lock", "lyapnet.lab.comparison.execution"} <= loaded["comparison"]
+
+
+@pytest.mark.gate
+def test_training_loads_neither_bench_nor_comparison(loaded):
+    assert "lyapnet.training.experiment" in loaded["training"]
+    assert (
+        not {"lyapnet.lab.bench", "lyapnet.lab.comparison", "gymnasium", "casadi", "stable_baselines3"}
+        & loaded["training"]
     )
-    slow = {"lightning", "matplotlib", "casadi", "scipy", "sympy", "torch._dynamo"}
-    assert not slow & loaded(
-        "import lyapnet.experiment.assembly, lyapnet.training.build_learner, lyapnet.training.task_facts"
-    )
-
-
-@pytest.mark.gate
-def test_training_and_comparing_import_no_module_of_unix_alone():
-    without = "sys.modules |= dict.fromkeys(['fcntl', 'resource'])"
-    psutil = "import sys, psutil"  # which on Linux imports them itself
-    found = loaded(psutil, without, "import lyapnet.training.experiment, lyapnet.lab.comparison.execution")
-    assert "lyapnet.training.run_lock" in found
-
-
-@pytest.mark.gate
-def test_training_loads_neither_bench_nor_comparison():
-    found = loaded("import lyapnet", "lyapnet.train")
-    assert "lyapnet.training.experiment" in found
-    assert not {"lyapnet.lab.bench", "lyapnet.lab.comparison", "gymnasium", "casadi", "stable_baselines3"} & found

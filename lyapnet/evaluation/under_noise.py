@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.special import stdtrit
 from torch import Tensor
 
 from lyapnet.base.random_streams import NOISE, TEST, stream
@@ -95,6 +94,8 @@ def _half_width(samples: Tensor) -> float:
     variances = samples.double().var(0) / len(samples)  # of the mean of each state
     if not (total := float(variances.sum())):
         return 0.0
+    from scipy.special import stdtrit  # imported here because it takes 0.2 s
+
     freedom = (len(samples) - 1) * total**2 / float((variances**2).sum())
     return float(stdtrit(freedom, (1 + CONFIDENCE) / 2)) * math.sqrt(total) / samples.shape[1]
 

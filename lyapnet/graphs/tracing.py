@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from functools import cache
 from traceback import FrameSummary
 from typing import Any
 
@@ -99,12 +100,10 @@ def core_trace(
         what: a name of the function for messages.
         refusal: the class of the error if it cannot be traced.
     """
-    simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
-    simpler = {target: others for target, others in simpler.items() if not _has_row(target)}
     try:
         with torch.no_grad():
             return trace(
-                lambda *a: function(*a), arguments, decompositions=simpler
+                lambda *a: function(*a), arguments, decompositions=_core_decompositions()
             )  # lambda: make_fx would count `self` as an argument
     except LyapnetError as error:
         raise refusal(str(error)) from error
@@ -114,6 +113,16 @@ def core_trace(
             f"Expected {what} that torch can trace, got {type(error).__name__}: {line}; write them in torch "
             "operations, with torch.where for branches that depend on values."
         ) from error
+
+
+@cache
+def _core_decompositions() -> Mapping[Any, Any]:
+    """Operator ↦ its implementation in core operators, without those that the table of operators has for itself.
+
+    Kept, since torch goes through all its operators to make such a table.
+    """
+    simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
+    return {target: others for target, others in simpler.items() if not _has_row(target)}
 
 
 def _has_row(target: Any) -> bool:

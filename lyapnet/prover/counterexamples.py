@@ -10,6 +10,9 @@ from lyapnet.base.types import Corner, PerState, Points
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.condition import DecreaseCondition
 
+SAMPLES = 20_000  # points of the domain
+STEPS = 40  # of an ascent; the last has 1/1000 of the domain's width
+
 
 class Counterexample(NamedTuple):
     """A point at which the condition fails: its value c is positive, and so is the lower bound of c there."""
@@ -74,22 +77,18 @@ def _likely_violations(
     upper: Corner,
     level: float,
     generator: torch.Generator | None,
-    samples: int = 20_000,
-    steps: int = 40,
 ) -> Points:
     """Samples of the box, and all points of the paths of ascent from the worst 64 samples with W ≤ level."""
-    points = lower + (upper - lower) * torch.rand(samples, len(lower), generator=generator, dtype=torch.float64)
+    points = lower + (upper - lower) * torch.rand(SAMPLES, len(lower), generator=generator, dtype=torch.float64)
     c, W = _values(condition, points)
     start = points[torch.where(level >= W, c, -torch.inf).topk(64).indices]
-    return torch.cat([points, _ascend(condition, start, lower, upper, steps)])
+    return torch.cat([points, _ascend(condition, start, lower, upper)])
 
 
-def _ascend(
-    condition: DecreaseCondition, points: Points, lower: Corner, upper: Corner, steps: int
-) -> Float[Tensor, "passed axes"]:
+def _ascend(condition: DecreaseCondition, points: Points, lower: Corner, upper: Corner) -> Float[Tensor, "passed axes"]:
     """All points of paths along which c rises: steps of decreasing length along the signs of the gradient of c."""
     path = [points]
-    for step in range(steps):
+    for step in range(STEPS):
         with torch.enable_grad():
             leaf = path[-1].detach().requires_grad_()
             c = condition(leaf[:, 0], leaf[:, 1:]).sum()

@@ -21,7 +21,7 @@ import pytest
 import torch
 
 from lyapnet.base.errors import LyapnetError
-from lyapnet.claims import funnel
+from lyapnet.claims import funnel, preconditions
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.loop.rollout import ClosedLoop
 from lyapnet.prover.branch_and_bound import Budget
@@ -37,14 +37,14 @@ from tests.problems import AMPLE, problem_of
 AT, HALF = 0.7002, 1e-4  # where, and how wide: no sample need meet it
 ALPHA, DELTA = 0.5, 0.02
 BRIEF = 20.0  # seconds of an attempt; those of its honest twin are AMPLE
+LEVELS = 2.0  # seconds for the levels of an attempt, as those of a V that has none are sought as long as there is time
+BOXES = 400  # of an attempt and of its twin, of which none needs more than 63
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _little_time_for_levels():
-    """Those of a V that has none are sought as long as there is time; a twin finds its own in a tenth of a second."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(funnel, "LEVELS", 2.0)
-        yield
+@pytest.fixture
+def without_batch_sizes(monkeypatch):
+    """Functions that are the same at each call are not held against batches of every size: that only refuses more."""
+    monkeypatch.setattr(preconditions, "check_batch_sizes", lambda *_: None)
 
 
 def is_there(v):
@@ -108,20 +108,22 @@ class Bowl(ValueFunction):
         return 2.0 * (x**2).sum(-1) + (0 * t if self.add is None else self.add(t, x))
 
 
-def claim(system=None, cost=None, V=None, law=HJBPolicy, loop=ClosedLoop, controls=None, boxes=2000, **options):
+def claim(system=None, cost=None, V=None, law=HJBPolicy, loop=ClosedLoop, controls=None, **options):
     system = System() if system is None else system
     side, n = options.pop("side", 1.0), system.n
     X0 = Box([-0.5] * n, [0.5] * n)
     problem = problem_of(system, cost or Paid(), 20, initial_states=X0, controls=controls)
     closed_loop = loop(problem, law(problem, V or Bowl())).double()
     domain = Box([-side] * n, [side] * n)
-    options = {"alpha": ALPHA, "delta": DELTA, "states": domain, "budget": Budget(BRIEF, boxes=boxes), **options}
-    return prove_funnel(closed_loop, problem, **options)
+    options = {"alpha": ALPHA, "delta": DELTA, "states": domain, "budget": Budget(BRIEF, boxes=BOXES), **options}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(funnel, "LEVELS", AMPLE if options["budget"].seconds == AMPLE else LEVELS)
+        return prove_funnel(closed_loop, problem, **options)
 
 
 def patient():
     """As many boxes as an attempt has, and all the time that they take."""
-    return {"budget": Budget(AMPLE, boxes=2000)}
+    return {"budget": Budget(AMPLE, boxes=BOXES)}
 
 
 def outcome(*parts, **options):
@@ -421,6 +423,7 @@ TORCH = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("without_batch_sizes")
 @pytest.mark.parametrize("way", sample(TORCH, 9))
 def test_all_that_torch_does_is_bounded(way):
     assert outcome(System(TORCH[way])) != "certified"
@@ -610,6 +613,7 @@ CLASSES = {
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("without_batch_sizes")
 @pytest.mark.parametrize("way", sample(CLASSES, 7))
 def test_every_class_is_held_to_what_it_is_certified_for(way):
     assert outcome(**CLASSES[way]()) != "certified"
@@ -680,6 +684,7 @@ VALUES = {
 }
 
 
+@pytest.mark.usefixtures("without_batch_sizes")
 @pytest.mark.parametrize("name", sample(VALUES, 6))
 def test_no_such_value_function_is_certified(name):
     assert outcome(V=VALUES[name]) != "certified"
@@ -806,10 +811,11 @@ NUMBERS = {
     "no seconds": {"budget": Budget(0.0)},
     "seconds before 0": {"budget": Budget(-1.0)},
     "no boxes": {"budget": Budget(BRIEF, boxes=0)},
-    "one box kept, of a spike": {"system": System(spike), "budget": Budget(BRIEF, boxes=2000, frontier=1)},
+    "one box kept, of a spike": {"system": System(spike), "budget": Budget(BRIEF, boxes=BOXES, frontier=1)},
 }
 
 
+@pytest.mark.usefixtures("without_batch_sizes")
 @pytest.mark.parametrize("name", sample(NUMBERS, 7))
 def test_no_such_numbers_are_certified(name):
     assert outcome(**NUMBERS[name]) != "certified"
@@ -846,7 +852,7 @@ def test_a_problem_that_changes_after_its_check_is_certified_as_it_is_then():
     problem = problem_of(system, Paid(), 20, initial_states=Box([-0.5] * 2, [0.5] * 2))
     problem.check()
     closed_loop = ClosedLoop(problem, HJBPolicy(problem, Bowl())).double()
-    domain, budget = Box([-1.0] * 2, [1.0] * 2), Budget(AMPLE, boxes=2000)
+    domain, budget = Box([-1.0] * 2, [1.0] * 2), Budget(AMPLE, boxes=BOXES)
     system.add = spike
     assert prove_funnel(closed_loop, problem, ALPHA, DELTA, domain, budget).verdict != "certified"
     system.add = None

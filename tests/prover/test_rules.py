@@ -15,7 +15,7 @@ from lyapnet.prover.bound_rules import ARRANGEMENTS, RULES
 from lyapnet.prover.bounds import BoundedFunction
 from lyapnet.prover.branches import decisions
 from lyapnet.prover.rounding import ROUNDED
-from tests.marks import at_the_gate, sample
+from tests.marks import sample
 
 aten = torch.ops.aten
 AXES = 3
@@ -234,8 +234,9 @@ def test_no_value_lies_outside(operation):
 
 
 @pytest.mark.parametrize("operation", sample(CASES, 25), ids=str)
-def test_no_value_lies_outside_in_ten_thousand_boxes(operation):
-    counts = [examine(operation, 2000, seed) for seed in range(1, 6)]
+def test_no_value_of_other_functions_lies_outside(operation):
+    """test_rules_at_length.py has ten thousand boxes of each."""
+    counts = [examine(operation, 600, seed) for seed in (1, 2)]
     assert sum(outside for outside, _, _ in counts) == 0
 
 
@@ -281,7 +282,7 @@ def outside_of_composition(expression, boxes=60):
 
 
 @pytest.mark.gate
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(EXPRESSIONS)
 def test_no_value_of_many_compositions_lies_outside(expression):
     assert outside_of_composition(expression) == 0
@@ -336,10 +337,9 @@ def largest_error(name, count):
 
 
 @pytest.mark.gate
-@pytest.mark.parametrize("count", [2000, at_the_gate(100_000)])
 @pytest.mark.parametrize("name", ELEMENTARY)
-def test_elementary_functions_err_by_less_at_many_points(name, count):
-    assert largest_error(name, count) < 2
+def test_elementary_functions_err_by_less_at_many_points(name):
+    assert largest_error(name, 4000) < 2
 
 
 def test_a_function_in_single_precision_errs_by_more(monkeypatch):

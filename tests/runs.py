@@ -4,6 +4,7 @@ The processes are forked from a server that has imported everything once: a star
 """
 
 import contextlib
+import gc
 import itertools
 import json
 import multiprocessing
@@ -23,6 +24,7 @@ from tensorboard.util import tensor_util
 
 from lyapnet.cli import main, options
 from lyapnet.experiment.checkpoint import read_checkpoint
+from tests.pages import ROOT
 
 SMALL = {
     "experiment": "small",
@@ -44,7 +46,7 @@ MEASURED_TIME = {"rollout_steps_per_second", "training_seconds"}
 _server = multiprocessing.get_context("forkserver")
 _server.set_forkserver_preload(
     ["lyapnet.training.experiment", "lyapnet.cli", "lyapnet.evaluation.tables", "tensorboard.util.tensor_util",
-     "torch.utils.tensorboard", "matplotlib.backends.backend_agg"]
+     "torch.utils.tensorboard", "matplotlib.backends.backend_agg", "tests.frozen"]
 )  # fmt: skip
 
 
@@ -83,7 +85,8 @@ class Desk:
     def start(self, *arguments, prepare=None):
         """A process that trains; `prepare` is called in it first."""
         process = _server.Process(target=_train, args=(self.folder, arguments, prepare))
-        process.start()
+        with contextlib.chdir(ROOT):  # the first one starts the server, which finds tests.frozen here
+            process.start()
         return process
 
     def train(self, *arguments, prepare=None):
@@ -111,6 +114,7 @@ class Desk:
 
 
 def _train(folder, arguments, prepare):
+    assert gc.get_freeze_count(), "half of the time would go to the garbage of the server"
     os.chdir(folder)
     for name, descriptor in (("output.txt", 1), ("errors.txt", 2)):
         os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)

@@ -51,11 +51,11 @@ def test_a_file_for_what_keeps_no_proof_is_refused(controller, claim, tmp_path):
 
 @pytest.mark.gate
 def test_two_sides_in_any_order_are_one_certificate(controller):
-    claims = [lyapnet.LowerBound(), lyapnet.Funnel(alpha=0.95, delta=0.02)]
+    claims = [lyapnet.LowerBound(), lyapnet.Funnel(alpha=0.9, delta=0.1)]
     both = lyapnet.certify(controller, *claims)
     assert both.result["lower_level"] > 0
     assert "--two-sided" in both.command("best.ckpt")
-    alone = lyapnet.certify(controller, lyapnet.LowerBound(delta=0.02))
+    alone = lyapnet.certify(controller, lyapnet.LowerBound(beta=0.9, delta=0.1))
     assert alone.result["lower_level"] == both.result["lower_level"]
     assert alone.in_words().startswith("controls that keep the state in D cost at least")
     assert alone.figure().axes

@@ -31,6 +31,12 @@ def _few_optima(monkeypatch):
     monkeypatch.setattr("lyapnet.training.pretraining.BRIEF_STEPS", 10)
 
 
+@pytest.fixture
+def without_start(monkeypatch):
+    """The start of a training, which is sought last and takes longest, is not sought."""
+    monkeypatch.setattr("lyapnet.training.task_facts.load_or_choose_start", lambda *_, **__: None)
+
+
 def linear(A, B, **changes):
     n = len(A)
     ones = {"Q": [1] * n, "R": [1] * len(B[0]), "Q_T": [1] * n}
@@ -48,6 +54,7 @@ def found_of(config, problem=None, **options):
     return facts_of(build_learner(config, problem or build_problem(config)), **options)
 
 
+@pytest.mark.usefixtures("without_start")
 def test_modes_and_controllability():
     reached = facts(linear([[0, 1], [4, 0]], [[0], [1]]))
     assert reached["modes"].found == "2, -2 1/s at the goal"
@@ -78,6 +85,7 @@ class Falling(Linear):
         return self.f(x) + (self.g(x) @ u[..., None])[..., 0]
 
 
+@pytest.mark.usefixtures("without_start")
 @pytest.mark.parametrize(("B", "words"), [([[0], [2]], "held by u = (0.5)"), ([[1], [0]], "no control holds it")])
 def test_a_goal_that_is_no_equilibrium(B, words):
     content = linear([[0, 1], [0, 0]], B)
@@ -89,6 +97,7 @@ def test_a_goal_that_is_no_equilibrium(B, words):
     assert facts(content)["goal"].found == "an equilibrium without control"
 
 
+@pytest.mark.usefixtures("without_start")
 @pytest.mark.gate
 def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     """ẋ = u, φ = px²: the gain over a step is Δt p/R, and Euler steps of u = −px/R grow above 2."""
@@ -107,6 +116,7 @@ def test_stiffness_is_that_at_which_the_hjb_law_breaks():
     )
 
 
+@pytest.mark.usefixtures("without_start")
 @pytest.mark.gate
 @pytest.mark.parametrize(("method", "least"), [("euler", 2.0), ("midpoint", 2.0), ("rk4", 2.785)])
 def test_a_step_that_a_method_cannot_take(method, least):

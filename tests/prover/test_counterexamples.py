@@ -13,6 +13,11 @@ from tests.claims.planted import Planted, domain, loop, riccati
 POINT, SIDE = torch.tensor([1.0, 0.0, 0.0]).double(), 0.3  # where c has no slope
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_ascents():
+    """They go all the way here."""
+
+
 @pytest.fixture
 def planted():
     """A condition that fails within 0.03 of a point alone, of a bump that is wider."""

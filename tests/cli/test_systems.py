@@ -1,5 +1,6 @@
 """lyapnet systems."""
 
+import gc
 import os
 import re
 import subprocess
@@ -7,6 +8,7 @@ import sys
 
 import pytest
 
+from lyapnet import cli
 from lyapnet.cli import main
 from lyapnet.loop.programs import PROGRAMS
 from lyapnet.task.constraints import CONSTRAINTS
@@ -49,3 +51,16 @@ def test_code_of_the_users_own_that_leaves_is_named(monkeypatch, capsys):
     monkeypatch.setattr("lyapnet.cli.app", lambda *arguments, **options: sys.exit(3))
     assert main(["systems"]) == 1
     assert "Expected code of your own that returns, got SystemExit: 3" in capsys.readouterr().err
+
+
+def test_commands_seldom_search_for_garbage_and_leave_that_as_it_was(monkeypatch):
+    before, seen = gc.get_threshold(), []
+    monkeypatch.setattr(cli, "app", lambda *_, **__: seen.append(gc.get_threshold()[0]))
+    try:
+        for threshold in (700, 1_000_000):
+            gc.set_threshold(threshold)
+            assert main(["systems"]) == 0
+            assert gc.get_threshold()[0] == threshold
+    finally:
+        gc.set_threshold(*before)
+    assert seen == [cli.ALLOCATIONS, 1_000_000]

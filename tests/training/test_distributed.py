@@ -56,8 +56,8 @@ def gradient_on(name, *overrides, processes):
     ("name", "gradient", "two"),
     [
         ("double_integrator", "discrete", FORKED),
-        pytest.param("double_integrator", "discrete", TWO, marks=pytest.mark.gate),
-        pytest.param("double_integrator_value", "adjoint", TWO, marks=pytest.mark.gate),
+        ("double_integrator_value", "adjoint", TWO),
+        pytest.param("double_integrator", "discrete", TWO, marks=pytest.mark.nightly),
     ],
 )
 def test_two_processes_have_the_gradient_of_the_joint_batch(tmp_path, name, gradient, two):

@@ -117,14 +117,20 @@ def at(x, problem):
     )
 
 
-@pytest.fixture
-def swing(monkeypatch):
+@pytest.fixture(scope="module")
+def optima():
     """A pendulum that hangs, and optima of it: (problem, those that are fitted to, those that are not)."""
-    shorten_fits(monkeypatch, 400, 200)
     problem = hanging(steps=40)
     expansion = optimal_trajectories(problem, problem.initial_states.center[None], torch.zeros(40, 1, 1)).expansion
     seen, unseen = (optima_for(problem, [expansion.member(0)], problem.initial_states.sample(12)) for _ in range(2))
     return problem, seen, unseen
+
+
+@pytest.fixture
+def swing(optima, monkeypatch):
+    """The same, with short fits."""
+    shorten_fits(monkeypatch, 400, 200)
+    return optima
 
 
 def learner_of(problem, value_scale):

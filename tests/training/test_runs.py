@@ -272,11 +272,10 @@ def survives(desk, moments, arguments=()):
         arguments = ("--resume", "last")
 
 
-@pytest.mark.parametrize("every", [4, pytest.param(1, marks=pytest.mark.gate)])
-def test_killed_at_chosen_moments_a_run_ends_the_same(every, desk, reference):
-    survives(desk, MOMENTS[2 if every > 1 else 0 :: every])
+def test_killed_at_chosen_moments_a_run_ends_the_same(desk, reference):
+    survives(desk, MOMENTS)
     assert desk.train("--resume", "last")[0] == 0
-    assert_same_end(desk, reference, pictures=every == 1)
+    assert_same_end(desk, reference)
 
 
 def test_killed_at_random_moments_a_run_ends_the_same(desk, reference):

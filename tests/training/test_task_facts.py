@@ -1,7 +1,5 @@
 """What a run knows of its task comes from its config: not from weights, not from a precision, not from a device."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -116,20 +114,3 @@ def test_figure_that_cannot_be_drawn_does_not_stop_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr("lyapnet.evaluation.figures.certified_region", diverges)
     with pytest.warns(UserWarning, match="No figures at step"):
         trained("double_integrator", tmp_path)
-
-
-@pytest.mark.gate
-def test_two_processes_draw_different_batches_and_agree(without_figures, tmp_path):
-    """Distributed data parallel on the CPU; a process of its own, since it forks."""
-    arguments = [*SHORT, "trainer.devices=2", "trainer.strategy=ddp_fork", f"logs={tmp_path}", "network.hidden=[8,8]"]
-    command = [sys.executable, "train.py", "--config", str(SCRATCH / "double_integrator.yaml"), *arguments]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    weights = [
-        read_checkpoint(path)["state_dict"]["V.network.time.weight"]
-        for path in (
-            tmp_path / "double_integrator_from_scratch" / "version_0" / "checkpoints" / "last.ckpt",
-            trained("double_integrator", tmp_path, "network.hidden=[8,8]").with_name("last.ckpt"),
-        )
-    ]
-    assert not torch.equal(*weights)  # the joint batch is not the batch of one process

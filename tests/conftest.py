@@ -68,7 +68,7 @@ jaxtyping.install_import_hook("lyapnet", "beartype.beartype(conf=beartype.Bearty
 
 from lyapnet.claims import funnel, preconditions  # noqa: E402
 from lyapnet.loop.rollout import routines  # noqa: E402
-from lyapnet.prover import counterexamples  # noqa: E402
+from lyapnet.prover import bounds, counterexamples  # noqa: E402
 from lyapnet.task.cost import QuadraticCost  # noqa: E402
 from lyapnet.task.systems import SYSTEMS, ControlAffineSystem  # noqa: E402
 from lyapnet.value.networks import FCN, Scaling  # noqa: E402
@@ -239,8 +239,11 @@ def few_seconds_for_levels():
 
 
 @pytest.fixture(scope="module")
-def batch_sizes_once():
-    """The parts of a closed loop are traced for batches of every size once in a file that is about one closed loop."""
+def one_closed_loop():
+    """For a file about one closed loop: its parts are traced for batches of every size once.
+
+    Each trace of a function is compared with it at 4 points instead of 32.
+    """
     asked, check = [], preconditions.check_batch_sizes
 
     def once(*arguments):
@@ -249,4 +252,5 @@ def batch_sizes_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(preconditions, "check_batch_sizes", once)
+        patch.setattr(bounds, "TRACE_POINTS", 4)
         yield

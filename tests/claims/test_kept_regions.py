@@ -24,7 +24,7 @@ from tests.claims.planted import riccati, stationary
 from tests.claims.test_region import LIMITED, D, loop_of, problem
 from tests.problems import AMPLE
 
-pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("batch_sizes_once")]
+pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("one_closed_loop")]
 ABOUT = problem(controls=LIMITED)
 
 

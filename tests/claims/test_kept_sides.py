@@ -17,7 +17,7 @@ from tests.claims.planted import riccati, stationary
 from tests.claims.test_least_cost import problem
 from tests.problems import Formula
 
-pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("batch_sizes_once")]
+pytestmark = [pytest.mark.gate, pytest.mark.usefixtures("one_closed_loop")]
 SET = [[-2.5, -4.5], [2.5, 4.5]]
 
 

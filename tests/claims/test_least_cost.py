@@ -29,7 +29,7 @@ from tests.marks import sample
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = pytest.mark.usefixtures("one_closed_loop")
 
 DURATION, STEPS = 2.0, 200
 D = Box([-1.5, -2.5], [1.5, 2.5]).double()

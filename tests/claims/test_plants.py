@@ -31,7 +31,7 @@ from lyapnet.value.policy import HJBPolicy
 from tests.claims.planted import cost, riccati, stationary
 from tests.problems import Formula, problem_of
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = pytest.mark.usefixtures("one_closed_loop")
 
 LAMBDA = 0.01 / 2  # 1 % of 1/T
 K0 = 2.0  # u = −K0 x of V = x² with R = ½, g = 1

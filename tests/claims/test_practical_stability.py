@@ -33,7 +33,7 @@ from tests.claims.test_region import D, claimed, loop_of, plain_claim, problem
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = pytest.mark.usefixtures("one_closed_loop")
 
 W = torch.tensor([0.0, 0.2], dtype=torch.float64)
 LAMBDA = 0.01 / 2  # 1 % of 1/T

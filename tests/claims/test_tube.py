@@ -25,7 +25,7 @@ from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem, Linear
 from tests.problems import Formula, problem_of
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = pytest.mark.usefixtures("one_closed_loop")
 
 HALF, T = 0.3, 1.0
 

@@ -23,7 +23,7 @@ from tests.claims.test_least_cost import optimum, problem
 from tests.problems import Formula
 from tests.runs import tiny_checkpoint
 
-pytestmark = pytest.mark.usefixtures("batch_sizes_once")
+pytestmark = pytest.mark.usefixtures("one_closed_loop")
 
 BETA, DELTA = 0.98, 0.005
 

@@ -151,8 +151,9 @@ def test_seeds_beyond_the_config_are_reported(smoke, compare):
     assert [seed for _, method, seed in rows if method == "lyapnet"] == ["0"]
 
 
-@pytest.mark.gate
+@pytest.mark.nightly
 def test_a_killed_job_goes_on(tmp_path):
+    """Without the comparison around it; that of test_a_killed_comparison_goes_on is continued in the same way."""
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     longer = "tasks.double_integrator.steps.ppo_tuned=15000"
     folder = tmp_path / "logs" / "compare_smoke" / "double_integrator" / "ppo_tuned" / "seed_0"

@@ -647,7 +647,7 @@ def test_of_two_that_resume_at_the_same_time_one_is_refused(finished, tmp_path):
     (tmp_path / "other").mkdir()
     desks = [finished, Desk(tmp_path / "other")]
     (tmp_path / "other" / "logs").symlink_to(finished.folder / "logs")
-    arguments = ("--resume", "last", "training.iterations=300")
+    arguments = ("--resume", "last", "training.iterations=150")
     processes = [desk.start(*arguments, prepare=without_figures) for desk in desks]
     ends = [desk.end(process) for desk, process in zip(desks, processes, strict=True)]
     (_, _, quiet), (_, _, refusal) = sorted(ends)
@@ -655,7 +655,7 @@ def test_of_two_that_resume_at_the_same_time_one_is_refused(finished, tmp_path):
     assert quiet == ""
     assert refusal.count("\n") == 1
     assert "is training" in refusal
-    assert [step for step, _ in logged(finished.run)["loss/train"]] == list(range(1, 301))
+    assert [step for step, _ in logged(finished.run)["loss/train"]] == list(range(1, 151))
 
 
 def test_runs_that_start_at_the_same_time_have_folders_of_their_own(tmp_path):

@@ -18,11 +18,11 @@ from lyapnet.controller.controller import Controller
 from lyapnet.evaluation.measurement import evaluate
 from lyapnet.evaluation.oracles import discrete_riccati
 from lyapnet.experiment.assembly import build_problem, build_program, build_rollout, build_value_function
-from lyapnet.experiment.checkpoint import KEY, read_checkpoint, write_checkpoint
+from lyapnet.experiment.checkpoint import AFTER_HORIZON, KEY, read_checkpoint, write_checkpoint
 from lyapnet.experiment.config import Config, load_config
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.systems import DoubleIntegrator, Linear
-from lyapnet.value.after_horizon import LAWS
+from lyapnet.value.after_horizon import LAWS, AfterHorizon
 from lyapnet.value.policy import HJBPolicy
 from tests.problems import Quadratic, problem_of, untrained
 
@@ -408,6 +408,46 @@ def test_evaluate_notes_another_plant_once_and_measures_it(path, tmp_path, monke
     assert "other state names;" in note
     own, other = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     assert own["cost_mean"] == other["cost_mean"]
+
+
+@pytest.mark.parametrize(("held", "beyond", "noted"), [(10, None, True), (64, None, False), (10, "hold", False)])
+def test_a_law_after_T_that_holds_too_few_is_noted_at_load(held, beyond, noted, path, tmp_path, caplog):
+    """Where the law after T is the user's choice, nothing is to be said of the one that training found."""
+    found = AfterHorizon("receding", held, 64, "receding: 10 of 64")
+    content = read_checkpoint(path)
+    content[KEY][AFTER_HORIZON] = found._asdict()
+    write_checkpoint(content, tmp_path / "after.ckpt")
+    controller = lyapnet.load(tmp_path / "after.ckpt", beyond=beyond)
+    assert controller.after_horizon() == found
+    notes = [record.getMessage() for record in caplog.records if "no law was found" in record.getMessage()]
+    assert len(notes) == noted
+
+
+def test_weights_of_another_network_are_named_up_to_six(path, tmp_path):
+    content = read_checkpoint(path)
+    weights = content["state_dict"]
+    own = sorted(name for name in weights if name.startswith("V."))
+    weights[own[0]] = weights[own[0]].new_zeros(7, 7)
+    write_checkpoint(content, tmp_path / "shape.ckpt")
+    with pytest.raises(
+        CheckpointError, match=rf"got another one: {own[0][2:]} has shape \(7, 7\) in the checkpoint[^;]*$"
+    ):
+        lyapnet.load(tmp_path / "shape.ckpt")
+    weights |= {f"V.extra{i}": torch.zeros(1) for i in range(8)}
+    write_checkpoint(content, tmp_path / "more.ckpt")
+    with pytest.raises(CheckpointError, match=r"extra5 is only in the checkpoint; and 3 more\. Use"):
+        lyapnet.load(tmp_path / "more.ckpt")
+
+
+def test_a_rollout_of_more_or_fewer_steps_is_the_same_closed_loop():
+    """Under a V that does not depend on time the law after T is that before T."""
+    problem = problem_of(DoubleIntegrator(), steps=6)
+    V = Quadratic(torch.tensor([[2.0, 1.0], [1.0, 2.0]]), dt=100.0)
+    short = lyapnet.Controller(problem, V, policy=HJBPolicy, beyond="hold")
+    long = lyapnet.Controller(problem.in_steps(steps=10), V, policy=HJBPolicy, beyond="hold")
+    x0 = torch.tensor([X0, [-0.3, 0.9]])
+    assert_close(tuple(short.rollout(x0, steps=10)), tuple(long.rollout(x0)))
+    assert_close(tuple(long.rollout(x0, steps=6)), tuple(short.rollout(x0)))
 
 
 def test_a_system_of_another_number_of_states_is_named(path):

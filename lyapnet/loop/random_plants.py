@@ -22,6 +22,9 @@ class UntoldValue(ValueFunction):
         n: number of states x.
     """
 
+    V: ValueFunction
+    n: int
+
     def __init__(self, V: ValueFunction, n: int):
         super().__init__()
         self.V, self.n = V, n
@@ -41,6 +44,9 @@ class UntoldPolicy(ValuePolicy):
         problem: the problem of the plants, with the states (x, p).
         law: u(t, x).
     """
+
+    law: ValuePolicy
+    n: int
 
     def __init__(self, problem: Problem, law: ValuePolicy):
         n = law.system.n
@@ -71,6 +77,7 @@ class RandomPlants(nn.Module):
     problem: Problem
     rollout: Rollout
     ranges: Box
+    n: int  # number of states x
 
     def __init__(self, problem: Problem, rollout: Rollout):
         super().__init__()

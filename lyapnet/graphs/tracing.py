@@ -100,10 +100,12 @@ def core_trace(
         what: a name of the function for messages.
         refusal: the class of the error if it cannot be traced.
     """
+    # an operator may have been registered since the last trace
+    simpler = {target: others for target, others in _core_decompositions().items() if not _has_row(target)}
     try:
         with torch.no_grad():
             return trace(
-                lambda *a: function(*a), arguments, decompositions=_core_decompositions()
+                lambda *a: function(*a), arguments, decompositions=simpler
             )  # lambda: make_fx would count `self` as an argument
     except LyapnetError as error:
         raise refusal(str(error)) from error
@@ -117,12 +119,8 @@ def core_trace(
 
 @cache
 def _core_decompositions() -> Mapping[Any, Any]:
-    """Operator ↦ its implementation in core operators, without those that the table of operators has for itself.
-
-    Kept, since torch goes through all its operators to make such a table.
-    """
-    simpler = {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
-    return {target: others for target, others in simpler.items() if not _has_row(target)}
+    """Operator ↦ its implementation in core operators; kept, since torch goes through all its operators to make it."""
+    return {**core_aten_decompositions(), **get_decompositions(NOT_CORE)}
 
 
 def _has_row(target: Any) -> bool:

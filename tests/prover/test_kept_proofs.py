@@ -9,7 +9,17 @@ import pytest
 import torch
 
 from lyapnet.base.errors import UsageError
-from lyapnet.prover import bound_rules, bounds, branch_and_bound, condition, kept_proofs, proof, simplification, taylor
+from lyapnet.prover import (
+    bound_rules,
+    bounds,
+    branch_and_bound,
+    condition,
+    counterexamples,
+    kept_proofs,
+    proof,
+    simplification,
+    taylor,
+)
 from lyapnet.prover.boxes import CutTree, single
 from lyapnet.prover.branch_and_bound import Budget
 from lyapnet.prover.condition import DecreaseCondition
@@ -349,7 +359,8 @@ def test_threads_come_to_the_same_verdict_and_level(P):
 # Where a condition fails
 
 
-def test_violations_are_the_worst_points_found(P):
+def test_violations_are_the_worst_points_found(P, monkeypatch):
+    monkeypatch.setattr(counterexamples, "STEPS", 40)  # conftest.py has fewer
     condition = violated(P)
     points = violations(condition, domain(), 6.0, 40, torch.Generator().manual_seed(0))
     with torch.no_grad():

@@ -437,3 +437,10 @@ def test_the_file_in_which_a_bound_is_written_joins_what_a_proof_depends_on(tmp_
         assert (tmp_path / "written_elsewhere.py").read_bytes() in own.files()
     finally:
         forget(SOFT)
+
+
+@needs_c
+@needs_compiler
+def test_a_row_registered_after_a_first_trace_is_read_too(registered, tmp_path):
+    by_c(OPERATORS["exp"], tmp_path)
+    test_a_wrong_column_is_found("C", registered, tmp_path)

@@ -11,17 +11,15 @@ from torch import Tensor
 
 from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError, did_you_mean
-from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.controller.controller import Controller
 from lyapnet.experiment.assembly.classes import float64_defaults, section
+from lyapnet.loop.random_plants import NominalLaw, problem_of_plants
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
-from lyapnet.task.constraints import OfFirstStates
-from lyapnet.task.family import PREFIX, FamilyCost, FamilySystem, check_members
+from lyapnet.task.family import PREFIX, FamilySystem, check_members
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import ControlAffineSystem
-from lyapnet.value.calculus import ValueFunction
-from lyapnet.value.policy import PolicyOutput, ValuePolicy
+from lyapnet.value.policy import ValuePolicy
 
 OPTION = "parameters"
 TRIED = 8  # random states at which plants are compared with systems built with their parameters
@@ -70,53 +68,7 @@ class Plants:
 
     def problem(self, problem: Problem) -> Problem:
         """The problem in z: the cost, the controls and the constraints of the nominal plant, and X₀ × P."""
-        n, k = self.system.system.n, self.box.dimension
-        center = self.box.center
-        cost = FamilyCost(problem.cost, center.new_zeros(n, k), center)
-        h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
-        return problem.replaced(
-            system=self.system, cost=cost, initial_states=self.around(problem.initial_states), constraints=h
-        )
-
-
-class NominalValue(ValueFunction):
-    """V(t, x) as a function of (t, z) with z = (x, p), independent of p."""
-
-    def __init__(self, V: ValueFunction, n: int):
-        super().__init__()
-        self.V, self.n = V, n
-
-    def forward(self, t: Time, x: State) -> PerState:
-        return self.V(t, x[..., : self.n])
-
-    def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
-        value, slope = self.V.value_and_state_gradient(t, x[..., : self.n])
-        return value, append_zeros(slope, x)
-
-
-class NominalLaw(ValuePolicy):
-    """u(t, x) as a function of (t, z), independent of p.
-
-    Args:
-        problem: the problem in z.
-        policy: the law of the nominal plant.
-    """
-
-    def __init__(self, problem: Problem, policy: ValuePolicy):
-        super().__init__(problem, NominalValue(policy.V, policy.system.n))
-        self.policy, self.n, self.held, self.origin = policy, policy.system.n, policy.held, policy.origin
-
-    def forward(self, t: Time, x: State) -> Control:
-        return self.policy(t, x[..., : self.n])
-
-    def with_value(self, t: Time, x: State) -> PolicyOutput:
-        u, value, slope = self.policy.with_value(t, x[..., : self.n])
-        return PolicyOutput(u, value, append_zeros(slope, x))
-
-
-def append_zeros(slope: Tensor, z: Tensor) -> Tensor:
-    """The gradient in z of a function that is independent of p, from its gradient in x."""
-    return torch.cat([slope, torch.zeros_like(z[..., slope.shape[-1] :])], -1)
+        return problem_of_plants(problem, self.system, self.around(problem.initial_states))
 
 
 def plants_of(controller: Controller, ranges: Mapping[str, Sequence[float]]) -> Plants:

@@ -6,6 +6,8 @@ from torch import Tensor, nn
 
 from lyapnet.base.types import Control, PerState, State, Time
 from lyapnet.loop.rollout import Rollout, Trajectory
+from lyapnet.task.constraints import OfFirstStates
+from lyapnet.task.family import FamilyCost, FamilySystem
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
@@ -14,7 +16,7 @@ from lyapnet.value.policy import PolicyOutput, ValuePolicy
 StateOfPlant = Float[Tensor, "*batch states_and_parameters"]  # (x, p)
 
 
-class UntoldValue(ValueFunction):
+class NominalValue(ValueFunction):
     """V(t, x) as a function of (t, (x, p)) that does not depend on the parameters p.
 
     Args:
@@ -34,36 +36,49 @@ class UntoldValue(ValueFunction):
 
     def value_and_state_gradient(self, t: Time, x: State) -> tuple[PerState, State]:
         value, V_x = self.V.value_and_state_gradient(t, x[..., : self.n])
-        return value, _with_zeros(V_x, x)
+        return value, append_zeros(V_x, x)
 
 
-class UntoldPolicy(ValuePolicy):
+class NominalLaw(ValuePolicy):
     """u(t, x), a law made with the model, as a law of (x, p) that does not depend on the parameters p.
 
     Args:
         problem: the problem of the plants, with the states (x, p).
-        law: u(t, x).
+        policy: u(t, x).
     """
 
-    law: ValuePolicy
+    policy: ValuePolicy
     n: int
 
-    def __init__(self, problem: Problem, law: ValuePolicy):
-        n = law.system.n
-        super().__init__(problem, UntoldValue(law.V, n))
-        self.law, self.n, self.held = law, n, law.held
+    def __init__(self, problem: Problem, policy: ValuePolicy):
+        super().__init__(problem, NominalValue(policy.V, policy.system.n))
+        self.policy, self.n, self.held, self.origin = policy, policy.system.n, policy.held, policy.origin
 
     def forward(self, t: Time, x: State) -> Control:
-        return self.law(t, x[..., : self.n])
+        return self.policy(t, x[..., : self.n])
 
     def with_value(self, t: Time, x: State) -> PolicyOutput:
-        u, value, V_x = self.law.with_value(t, x[..., : self.n])
-        return PolicyOutput(u, value, _with_zeros(V_x, x))
+        u, value, V_x = self.policy.with_value(t, x[..., : self.n])
+        return PolicyOutput(u, value, append_zeros(V_x, x))
 
 
-def _with_zeros(V_x: Tensor, x: State) -> State:
-    """V_x of all states, which is zero for the parameters."""
-    return torch.cat([V_x, torch.zeros_like(x[..., V_x.shape[-1] :])], -1)
+def append_zeros(slope: Tensor, z: Tensor) -> Tensor:
+    """The gradient in z = (x, p) of a function that is independent of p, from its gradient in x."""
+    return torch.cat([slope, torch.zeros_like(z[..., slope.shape[-1] :])], -1)
+
+
+def problem_of_plants(problem: Problem, system: FamilySystem, initial_states: Box) -> Problem:
+    """The problem in z = (x, p): the cost, the controls and the constraints of the nominal plant, and X₀ × P.
+
+    Args:
+        problem: that of the nominal plant, in x.
+        system: all plants, as a family.
+        initial_states: X₀ × P.
+    """
+    n, center = problem.system.n, initial_states.center
+    cost = FamilyCost(problem.cost, center.new_zeros(n, len(center) - n), center[n:])
+    h = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
+    return problem.replaced(system=system, cost=cost, initial_states=initial_states, constraints=h)
 
 
 class RandomPlants(nn.Module):
@@ -87,7 +102,7 @@ class RandomPlants(nn.Module):
         options = rollout.solver_arguments
         self.problem, self.n, box = problem, law.system.n, problem.initial_states
         self.rollout = Rollout(
-            problem, UntoldPolicy(problem, law), rollout.method, rollout.gradient, options["rtol"], options["atol"],
+            problem, NominalLaw(problem, law), rollout.method, rollout.gradient, options["rtol"], options["atol"],
             limit,
         )  # fmt: skip
         self.ranges = Box(box.lower[self.n :], box.upper[self.n :])

@@ -13,7 +13,7 @@ from lyapnet.evaluation.on_plants import measure_on_plants
 from lyapnet.evaluation.oracles import oracle_of
 from lyapnet.evaluation.plants_figure import cost_against_parameters
 from lyapnet.evaluation.tables import evaluation_table
-from lyapnet.loop.random_plants import UntoldPolicy
+from lyapnet.loop.random_plants import NominalLaw
 from tests.loop.test_random_plants import TASK, plants_of, seeded
 
 
@@ -45,9 +45,9 @@ def test_plants_that_equal_the_model_cost_as_much_as_the_model():
 
 def test_a_closed_loop_that_is_not_finite_is_counted_and_not_averaged_away(monkeypatch):
     def diverging(self, t, x):
-        return torch.where(x[..., 2:3] > 1.0, 1e200 * (1 + x[..., :1] ** 2), self.law(t, x[..., :2]))
+        return torch.where(x[..., 2:3] > 1.0, 1e200 * (1 + x[..., :1] ** 2), self.policy(t, x[..., :2]))
 
-    monkeypatch.setattr(UntoldPolicy, "forward", diverging)
+    monkeypatch.setattr(NominalLaw, "forward", diverging)
     _, _, found = measured()
     share = float((found.z0[:, 2] <= 1.0).double().mean())
     assert 0 < share < 1

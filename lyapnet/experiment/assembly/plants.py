@@ -6,10 +6,8 @@ from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly.classes import float64_defaults
 from lyapnet.experiment.assembly.family import checked_ranges, members_of
 from lyapnet.experiment.config import Config
-from lyapnet.loop.random_plants import RandomPlants
+from lyapnet.loop.random_plants import RandomPlants, problem_of_plants
 from lyapnet.loop.rollout import Rollout
-from lyapnet.task.constraints import OfFirstStates
-from lyapnet.task.family import FamilyCost
 
 
 def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
@@ -27,14 +25,11 @@ def build_plants(config: Config, rollout: Rollout) -> RandomPlants | None:
         return None
     _require_support(config)
     problem, ranges = rollout.problem, checked_ranges(config.randomise, "randomise")
-    n, k, like = problem.system.n, len(ranges), problem.initial_states.lower
+    like = problem.initial_states.lower
     with float64_defaults():  # as when the problem is built
-        exact = copy.deepcopy(problem.system).double()
-        system, box = members_of(config, exact, ranges, [""] * k, problem.initial_states, "randomise")
-    cost = FamilyCost(problem.cost, like.new_zeros(n, k), box.center[n:].to(like)).to(like)
-    constraints = None if problem.constraints is None else OfFirstStates(problem.constraints, n)
-    plants = problem.replaced(system=system.to(like), cost=cost, initial_states=box.to(like), constraints=constraints)
-    return RandomPlants(plants, rollout)
+        exact, units = copy.deepcopy(problem.system).double(), [""] * len(ranges)
+        system, box = members_of(config, exact, ranges, units, problem.initial_states, "randomise")
+    return RandomPlants(problem_of_plants(problem, system.to(like), box.to(like)), rollout)
 
 
 def _require_support(config: Config) -> None:

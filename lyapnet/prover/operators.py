@@ -31,7 +31,7 @@ BOXES, POINTS = 40, 40  # numbers of boxes, and of points in each, at which boun
 TOLERANCE = 1e-7  # largest difference of a derivative from torch's, relative to max(1, |derivative|)
 
 KINDS: dict[str, dict[Any, Any]] = {"smooth": {}, "kink": KINKS, "jump": JUMPS}
-_files = list[bytes]()
+_files = dict[str, list[bytes]]()  # name of a row ↦ contents of the files that registered its bounds
 
 
 def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", "kink", "jump"] = "smooth") -> None:
@@ -71,7 +71,7 @@ def register(row: Operator, bound: Bound | None = None, kind: Literal["smooth", 
         if wrong is not None:
             raise UsageError(f"Expected bounds that enclose the values of {row.name}, got {wrong}; mend them.")
         # dict.fromkeys has a fixed order, on which the hash of a proof's code depends
-        _files.extend(_content(file) for file in dict.fromkeys([caller, *_files_of(bound)]))
+        _files[row.name] = [_content(file) for file in dict.fromkeys([caller, *_files_of(bound)])]
         undo.pop_all()
 
 
@@ -102,6 +102,7 @@ def _content(file: Path) -> bytes:
 
 def forget(row: Operator, is_new: bool = True) -> None:
     """Undo the registration of a new row, or that of bounds of an old one."""
+    _files.pop(row.name, None)
     if is_new:
         table.remove(row)
     for overload in row.overloads:
@@ -111,7 +112,7 @@ def forget(row: Operator, is_new: bool = True) -> None:
 
 def files() -> list[bytes]:
     """The content of each file that has registered bounds; random bytes for code typed at a prompt."""
-    return _files
+    return [content for contents in _files.values() for content in contents]
 
 
 def has_bounds(row: Operator) -> bool:

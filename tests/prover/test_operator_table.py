@@ -422,7 +422,6 @@ def test_a_registration_that_fails_leaves_no_rule(row, bound, kind, says):
 
 def test_the_file_in_which_a_bound_is_written_joins_what_a_proof_depends_on(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(own, "_files", [])
     (tmp_path / "written_elsewhere.py").write_text(
         "def bound(operators, x, y):\n    return operators.add(y, operators.softplus(operators.sub(x, y)))\n",
         encoding="utf-8",
@@ -437,6 +436,7 @@ def test_the_file_in_which_a_bound_is_written_joins_what_a_proof_depends_on(tmp_
         assert (tmp_path / "written_elsewhere.py").read_bytes() in own.files()
     finally:
         forget(SOFT)
+    assert own.files() == []
 
 
 @needs_c

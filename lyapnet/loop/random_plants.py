@@ -13,6 +13,8 @@ from lyapnet.task.sets import Box
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.policy import PolicyOutput, ValuePolicy
 
+ON_MODEL = slice(0, None, 2)  # the closed loops of a training batch that run on the model; the others on random plants
+
 StateOfPlant = Float[Tensor, "*batch states_and_parameters"]  # (x, p)
 
 
@@ -92,6 +94,7 @@ class RandomPlants(nn.Module):
     problem: Problem
     rollout: Rollout
     ranges: Box
+    parameters_of_model: Float[Tensor, " parameters"]
     n: int  # number of states x
 
     def __init__(self, problem: Problem, rollout: Rollout):
@@ -105,11 +108,20 @@ class RandomPlants(nn.Module):
             problem, NominalLaw(problem, law), rollout.method, rollout.gradient, options["rtol"], options["atol"],
             limit,
         )  # fmt: skip
-        self.ranges = Box(box.lower[self.n :], box.upper[self.n :])
+        self.ranges, system = Box(box.lower[self.n :], box.upper[self.n :]), problem.system
+        assert isinstance(system, FamilySystem)
+        known = [float(getattr(system.system, name)) for name in system.parameters_in_f]
+        self.register_buffer("parameters_of_model", self.ranges.lower.new_tensor(known), persistent=False)
 
     def draw(self, x0: State, generator: torch.Generator) -> StateOfPlant:
         """(x₀, p) with random parameters for each of a batch of states (b, n)."""
         return torch.cat([x0, self.ranges.sample(len(x0), generator).to(x0)], -1)
+
+    def draw_beside_model(self, x0: State, generator: torch.Generator) -> StateOfPlant:
+        """As `draw`, but with the parameters of the model for the closed loops of ON_MODEL."""
+        z0 = self.draw(x0, generator)
+        z0[ON_MODEL, self.n :] = self.parameters_of_model
+        return z0
 
     def forward(self, z0: StateOfPlant) -> Trajectory:
         """The closed loops from (x₀, p), with x alone as their states."""

@@ -13,7 +13,7 @@ from lyapnet.base.random_streams import NOISE, PLANTS, POINTS, VALIDATION, strea
 from lyapnet.base.types import PerState, State
 from lyapnet.evaluation.states import StateTable, measure
 from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, RegionCondition
-from lyapnet.loop.random_plants import RandomPlants, StateOfPlant
+from lyapnet.loop.random_plants import ON_MODEL, RandomPlants, StateOfPlant
 from lyapnet.loop.rollout import Rollout, Trajectory
 from lyapnet.task.cost import PenaltyCost, spread
 from lyapnet.task.problem import Problem
@@ -33,7 +33,7 @@ class Learner(nn.Module):
         pointwise: the program's condition at points off the closed loops, if it is a term of the loss.
         seed: seed of these points.
         label: name of this learner in messages and file names; "" for a single one.
-        plants: the plants of its closed loops, if they differ from the model.
+        plants: the plants of half of its closed loops, if they differ from the model.
 
     Raises:
         UsageError: the problem has constraints but no penalty for them.
@@ -106,7 +106,7 @@ class Learner(nn.Module):
         return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
 
     def roll_out(self, x0: State, *draw: int) -> Trajectory:
-        """The closed loop from x₀, under noise if the problem has some, and on random plants if there are some.
+        """The closed loops from x₀, under noise if the problem has some; with random plants, half of them on those.
 
         Args:
             draw: identifies the random stream of both, which also depends on the seed.
@@ -120,7 +120,7 @@ class Learner(nn.Module):
 
     def with_plants(self, x0: State, *draw: int) -> StateOfPlant:
         """(x₀, p) of the closed loops that `roll_out` computes from x₀ (b, n); x₀ without random plants."""
-        return x0 if self.plants is None else self.plants.draw(x0, stream(self.seed, PLANTS, *draw))
+        return x0 if self.plants is None else self.plants.draw_beside_model(x0, stream(self.seed, PLANTS, *draw))
 
     @property
     def problem_of_loops(self) -> Problem:
@@ -177,7 +177,8 @@ class Learner(nn.Module):
     ) -> ProgramOutput:
         """Evaluate the program, with its pointwise condition if there is one."""
         trajectory = trajectory.compensated()
-        output = self.program(trajectory, over_processes, spread_of_costs)
+        on_model = ... if self.plants is None else ON_MODEL
+        output = self.program(trajectory, over_processes, spread_of_costs, on_model)
         if self.pointwise is None:
             return output
         values, size = trajectory.require_value(), spread_of_costs

@@ -7,7 +7,8 @@ from torch.testing import assert_close
 from lyapnet.base.errors import UsageError
 from lyapnet.experiment.assembly import build_plants, build_problem, build_rollout, build_value_function
 from lyapnet.experiment.config import config_from_plain
-from lyapnet.loop.random_plants import RandomPlants
+from lyapnet.loop.programs import ValueProgram
+from lyapnet.loop.random_plants import ON_MODEL, RandomPlants
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.family import FamilySystem
 from lyapnet.task.systems import Pendulum, Quadrotor
@@ -149,3 +150,32 @@ def test_every_number_of_the_quadrotor_can_be_drawn():
         alone = Quadrotor(mass, gravity, carried)
         assert_close(system.f(z[None])[0, :, :12][z.eq(row).all(-1)][0], alone.f(row[:12]))
         assert_close(system.g(z)[z.eq(row).all(-1)][0, :12], alone.g(row[:12]))
+
+
+def test_a_training_batch_is_half_on_the_model_and_half_on_plants():
+    learner = build_module(config()).members[0]
+    x0 = learner.problem.initial_states.sample(6, seeded())
+    z0 = learner.with_plants(x0, 1)
+    assert_close(z0[::2, 2:], torch.ones(3, 2, dtype=z0.dtype))
+    assert (z0[1::2, 2:] != 1).all()
+    with torch.no_grad():
+        loops, model = learner.roll_out(x0, 1), learner.rollout(x0)
+    assert_close(loops.cost[::2], model.cost[::2])
+    assert (loops.cost[1::2] != model.cost[1::2]).all()
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_v_is_fitted_on_the_model_and_the_cost_is_that_of_all(normalise):
+    """V's error counts on the model alone, as in a program on these loops; the cost on all of them."""
+    rollout, plants = plants_of()
+    z0 = plants.draw_beside_model(rollout.problem.initial_states.sample(6, seeded()), seeded(1))
+    with torch.no_grad():
+        loops, model = plants(z0), rollout(z0[::2, :2])
+    program = ValueProgram(constraint=0.0, cost_to_go=1.0, trajectory_cost=1.0, normalise=normalise)
+    terms, own, all_alike = (
+        program(loops, on_model=ON_MODEL).terms, program(model).terms, program(loops).terms
+    )  # fmt: skip
+    unit = (model.cost.mean() / loops.cost.mean()) ** 2 if normalise else 1.0  # J̄² of the batch
+    assert_close(terms["cost_to_go"], own["cost_to_go"] * unit)
+    assert_close(terms["trajectory_cost"], all_alike["trajectory_cost"])
+    assert (all_alike["cost_to_go"] - terms["cost_to_go"]).abs() > 1e-3 * terms["cost_to_go"]

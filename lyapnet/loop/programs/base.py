@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import EllipsisType
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -65,6 +66,7 @@ class Program(ABC):
         trajectory: Trajectory,
         mean_over_processes: Callable[[Tensor], Tensor] = lambda value: value,
         spread_of_costs: Float[Tensor, ""] | None = None,
+        on_model: slice | EllipsisType = ...,
     ) -> ProgramOutput:
         """Evaluate the program on a batch of trajectories under the control law of a V.
 
@@ -73,6 +75,8 @@ class Program(ABC):
             mean_over_processes: the mean of a number over all processes that share the batch. With it they use the same
                 normalisation, so that the mean of their gradients is the gradient on the joint batch.
             spread_of_costs: replaces the mean cost in a task without a goal; None for a task with a goal.
+            on_model: the trajectories of the model. Of others, on plants that differ, only the cost J counts, since V
+                is the value function of the model.
 
         Raises:
             ValueError: no V defines the control law.
@@ -83,18 +87,20 @@ class Program(ABC):
         per_state = self.per_state(values, trajectory)
         for name, term in per_state.items():
             _require_finite(name, term, trajectory)
-        terms = {name: term.mean() for name, term in per_state.items()}
+        terms = {name: term[on_model].mean() for name, term in per_state.items()}
         if self.normalise:
             cost = trajectory.cost.detach()
             has_goal = spread_of_costs is None
             size = mean_over_processes(cost.mean()) if has_goal else spread_of_costs
             each = cost if has_goal else size.expand_as(cost)
-            terms = {name: (term / self.unit(name, each, size)).mean() for name, term in per_state.items()}
+            terms = {name: (term / self.unit(name, each, size))[on_model].mean() for name, term in per_state.items()}
             # N Σ (ΔV + Δtℓ)² / J̄² is the mean over time of ((V̇ + ℓ) / (J̄/T))²; for degree one the factor is 1
             terms["constraint"] = terms["constraint"] * len(trajectory.step_cost) ** (self.degree - 1)
             # log J̄, or J̄ in units of the spread, with J̄ over all processes but the gradient of this batch
             mean = torch.log(size) if has_goal else mean_over_processes(J.detach()) / size
             terms["trajectory_cost"] = mean + (J - J.detach()) / size
+        else:
+            terms["trajectory_cost"] = J
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
         return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
 

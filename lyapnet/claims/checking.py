@@ -228,7 +228,11 @@ def _reprove_reach(controller: Controller, path: Path, budget: Budget, report: R
         loop, problem, target, avoided, probability, risk, rate, states, budget, _generator(), report, path, True,
         noise,
     )  # fmt: skip
-    reason = None if claim.verdict == "certified" else f"{NOT_PROVED}, or some of X₀ misses the target with a higher probability"
+    reason = (
+        None
+        if claim.verdict == "certified"
+        else f"{NOT_PROVED}, or some of X₀ misses the target with a higher probability"
+    )
     return Checked(ReachCertificate(controller, claim, {}, loop).numbers(), reason, claim.proof.seconds, seconds)
 
 

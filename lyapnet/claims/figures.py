@@ -230,7 +230,8 @@ def reach(
     name = "V(0, x) ≤ ρ: left before the target" + f" with probability ≤ {1 - claim.probability:.3g} from X₀"
     levels = [Level(0.0, claim.rho, BLUE, name if claim.verdict == "certified" else "V(0, x) ≤ ρ", proved=proved)]
     if claim.verdict != "certified":
-        levels = levels[:proved] + [Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for X₀, not proved", proved=False)]
+        wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
+        levels = [*levels[:proved], wanted]
     for panel, pair in panels:
         for k, path in enumerate(paths):
             x, y = (numpy_of(path[:, i]) for i in pair)

@@ -22,10 +22,9 @@ from lyapnet.claims.funnel import (
     share_of,
 )
 from lyapnet.claims.noisy_decrease import require_smooth
-from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES
+from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES, levels_of_constraints
 from lyapnet.claims.preconditions import over_time
 from lyapnet.claims.reach_decrease import OutsideBox, ReachDecrease
-from lyapnet.claims.region import level_of_boundary
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
@@ -182,11 +181,15 @@ def prove_reach(
     if left_out:
         names = ", ".join(problem.system.state_names[i] for i in left_out)
         raise UsageError(f"Expected a system that depends on each state for a target, got one without {names}.")
-    rim = level_of_boundary(condition.V, problem.constraints, domain, faces_of_D, levels)
-    rim = min([rim, *(_level_on(condition, box, D, budget) for box in avoided)])
-    lowest = minimum(condition.V, *(side[None] for side in domain), budget_for_level(budget), unit=condition.level)
+    wanted, needed = condition.level, just_above(condition.level)
+    enough, unit = just_above(needed), abs(needed)
+    rim = minimum(condition.V, *faces_of_D, levels, enough=enough, unit=unit)
+    rim = min([rim, *(_level_on(condition, box, D, budget, enough, unit) for box in avoided)])
+    if problem.constraints is not None:
+        rim = min(rim, *levels_of_constraints(condition, problem, domain, budget, enough))
+    lowest = minimum(condition.V, *(side[None] for side in domain), budget_for_level(budget), unit=unit)
     condition.constraints = OutsideBox(target)
-    wanted, needed, set_up = condition.level, just_above(condition.level), budget.elapsed
+    set_up = budget.elapsed
     proof = prove_within(
         condition, domain, min(needed, just_below(rim)), budget,
         generator=generator, report=report, keep=keep, replay=replay,
@@ -224,13 +227,17 @@ def _kept_largest(path: Path) -> float:
         return float(content["of"][0]["largest"])
 
 
-def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budget) -> float:
-    """A lower bound of V on the part of a box that lies in D; ∞ if none does."""
+def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budget, enough: float, unit: float) -> float:
+    """A lower bound of V on the part of a box that lies in D; ∞ if none does.
+
+    Args:
+        enough, unit: as in minimum.
+    """
     lower, upper = torch.maximum(avoided.lower, states.lower), torch.minimum(avoided.upper, states.upper)
     if bool((lower > upper).any()):
         return math.inf
     ends = (side[None] for side in over_time(Box(lower, upper), 0.0))
-    return minimum(condition.V, *ends, budget_for_level(budget))
+    return minimum(condition.V, *ends, budget_for_level(budget), enough=enough, unit=unit)
 
 
 def choose(

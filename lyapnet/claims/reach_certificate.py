@@ -94,9 +94,9 @@ class ReachCertificate(Certificate):
             "Under dx = (f + gu) dt + σ(x) dW with u = u(0, x) at every t, in continuous time, without end and for "
             f"this model: a closed loop from x₀ ∈ D with V(0, x₀) ≤ {claim.rho!r} reaches the target before it leaves "
             f"D{avoided}{constraints}, with a probability bounded as below; from at least "
-            f"{floored(claim.volume_share)} of X₀ by volume that is at least {claim.probability!r}. The mean time until "
-            "it does, or leaves {V(0, ·) ≤ ρ}, is bounded as below. Nothing is claimed about what follows then. It is "
-            "about every solution of the equation with the traced operations of f, g, σ, V and u, which have this "
+            f"{floored(claim.volume_share)} of X₀ by volume that is at least {claim.probability!r}. The mean time "
+            "until it does, or leaves {V(0, ·) ≤ ρ}, is bounded as below. Nothing is claimed about what follows then. "
+            "It is about every solution of the equation with the traced operations of f, g, σ, V and u, which have this "
             f"fingerprint; {FROZEN}{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 

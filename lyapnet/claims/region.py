@@ -262,7 +262,7 @@ def prove_region(
     _require_inside(D, goal, seen := [i for i in range(n) if i not in left_out], left_out, n)
     if kept is not None:
         kept.require_set(D, names)
-    rim = level_of_boundary(condition.V, problem.constraints, domain, sides, budget_for_level(budget))
+    rim = _level_of_boundary(condition.V, problem.constraints, domain, sides, budget_for_level(budget))
     contraction, slowest, level = _open_hole(condition, goal, setting, seen, rim, budget, kept)
     proof, rho, set_up = None, -math.inf, budget.elapsed
     if condition.hole > 0:
@@ -357,7 +357,7 @@ def _require_inside(states: Box, goal: State, seen: Sequence[int], left_out: Seq
             )
 
 
-def level_of_boundary(
+def _level_of_boundary(
     V: Value,
     constraints: Constraints | None,
     domain: tuple[Corner, Corner],

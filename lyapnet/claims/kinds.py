@@ -194,19 +194,15 @@ class Reach(Claim):
     )  # fmt: skip
     states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.target is None:
-            raise UsageError("Expected a target to reach, got none; give its bounds, as --target=-0.5:0.5,-1:1.")
-
     def establish(self, controller: "Controller", run: Run) -> "Certificate":
         from lyapnet.claims.arguments import box_of, under_noise
         from lyapnet.claims.reach import prove_reach
         from lyapnet.claims.reach_certificate import ReachCertificate
 
-        loop, problem = under_noise(self.noise, controller)
         target, *avoided = (box_of(each) for each in (self.target, *(self.avoid or ())))
-        assert target is not None
+        if target is None:
+            raise UsageError("Expected a target to reach, got none; give its bounds, as --target=-0.5:0.5,-1:1.")
+        loop, problem = under_noise(self.noise, controller)
         found = prove_reach(
             loop, problem, target, [each for each in avoided if each is not None], self.probability, self.risk,
             self.rate, box_of(self.states), run.budget, run.generator, run.report, run.keep, named=self.noise,

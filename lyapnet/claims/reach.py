@@ -23,7 +23,7 @@ from lyapnet.claims.funnel import (
 )
 from lyapnet.claims.noisy_decrease import require_smooth
 from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES, levels_of_constraints
-from lyapnet.claims.preconditions import over_time
+from lyapnet.claims.preconditions import at_time, over_time
 from lyapnet.claims.reach_decrease import OutsideBox, ReachDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
@@ -187,7 +187,7 @@ def prove_reach(
     rim = min([rim, *(_level_on(condition, box, D, budget, enough, unit) for box in avoided)])
     if problem.constraints is not None:
         rim = min(rim, *levels_of_constraints(condition, problem, domain, budget, enough))
-    lowest = minimum(condition.V, *(side[None] for side in domain), budget_for_level(budget), unit=unit)
+    lowest = minimum(condition.V, *at_time(0.0, D.lower, D.upper), budget_for_level(budget), unit=unit)
     condition.constraints = OutsideBox(target)
     set_up = budget.elapsed
     proof = prove_within(
@@ -236,8 +236,7 @@ def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budge
     lower, upper = torch.maximum(avoided.lower, states.lower), torch.minimum(avoided.upper, states.upper)
     if bool((lower > upper).any()):
         return math.inf
-    ends = (side[None] for side in over_time(Box(lower, upper), 0.0))
-    return minimum(condition.V, *ends, budget_for_level(budget), enough=enough, unit=unit)
+    return minimum(condition.V, *at_time(0.0, lower, upper), budget_for_level(budget), enough=enough, unit=unit)
 
 
 def choose(
@@ -291,7 +290,7 @@ def _sampled(condition: ReachDecrease, box: Box) -> tuple[Tensor, Tensor, Tensor
     x = x[OutsideBox(condition.target).worst(x) <= 0]
     sides = zip(*faces(lower, upper, range(box.dimension)), strict=True)
     parts = [*sides, *((torch.maximum(b.lower, lower), torch.minimum(b.upper, upper)) for b in condition.avoided)]
-    edge = [_drawn(*part, SAMPLES // 10, generator) for part in parts if bool((part[0] <= part[1]).all())]
+    edge = [_drawn(low, high, SAMPLES // 10, generator) for low, high in parts if bool((low <= high).all())]
     rim = torch.cat(edge)
     with torch.no_grad():
         now = x.new_zeros(len(x))

@@ -96,8 +96,8 @@ class ReachCertificate(Certificate):
             f"D{avoided}{constraints}, with a probability bounded as below; from at least "
             f"{floored(claim.volume_share)} of X₀ by volume that is at least {claim.probability!r}. The mean time "
             "until it does, or leaves {V(0, ·) ≤ ρ}, is bounded as below. Nothing is claimed about what follows then. "
-            "It is about every solution of the equation with the traced operations of f, g, σ, V and u, which have this "
-            f"fingerprint; {FROZEN}{' ' * bool(claim.assumed)}{claim.assumed}"
+            "It is about every solution of the equation with the traced operations of f, g, σ, V and u, which have "
+            f"this fingerprint; {FROZEN}{' ' * bool(claim.assumed)}{claim.assumed}"
         )
 
     def in_formulas(self) -> list[str]:

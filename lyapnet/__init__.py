@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from lyapnet.claims.certify import certify
     from lyapnet.claims.claim import Claim, Run, option
     from lyapnet.claims.everywhere import Everywhere
-    from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Region, Sampled, Statistical, Tube
+    from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Reach, Region, Sampled, Statistical, Tube
     from lyapnet.controller.controller import ArrayTrajectory, Controller
     from lyapnet.controller.loading import load
     from lyapnet.evaluation.measurement import evaluate
@@ -49,7 +49,7 @@ _HOMES = {  # imported when they are first asked for: torch and Lightning take s
     "claims.certify": ["certify"],
     "claims.claim": ["Claim", "Run", "option"],
     "claims.everywhere": ["Everywhere"],
-    "claims.kinds": ["Funnel", "LowerBound", "NoisyFunnel", "Region", "Sampled", "Statistical", "Tube"],
+    "claims.kinds": ["Funnel", "LowerBound", "NoisyFunnel", "Reach", "Region", "Sampled", "Statistical", "Tube"],
     "prover.branch_and_bound": ["Budget"],
     "evaluation.measurement": ["evaluate"],
     "exchange.export": ["export"],
@@ -104,6 +104,7 @@ __all__ = [
     "Program",
     "PseudoHuberCost",
     "QuadraticCost",
+    "Reach",
     "Region",
     "Rollout",
     "Run",

@@ -5,11 +5,15 @@ from typing import Any
 
 import torch
 
+from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError, did_you_mean
 from lyapnet.base.random_streams import CERTIFICATION, stream
 from lyapnet.base.types import State
 from lyapnet.claims.claim import sides_of
 from lyapnet.controller.controller import Controller
+from lyapnet.loop.rollout.closed_loop import ClosedLoop
+from lyapnet.task.noise import StateNoise
+from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
 
 COMPARED = 1000  # random states of X₀: their mean running cost sets δ, and their costs are compared with optima
@@ -35,6 +39,28 @@ def disturbance_of(disturbance: Mapping[str, float] | None, controller: Controll
             raise UsageError(f"Expected a disturbance of {', '.join(names)}, got '{name}={bound:g}'; {hint}")
         w[names.index(name)] = bound
     return w if disturbance else None
+
+
+def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tuple[ClosedLoop, Problem]:
+    """The closed loop and the task of a controller, with σ of the named states in the place of no noise.
+
+    Raises:
+        UsageError: a name is not the name of a state, or the task has a noise of its own.
+    """
+    loop, problem, names = controller.closed_loop, controller.problem, controller.system.state_names
+    if not noise:
+        return loop, problem
+    if problem.noise is not None:
+        raise UsageError("Expected no noise beside that of the task, got some; leave it out.")
+    strengths = [0.0] * len(names)
+    for name, strength in noise.items():
+        if name not in names:
+            hint = did_you_mean(name, names, "name one of them.")
+            raise UsageError(f"Expected noise of {', '.join(names)}, got '{name}={strength:g}'; {hint}")
+        strengths[names.index(name)] = strength
+    loop = copied(loop)
+    loop.noise = StateNoise(strengths).double()
+    return loop, problem.replaced(noise=loop.noise)
 
 
 def slack_of(delta: float | None, controller: Controller) -> float:

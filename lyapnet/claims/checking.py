@@ -14,6 +14,7 @@ from lyapnet.base.contracts import copied
 from lyapnet.base.errors import UsageError
 from lyapnet.base.files import plain
 from lyapnet.base.types import State
+from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.from_below import LowerBoundCertificate
 from lyapnet.claims.funnel import prove_funnel
 from lyapnet.claims.kept_regions import kept_region
@@ -22,6 +23,8 @@ from lyapnet.claims.noisy_certificate import NoisyCertificate
 from lyapnet.claims.noisy_funnel import prove_noisy_funnel
 from lyapnet.claims.plants import plants_of
 from lyapnet.claims.preconditions import over_time, require_no_noise
+from lyapnet.claims.reach import prove_reach
+from lyapnet.claims.reach_certificate import ReachCertificate
 from lyapnet.claims.region import prove_region
 from lyapnet.claims.region_certificate import RegionCertificate
 from lyapnet.claims.sound_certificate import SoundCertificate
@@ -41,7 +44,7 @@ Report = Callable[[Progress], None] | None
 def check(controller: Controller, path: Path, workers: int = 1, report: Report = None) -> dict[str, Any]:
     """Check whether a file proves its claim; return the object that `lyapnet certify check --json` prints.
 
-    The parameters of the claim (α, δ, D, w; λ, B, Y, c; λ, a, the probability) are read from the file, and the
+    The parameters of the claim (α, δ, D, w; λ, B, Y, c; λ, a, the probability; G, σ, ε) are read from the file, and the
     condition is built from the controller. Everything else is computed again: the levels on X₀ and on the boundary of
     D, the bounds of the condition and of W on every leaf of the cuts, contraction on B, shares and volumes, κ, e. The
     verdict is certified or refused, with the reason. A funnel or a bound from below must hold on all of X₀. A region is
@@ -50,7 +53,7 @@ def check(controller: Controller, path: Path, workers: int = 1, report: Report =
     started, kind, numbers, share = time.monotonic(), None, {}, None
     try:
         kind, reprove = kind_of(path)
-        if kind != NoisyCertificate.kind:
+        if kind not in (NoisyCertificate.kind, ReachCertificate.kind):
             require_no_noise(controller.problem, kind)
         found = reprove(controller, path, Budget(UNLIMITED, workers=workers), report)
         numbers, reason = found.numbers, found.reason
@@ -67,6 +70,7 @@ def labels_of(result: Mapping[str, Any]) -> dict[str, str]:
     kinds = {
         "region": RegionCertificate.labels,
         "noisy": NoisyCertificate.labels,
+        "reach": ReachCertificate.labels,
         "two-sided": labels_of_both(SoundCertificate),
     }
     labels = kinds.get(result["of"], SoundCertificate.labels)
@@ -207,11 +211,37 @@ def _reprove_noisy(controller: Controller, path: Path, budget: Budget, report: R
     return Checked(NoisyCertificate(controller, claim, {}).proved(), reason, claim.proof_seconds, seconds)
 
 
+def _reprove_reach(controller: Controller, path: Path, budget: Budget, report: Report) -> Checked:
+    content = part_of(read_proofs(path), "reach", path)
+    with refusing(path):
+        of, seconds = content["of"][0], float(content["seconds"])
+        states = Box(*(torch.tensor(of[side], dtype=torch.float64)[1:] for side in ("lower", "upper")))
+        target, *avoided = (
+            Box(*(torch.tensor(side, dtype=torch.float64) for side in each)) for each in (of["target"], *of["avoided"])
+        )
+        probability, risk, rate = float(of["probability"]), float(of["risk"]), float(of["rate"])
+        noise = None if of["noise"] is None else {str(name): float(sigma) for name, sigma in of["noise"].items()}
+        if of["degree"] != 2 or not 0 < probability < 1:
+            raise ValueError("forms of unknown degree, or no probability")
+    loop, problem = under_noise(noise, controller)
+    claim = prove_reach(
+        loop, problem, target, avoided, probability, risk, rate, states, budget, _generator(), report, path, True,
+        noise,
+    )  # fmt: skip
+    reason = (
+        None
+        if claim.verdict == "certified"
+        else f"{NOT_PROVED}, or some of X₀ misses the target with a higher probability"
+    )
+    return Checked(ReachCertificate(controller, claim, {}, loop).numbers(), reason, claim.proof.seconds, seconds)
+
+
 KINDS: dict[tuple[str, ...], tuple[str, Reprove]] = {
     ("above",): ("sound", _reprove_funnel),
     ("above", "below"): ("two-sided", _reprove_two_sides),
     ("region",): ("region", _reprove_region),
     ("noisy",): ("noisy", _reprove_noisy),
+    ("reach",): ("reach", _reprove_reach),
 }
 """Names of the proofs in a file ↦ (kind of the claim, the function that proves it again)."""
 

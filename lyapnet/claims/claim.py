@@ -202,6 +202,21 @@ def check_disturbance(value: Any) -> None:
         raise UsageError(f'Expected disturbance as numbers by name, got {value!r}; for example {{"velocity": 0.1}}.')
 
 
+def check_noise(value: Any) -> None:
+    """Refuse a value that is not a mapping from names to numbers ≥ 0, one of them positive."""
+    usable = isinstance(value, Mapping) and all(isinstance(n, str) and _is_number(s) for n, s in value.items())
+    if not usable or not all(0 <= s < math.inf for s in value.values()) or not any(value.values()):
+        raise UsageError(f'Expected noise as numbers ≥ 0 by name, got {value!r}; for example {{"velocity": 0.1}}.')
+
+
+def check_boxes(value: Any) -> None:
+    """Refuse a value that is not a sequence of sets of states."""
+    if not isinstance(value, Sequence) or isinstance(value, str):
+        raise UsageError(f"Expected a list of boxes to avoid, got {value!r}; for example [[[-2, 1], [-1, 2]]].")
+    for each in value:
+        sides_of(each)
+
+
 def check_parameters(value: Any) -> None:
     """Refuse a value that is not a mapping from names to closed intervals [lower, upper]."""
     if not isinstance(value, Mapping) or not all(isinstance(n, str) and _is_interval(i) for n, i in value.items()):
@@ -229,16 +244,22 @@ def flags_of(claim: type) -> Iterator[tuple[str, dataclasses.Field[Any]]]:
 
 
 def _plain(name: str, value: Any) -> Any:
-    """A number, None, or text as on the command line: "-1:1,-2:2" for states, ["mass=0.9:1.1"] for a mapping."""
+    """A number, None, or text as on the command line: "-1:1,-2:2" for a box, ["mass=0.9:1.1"] for a mapping."""
     if isinstance(value, Mapping):
         return [f"{name}={_format_numbers(entry)}" for name, entry in value.items()] or None
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    return (
-        ",".join(_format_numbers(ends) for ends in zip(*sides_of(value), strict=True))
-        if name == "states"
-        else repr(value)
-    )
+    if name in BOXES:
+        return _format_box(value)
+    return [_format_box(each) for each in value] or None if name in LISTS_OF_BOXES else repr(value)
+
+
+BOXES, LISTS_OF_BOXES = ("states", "target"), ("avoid",)
+"""Fields that hold a set of states, and fields that hold several."""
+
+
+def _format_box(value: Any) -> str:
+    return ",".join(_format_numbers(ends) for ends in zip(*sides_of(value), strict=True))
 
 
 def _format_numbers(value: Any) -> str:

@@ -16,6 +16,7 @@ from torch import Tensor
 from lyapnet.base.drawing import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, legend_below, numpy_of
 from lyapnet.base.types import State, Value
 from lyapnet.claims.funnel import ProvedFunnel
+from lyapnet.claims.reach import ProvedReach
 from lyapnet.claims.region import ProvedRegion
 from lyapnet.claims.statistical import CountedSuccesses
 from lyapnet.claims.tables import floored
@@ -24,7 +25,7 @@ from lyapnet.prover.counterexamples import Counterexample
 from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 
-Sliced = ProvedFunnel | ProvedRegion  # claims that are drawn in slices
+Sliced = ProvedFunnel | ProvedRegion | ProvedReach  # claims that are drawn in slices
 
 NEAR = 0.02  # of D's widths: a point this close to a slice is drawn as a point of it
 
@@ -203,6 +204,50 @@ def _levels_of_region(claim: ProvedRegion) -> list["Level"]:
         proved += [Level(0.0, claim.hole, ORANGE, "V(0, x) ≤ c: entered, then never left", proved=True)]
     wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
     return proved + ([wanted] if claim.rho < claim.wanted < float("inf") else [])
+
+
+# Targets
+
+
+def reach(
+    claim: ProvedReach,
+    V: Value,
+    initial_states: Box,
+    goal: State,
+    labels: Sequence[str],
+    constraints: Constraints | None = None,
+    paths: Sequence[Tensor] = (),
+) -> Figure:
+    """{V(0, ·) ≤ ρ} with X₀, the target, the boxes to avoid and closed loops under noise.
+
+    Args:
+        labels, constraints: as in funnel.
+        paths: closed loops, (times, n) each, until they are in the target.
+    """
+    figure, panels = _panels_of(claim, initial_states)
+    handles: dict[str, Artist] = {}
+    proved = claim.rho > -float("inf")
+    name = "V(0, x) ≤ ρ: left before the target" + f" with probability ≤ {1 - claim.probability:.3g} from X₀"
+    levels = [Level(0.0, claim.rho, BLUE, name if claim.verdict == "certified" else "V(0, x) ≤ ρ", proved=proved)]
+    if claim.verdict != "certified":
+        wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)
+        levels = [*levels[:proved], wanted]
+    for panel, pair in panels:
+        for k, path in enumerate(paths):
+            x, y = (numpy_of(path[:, i]) for i in pair)
+            (line,) = panel.plot(x, y, color=GREY, linewidth=0.7, label="closed loops under noise")
+            if not k:
+                handles.setdefault("closed loops", line)
+        _draw_slice(panel, claim, V, initial_states, goal, labels, pair, levels, handles, constraints)
+        style = {"edgecolor": GREEN, "facecolor": GREEN, "alpha": 0.25, "fill": True}
+        handles.setdefault("target", panel.add_patch(_rectangle(claim.target, pair, label="target", **style)))
+        for box in claim.avoided:
+            style = {"edgecolor": VERMILION, "hatch": "////", "label": "to avoid"}
+            handles.setdefault("to avoid", panel.add_patch(_rectangle(box, pair, **style)))
+    legend_below(figure, [*handles.values()], columns=2 if len(panels) == 1 else 4)
+    share = f"the target is reached with probability ≥ {claim.probability!r} from {floored(claim.volume_share)} of X₀"
+    figure.suptitle(f"{claim.verdict}: {share if proved else 'no level proved'}", fontsize=9)
+    return figure
 
 
 # Two sides
@@ -407,9 +452,8 @@ def _widest_states(initial_states: Box, seen: Sequence[int]) -> list[int]:
 
 def _rectangle(box: Box, axes: Sequence[int], **style) -> Rectangle:
     (left, bottom), (width, height) = (side[list(axes)].tolist() for side in (box.lower, box.widths))
-    return Rectangle(
-        (left, bottom), width, height, fill=False, edgecolor=GREY if "label" not in style else "black", **style
-    )
+    style = {"fill": False, "edgecolor": GREY if "label" not in style else "black", **style}
+    return Rectangle((left, bottom), width, height, **style)
 
 
 def _name(label: str) -> str:

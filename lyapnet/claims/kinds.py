@@ -11,7 +11,9 @@ from lyapnet.base.errors import UsageError
 from lyapnet.claims.claim import (
     Claim,
     Run,
+    check_boxes,
     check_disturbance,
+    check_noise,
     check_parameters,
     flag_of,
     is_same,
@@ -159,6 +161,53 @@ class NoisyFunnel(Claim):
             self.risk, self.decay, box_of(self.states), run.budget, run.generator, run.report, run.keep,
         )  # fmt: skip
         return NoisyCertificate(controller, found, run.options(self))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reach(Claim):
+    """Closed loops of the receding law u(0, x) under noise from X₀ reach a target, before they leave D or meet what is
+    to be avoided, with a probability: proved, for all times.
+
+    lyapnet.claims.reach.ProvedReach states the conditions.
+    """
+
+    kind: ClassVar[str] = "reach"
+    allows_noise: ClassVar[bool] = True
+
+    target: "Box | Sequence[Sequence[float]] | None" = option(
+        None, "The set to reach, as lower:upper,…; it is needed.", metavar="BOX", check=sides_of
+    )  # fmt: skip
+    avoid: "Sequence[Box | Sequence[Sequence[float]]] | None" = option(
+        None, "A set not to be met before, as lower:upper,…; may be given again.", metavar="BOX", check=check_boxes
+    )  # fmt: skip
+    noise: Mapping[str, float] | None = option(
+        None, "σ of a state's noise, in its unit per √s; that of the task if none. May be given again.",
+        metavar="STATE=SIGMA", check=check_noise,
+    )  # fmt: skip
+    probability: float = option(
+        0.99, "Probability of reaching the target, from each state of X₀.", above=0, below=1,
+        remedy="for example 0.99",
+    )  # fmt: skip
+    risk: float | None = option(None, "λ of exp(λV), in 1/cost; found if none.", above=0, remedy="give it in 1/cost")
+    rate: float | None = option(
+        None, "ε, at which V(0, ·) has to fall, in cost per second; found if none.", above=0, remedy=RATE
+    )  # fmt: skip
+    states: "Box | Sequence[Sequence[float]] | None" = option(None, SET, flag="set", metavar="BOX", check=sides_of)
+
+    def establish(self, controller: "Controller", run: Run) -> "Certificate":
+        from lyapnet.claims.arguments import box_of, under_noise
+        from lyapnet.claims.reach import prove_reach
+        from lyapnet.claims.reach_certificate import ReachCertificate
+
+        target, *avoided = (box_of(each) for each in (self.target, *(self.avoid or ())))
+        if target is None:
+            raise UsageError("Expected a target to reach, got none; give its bounds, as --target=-0.5:0.5,-1:1.")
+        loop, problem = under_noise(self.noise, controller)
+        found = prove_reach(
+            loop, problem, target, [each for each in avoided if each is not None], self.probability, self.risk,
+            self.rate, box_of(self.states), run.budget, run.generator, run.report, run.keep, named=self.noise,
+        )  # fmt: skip
+        return ReachCertificate(controller, found, run.options(self), loop)
 
 
 @dataclass(frozen=True, kw_only=True)

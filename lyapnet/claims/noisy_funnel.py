@@ -29,7 +29,7 @@ from lyapnet.claims.ultimate_bound import extent_of
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
-from lyapnet.prover.condition import own_constraints
+from lyapnet.prover.condition import DecreaseCondition, own_constraints
 from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress
 from lyapnet.prover.verdict import time_spent
@@ -162,7 +162,7 @@ def prove_noisy_funnel(
     needed = just_above(wanted)
     rim = minimum(condition.height, *sides, levels, enough=just_above(needed))
     if problem.constraints is not None:
-        rim = min(rim, *_levels_of_constraints(condition, problem, domain, budget, just_above(needed)))
+        rim = min(rim, *levels_of_constraints(condition, problem, domain, budget, just_above(needed)))
     set_up, spent = time.monotonic() - started, budget.elapsed
     proof = prove_within(
         condition, domain, min(needed, just_below(rim)), budget,
@@ -206,8 +206,8 @@ def _likely_level(condition: NoisyDecrease, rho: float) -> float:
     return rho + math.log(start) / condition.risk if start > 0 else -math.inf
 
 
-def _levels_of_constraints(
-    condition: NoisyDecrease, problem: Problem, domain: tuple[Corner, Corner], budget: Budget, enough: float
+def levels_of_constraints(
+    condition: DecreaseCondition, problem: Problem, domain: tuple[Corner, Corner], budget: Budget, enough: float
 ) -> list[float]:
     """A lower bound of W on {(t, x): h_j(x) ≥ 0} for each constraint."""
     assert problem.constraints is not None

@@ -11,7 +11,9 @@ from rich.table import Table
 
 def progress_reporter(stages: Callable[..., None], kind: str) -> Callable[[Any], None]:
     """A callback for Progress that passes on the stage and the undecided share of [0, T] × D, D or X₀."""
-    domain = {"region": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(kind, "[0, T] × D")
+    domain = {"region": "D", "reach": "D", "tube": "X₀", "two-sided tube": "X₀, then of [0, T] × D,"}.get(
+        kind, "[0, T] × D"
+    )
 
     def report(progress: Any) -> None:
         undecided = f"{progress.boxes:,} boxes, {progress.remaining:.2%} of {domain} undecided"

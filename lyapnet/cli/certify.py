@@ -1,4 +1,4 @@
-"""lyapnet certify sampled | statistical | sound | noisy | region | tube | check."""
+"""lyapnet certify sampled | statistical | sound | noisy | reach | region | tube | check."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from rich.console import Console
 
 from lyapnet.base.errors import UsageError
 from lyapnet.claims.claim import Claim, flag_of
-from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Region, Sampled, Statistical, Tube
+from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Reach, Region, Sampled, Statistical, Tube
 from lyapnet.cli.by_kind import ByKind
 from lyapnet.cli.claims import (
     Law,
@@ -77,6 +77,20 @@ def noisy(
     debug: Debug = False,
 ) -> None:
     """A funnel that noise leaves with a small probability, and the expected cost: proved."""
+    _prove(given, [claim], search, Refining(keep=keep), output)
+
+
+@app.command()
+@of_a_controller
+def reach(
+    given: Given,
+    claim: Reach,
+    search: SearchAnywhere,
+    output: Output,
+    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None,
+    debug: Debug = False,
+) -> None:
+    """Closed loops under noise reach a target and avoid other sets, with a probability: proved."""
     _prove(given, [claim], search, Refining(keep=keep), output)
 
 

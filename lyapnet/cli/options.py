@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -202,8 +203,11 @@ def _read(name: str, value: Any) -> Any:
     return READ[name][1](value) if name in READ and value is not None else value
 
 
-def read_set(text: str) -> list[list[float]]:
+def read_set(text: str, name: str = "set") -> list[list[float]]:
     """[lower, upper] of "-1:1,-0.7:0.7": bounds of each state, in the order of the system.
+
+    Args:
+        name: the name of the option in the message.
 
     Raises:
         UsageError: there are none.
@@ -214,7 +218,7 @@ def read_set(text: str) -> list[list[float]]:
             raise ValueError("no bounds")
     except ValueError as error:
         raise UsageError(
-            f"Expected --set as lower:upper for each state, got {text!r}; for example --set=-1.6:1.6,-2.6:2.6."
+            f"Expected --{name} as lower:upper for each state, got {text!r}; for example --{name}=-1.6:1.6,-2.6:2.6."
         ) from error
     return [list(lower), list(upper)]
 
@@ -223,8 +227,11 @@ def _pairs(text: str) -> list[list[str]]:
     return [part.split(":") for part in text.split(",")]
 
 
-def read_pushes(named: Sequence[str]) -> dict[str, float]:
-    """The largest push on the derivative of each state, by its name, from "velocity=0.1".
+def read_pushes(named: Sequence[str], option: str = "--disturbance STATE=W") -> dict[str, float]:
+    """The number of each state by its name, from "velocity=0.1": the largest push on its derivative, or another.
+
+    Args:
+        option: the option and its placeholder in the message.
 
     Raises:
         UsageError: no number.
@@ -235,9 +242,7 @@ def read_pushes(named: Sequence[str]) -> dict[str, float]:
         try:
             found[name] = float(value)
         except ValueError as error:
-            raise UsageError(
-                f"Expected --disturbance STATE=W with a number, got {text!r}; for example {name}=0.1."
-            ) from error
+            raise UsageError(f"Expected {option} with a number, got {text!r}; for example {name}=0.1.") from error
     return found
 
 
@@ -263,7 +268,9 @@ def read_intervals(named: Sequence[str]) -> dict[str, tuple[float, float]]:
 
 
 READ: dict[str, tuple[bool, Callable[[Any], Any]]] = {
-    "states": (False, read_set), "disturbance": (True, read_pushes), "parameters": (True, read_intervals),
+    "states": (False, read_set), "target": (False, partial(read_set, name="target")),
+    "avoid": (True, lambda texts: [read_set(text, "avoid") for text in texts]), "disturbance": (True, read_pushes),
+    "noise": (True, partial(read_pushes, option="--noise STATE=SIGMA")), "parameters": (True, read_intervals),
 }  # fmt: skip
 """A field that is no number ↦ whether its option may be given again, and how its text is read."""
 

@@ -81,6 +81,7 @@ def about(bounded: BoundedFunction, condition: DecreaseCondition, lower: Corner,
 FORMAT = b"lyapnet proof 3\n"
 DESCRIPTIONS = {
     "above": "a funnel", "below": "a bound from below", "region": "a region", "noisy": "a funnel under noise",
+    "reach": "a target reached under noise",
 }  # fmt: skip
 """Name of a proof ↦ what it proves, in words."""
 TWO_SIDED = {"above", "below"}
@@ -170,7 +171,7 @@ class KeptProof:
             UsageError: the file holds another proof, an unfinished one, or none.
         """
         name = self.about["proves"]
-        content, kind = part_of(self._proofs, name, self.path), "noisy" if name == "noisy" else "sound"
+        content, kind = part_of(self._proofs, name, self.path), name if name in ("noisy", "reach") else "sound"
         with refusing(self.path):
             if content["of"][:1] != [self.about]:
                 raise UsageError(

@@ -13,7 +13,8 @@ from tests.claims.planted import problem, riccati, stationary
 from tests.pages import PAGES, ROOT
 
 KINDS = (
-    lyapnet.Sampled, lyapnet.Statistical, lyapnet.Funnel, lyapnet.NoisyFunnel, lyapnet.LowerBound, lyapnet.Region,
+    lyapnet.Sampled, lyapnet.Statistical, lyapnet.Funnel, lyapnet.NoisyFunnel, lyapnet.Reach, lyapnet.LowerBound,
+    lyapnet.Region,
     lyapnet.Tube,
 )  # fmt: skip
 FROM_PYTHON, CERTIFY = PAGES[ROOT / "docs" / "from_python.md"], PAGES[ROOT / "docs" / "certify.md"]
@@ -76,7 +77,12 @@ def test_the_page_lists_the_fields(kind):
 
 @pytest.mark.parametrize(
     ("kind", "section"),
-    [(lyapnet.Funnel, "## Sound"), (lyapnet.NoisyFunnel, "## Under noise"), (lyapnet.Region, "## Region of")],
+    [
+        (lyapnet.Funnel, "## Sound"),
+        (lyapnet.NoisyFunnel, "## Under noise"),
+        (lyapnet.Reach, "### Reaching a target"),
+        (lyapnet.Region, "## Region of"),
+    ],
 )
 def test_the_tables_of_options_have_the_fields(kind, section):
     text = CERTIFY[CERTIFY.index(f"\n{section}") :]

@@ -11,7 +11,7 @@ from typer.main import get_command
 from lyapnet.base.errors import UsageError
 from lyapnet.claims import checking, funnel
 from lyapnet.claims.claim import flags_of
-from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Region, Sampled, Statistical, Tube
+from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Reach, Region, Sampled, Statistical, Tube
 from lyapnet.claims.sound_certificate import SoundCertificate
 from lyapnet.cli import certify, main
 from lyapnet.cli.options import read_set
@@ -21,7 +21,7 @@ from tests.claims import planted
 from tests.problems import Formula, problem_of
 from tests.runs import tiny_checkpoint
 
-CLAIMS = {claim.kind: claim for claim in (Sampled, Statistical, Funnel, NoisyFunnel, Region, Tube)}
+CLAIMS = {claim.kind: claim for claim in (Sampled, Statistical, Funnel, NoisyFunnel, Reach, Region, Tube)}
 
 pytestmark = pytest.mark.usefixtures("few_seconds_for_levels")
 
@@ -100,8 +100,8 @@ REFUSED = [
     ("certify statistical --radius=-1", "Expected --radius ≥ 0, got -1"),
     (
         "certify sond",
-        "Expected sampled, statistical, sound, noisy, region, tube, check or a checkpoint, got 'sond'; did you mean "
-        "sound?",
+        "Expected sampled, statistical, sound, noisy, reach, region, tube, check or a checkpoint, got 'sond'; did you "
+        "mean sound?",
     ),
     ("certify proof", "got 'proof'; choose one, or name a file."),
     ("certify --alpha=0.9", "No such option: --alpha"),

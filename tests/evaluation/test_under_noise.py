@@ -272,7 +272,6 @@ def test_bands_show_both_states_and_the_cost():
         ({"noise": {"velocity": -1}}, "noise"),
         ({"noise": {"velocity": 0.1}, "rollout": {"gradient": "adjoint"}}, "rollout.gradient=discrete with noise"),
         ({"network": {"name": "icnn"}, "program": {"name": "value"}, **DISCRETE}, "network.name=expansion or fcn"),
-        ({"pointwise": {"weight": 1}}, "pointwise.weight=0 with noise"),
         ({"cost": {"Q": 1, "R": 1}, "horizon": {"steps": 30, "dt": 0.1, "stationary": True}}, "stationary: false"),
     ],
 )

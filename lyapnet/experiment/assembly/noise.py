@@ -52,7 +52,3 @@ def _require_support(config: Config) -> None:
             f"Expected network.name=expansion or fcn with noise, got {config.network.name}; that V is 0 at the goal, "
             "where V has to be what the noise costs: take another."
         )
-    if config.pointwise.weight:
-        raise UsageError(
-            "Expected pointwise.weight=0 with noise, got more; the condition at points knows none: leave it out."
-        )

@@ -9,7 +9,7 @@ from lyapnet.loop.programs.base import Program
 from lyapnet.loop.rollout import ClosedLoop, Rollout
 from lyapnet.task.problem import Problem
 from lyapnet.task.sets import Box
-from lyapnet.value.calculus import ValueFunction, time_derivative
+from lyapnet.value.calculus import ValueFunction, noise_derivative, time_derivative
 
 FLOOR = 0.01  # ℓ₀ and φ₀ relative to the mean running cost and the mean cost: floor of the denominators
 STATIONARY_FLOOR = 1e-4  # the same for a stationary V, which is exact at the goal by construction
@@ -24,9 +24,9 @@ class PointwiseCondition:
         Lyapunov: mean of max(V̇ + (1 + margin) ℓ, 0) / (ℓ + ℓ₀)  +  mean of max(φ − V(T, ·), 0) / (φ + φ₀),
         value:    mean of ((V̇ + ℓ) / (ℓ + ℓ₀))²                  +  mean of ((φ − V(T, ·)) / (φ + φ₀))²,
 
-    with V̇ = V_t + V_xᵀ(f + g u). ℓ₀ and φ₀ are a share (`floor`) of the batch's mean cost per second and of its mean
-    cost; denominators are detached. Points whose V is too large for a funnel of X₀ do not count. The terms at T are
-    omitted for a stationary V.
+    with V̇ = V_t + V_xᵀ(f + g u); under noise V̇ is the mean rate, with ½ tr(σσᵀV_xx) added. ℓ₀ and φ₀ are a share
+    (`floor`) of the batch's mean cost per second and of its mean cost; denominators are detached. Points whose V is too
+    large for a funnel of X₀ do not count. The terms at T are omitted for a stationary V.
 
     The points of a step depend only on its random stream and the weights, so that a resumed run uses the same ones.
     Half of the points are random, the other half are the worst of four times as many. 30 % lie in the last tenth of the
@@ -115,7 +115,10 @@ class PointwiseCondition:
     def _violation(self, t: Time, x: State, floor: Tensor, ceiling: Tensor) -> PerState:
         u = self.closed_loop.policy(t, x)
         running = self.closed_loop.cost.running(x, u)
-        excess = self.program.excess(time_derivative(self.V, self.closed_loop.system, t, x, u), running)
+        rate = time_derivative(self.V, self.closed_loop.system, t, x, u)
+        if self.closed_loop.noise is not None:
+            rate = rate + noise_derivative(self.V, self.closed_loop.noise(x), t, x)
+        excess = self.program.excess(rate, running)
         return self._relative(excess, running + floor / self.duration) * (self.V(t, x) <= ceiling)
 
     def _end_violation(self, x: State, floor: Tensor, ceiling: Tensor) -> PerState:

@@ -9,10 +9,11 @@ from lyapnet.base.random_streams import stream
 from lyapnet.loop.programs import LyapunovProgram, PointwiseCondition, ValueProgram
 from lyapnet.loop.rollout import Rollout
 from lyapnet.task.cost import QuadraticCost
+from lyapnet.task.noise import StateNoise
 from lyapnet.task.sets import Box
 from lyapnet.task.systems import DoubleIntegrator
 from lyapnet.value.policy import HJBPolicy
-from tests.problems import problem_of
+from tests.problems import Formula, problem_of
 
 A, B = torch.tensor([[0.0, 1.0], [0.0, 0.0]]).double(), torch.tensor([[0.0], [1.0]]).double()
 Q, DURATION, POINTS = torch.diag(torch.tensor([10.0, 0.1], dtype=torch.float64)), 2.0, 12
@@ -152,3 +153,20 @@ def test_a_law_without_V_has_no_condition():
     rollout = Rollout(problem_of(DoubleIntegrator()), torch.nn.Identity())
     with pytest.raises(ValueError, match="Expected a control law that a V defines"):
         PointwiseCondition(rollout, ValueProgram(), Box([-1.0, -2.0], [1.0, 2.0]))
+
+
+@pytest.mark.parametrize("margin", [None, 0.0])
+def test_noise_adds_the_trace_term(margin):
+    """V = xᵀPx + r(T − t), r = tr(σσᵀP), leaves nothing of 𝓛V + ℓ; the twin: without r(T − t) the value is too low."""
+    P, sigma = riccati(), torch.tensor([0.0, 0.7], dtype=torch.float64)
+    problem = problem_of(DoubleIntegrator(), QuadraticCost(Q, [[1.0]], P), steps=20, dt=DURATION / 20)
+    problem = problem.replaced(noise=StateNoise(sigma.tolist()))
+    r = float(sigma @ P @ sigma)
+    left = []
+    for share in (1.0, 0.0):
+        V = Formula(lambda t, x, share=share: ((x @ P) * x).sum(-1) + share * r * (DURATION - t))
+        program = ValueProgram() if margin is None else LyapunovProgram(margin=margin)
+        loop = Rollout(problem, HJBPolicy(problem, V))
+        left.append(value(PointwiseCondition(loop, program, Box([-1.0, -2.0], [1.0, 2.0]), 1.0, POINTS)).item())
+    assert abs(left[0]) < 1e-12
+    assert left[1] > 1e-2

@@ -61,7 +61,7 @@ def wells(problem: Problem) -> Exact:
 
 
 def logarithm(scale: float, target: float, sigma: float, farthest: float) -> Callable[[Problem], Exact]:
-    """dx = 2u dt + σ dW in 100 dimensions, with φ = scale · ln((1 + ‖x − target‖²)/2): dynamic programming in ‖x − target‖.
+    """dx = 2u dt + σ dW in 100 dimensions, with φ = scale · ln((1 + r²)/2), r = ‖x − target‖: dynamic programming in r.
 
     Steps of time may differ: a last state is the time that is left, if there is one.
     """

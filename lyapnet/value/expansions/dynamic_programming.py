@@ -59,6 +59,8 @@ class Optimum(NamedTuple):
 
 
 class Backward(NamedTuple):
+    """What a backward pass finds: the law u + k + K(x − x̄), and V along the path."""
+
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
     expansion: Expansion

@@ -1,7 +1,7 @@
 """An expansion of V around closed loops under noise, instead of one trajectory without it.
 
-Where loops spread far, the derivatives on the trajectory between them are those of states that no loop meets: at the top
-of a hill, at the tip of ln(1 + ‖x‖²) in many dimensions. Of a normal z with mean z̄ and covariance Σ, the quadratic
+Where loops spread far, the derivatives on the trajectory between them are those of states that no loop meets: at the
+top of a hill, at the tip of ln(1 + ‖x‖²) in many dimensions. Of a normal z with mean z̄ and covariance Σ, the quadratic
 function nearest to l(z) in the mean square, and the affine function nearest to F(z), are
 
     E l − ½ tr(E l_zz Σ) + E l_zᵀ(z − z̄) + ½ (z − z̄)ᵀ E l_zz (z − z̄)   and   E F + E F_z (z − z̄),

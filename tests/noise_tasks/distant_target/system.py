@@ -1,8 +1,8 @@
 """A hundred dimensions, and a target away from the start ("Benchmark2"), on a clock that slows down.
 
-V grows like 1 / (time left), so that equal steps cost much: the best law on 20 of them costs +511.7, on 40 +151.4, where
-continuous time has −401.9. Here time is s(τ) with ds/dτ = λ (time left + ε), and equal steps of τ are ever shorter ones
-of s.
+V grows like 1 / (time left), so that equal steps cost much: the best law on 20 of them costs +511.7, on 40 +151.4,
+where continuous time has −401.9. Here time is s(τ) with ds/dτ = λ (time left + ε), and equal steps of τ are ever
+shorter ones of s.
 
 Source: Li, Verma, Ruthotto, "A neural network approach for stochastic optimal control", SIAM J. Sci. Comput. 2024.
 """

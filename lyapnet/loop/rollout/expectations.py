@@ -12,8 +12,8 @@ from lyapnet.base.types import PerState, State, StatePath, StepPath, Time, Times
 from lyapnet.task.noise import Increments, Noise
 from lyapnet.value.calculus import ValueFunction
 
-MOST_SOURCES = 12  # sources of noise up to which an expectation is one over 2k points
-DIRECTIONS = 6  # pairs of random points with more sources
+MOST_SOURCES = 8  # sources of noise up to which an expectation is one over 2k points
+DIRECTIONS = 4  # pairs of random points with more sources
 STATES_PER_BLOCK = 4096  # states at which V is evaluated at once without a gradient; their hidden layers fit a cache
 
 

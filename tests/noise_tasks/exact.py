@@ -132,7 +132,8 @@ def one_dimension(
 def on_a_line(function: Callable[[Array], Array], m: Array, deviation: float) -> Array:
     """E of a function of m plus normal noise."""
     points, weights = roots_hermitenorm(15)
-    return sum(w * function(m + deviation * z) for z, w in zip(points, weights / weights.sum(), strict=True))
+    chances = zip(points, weights / weights.sum(), strict=True)
+    return sum((w * function(m + deviation * z) for z, w in chances), np.zeros_like(m))
 
 
 def about_a_point(function: Callable[[Array], Array], m: Array, deviation: float, d: int) -> Array:

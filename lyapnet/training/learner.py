@@ -16,6 +16,7 @@ from lyapnet.loop.programs import PointwiseCondition, Program, ProgramOutput, Re
 from lyapnet.loop.random_plants import ON_MODEL, RandomPlants, StateOfPlant
 from lyapnet.loop.rollout import Rollout, Trajectory
 from lyapnet.task.cost import PenaltyCost, spread
+from lyapnet.task.noise import Increments
 from lyapnet.task.problem import Problem
 from lyapnet.value.calculus import ValueFunction
 from lyapnet.value.expansions import Path, in_float64, path_of, path_under
@@ -92,18 +93,21 @@ class Learner(nn.Module):
         return Learner(self.problem, self.V, ahead, self.program, seed=self.seed, label=self.label)
 
     @torch.no_grad()
-    def path_from(self, x0: State) -> Path:
+    def path_from(self, x0: State, increments: Increments | None = None) -> Path:
         """The closed loop from x₀ (b, n) in float64, each control held for Δt; it may be non-finite.
 
         Uses the compiled closed loop if it takes the same steps.
+
+        Args:
+            increments: ΔW of each step; None: without noise.
         """
         goal, loop = self.problem.goal, self.rollout.discrete
         exact, policy = in_float64(self.problem), self.rollout.closed_loop.policy
         if loop is not None and self.rollout.takes_steps_of_problem:
-            x, running_cost, _, u = loop(x0.to(goal))
+            x, running_cost, _, u = loop(x0.to(goal), None if increments is None else increments.to(goal))
             return path_of(exact, x.double().cpu(), u.double().cpu(), running_cost[-1].double().cpu())
         times = self.problem.horizon.times(goal)
-        return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu())
+        return path_under(exact, lambda n, x: policy(times[n], x.to(goal)).to(x), x0.double().cpu(), increments)
 
     def roll_out(self, x0: State, *draw: int) -> Trajectory:
         """The closed loops from x₀, under noise if the problem has some; with random plants, half of them on those.

@@ -24,6 +24,7 @@ from lyapnet.value.expansions import (
     Expansion,
     Optimum,
     at_rest,
+    expansion_under_noise,
     greedy_law,
     in_float64,
     optimal_trajectories,
@@ -39,6 +40,8 @@ OPTIMALITY_TOLERANCE = 1e-5  # relative gain below which a law counts as optimal
 TEST_STATES = 16  # states of X₀ on which that is tested
 REGULATOR_LEVELS = tuple(4.0**-k for k in range(9))  # levels tried in `start_from`, relative to the mean V on X₀
 MAX_INITIAL_MISFIT = 0.1  # above this misfit an expansion does not predict the misfit after a fit
+LOOPS_UNDER_NOISE = "loops under noise from states of X₀"  # name of the candidate around them
+PATHS_UNDER_NOISE = 4  # paths of the noise from each state on which candidates are compared
 NOT_FINITE_REMEDY = "choose a smaller X₀, or a shorter horizon"
 STEP_ERROR_REMEDY = "rollout.method=rk4, or a smaller horizon.dt"
 
@@ -52,7 +55,8 @@ def choose_start(
     """Initialise the networks of some learners of one problem with the best candidate; None if they cannot hold one.
 
     The candidates are V = 0, each expansion, and a network that is fitted to optimal trajectories. The closed loop of
-    each candidate is rolled out from states of X₀ that neither training nor evaluation uses. Where the lookahead law
+    each candidate is rolled out from states of X₀ that neither training nor evaluation uses, under noise if there is
+    some. Where the lookahead law
     costs much less with the chosen V, V is fitted again for that law.
 
     Args:
@@ -75,6 +79,14 @@ def choose_start(
         start_from(learners[0], expansion, x0)
         trials.roll_out(name)
         networks[0].load_state_dict(drawn[0])
+    if problem.noise is not None:
+        best = expansions[_cheapest(trials.tried).name] if trials.tried else None
+        progress = partial(report, LOOPS_UNDER_NOISE)
+        if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
+            expansions[LOOPS_UNDER_NOISE] = expansion
+            start_from(learners[0], expansion, x0)
+            trials.roll_out(LOOPS_UNDER_NOISE)
+            networks[0].load_state_dict(drawn[0])
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])
@@ -98,7 +110,8 @@ def choose_start(
         if gain_ahead > MIN_LOOKAHEAD_GAIN and may_look_ahead and optimum is not None:
             policy = LookaheadPolicy(problem, policy.V)
             chosen = _fit_for_looking_ahead(learners, list(expansions.values()), drawn, optimum, trials)
-    held_cost = float(costs_of_plant(problem, policy, x0).mean())
+    # under noise nothing is said of continuous time
+    held_cost = chosen.cost if problem.noise is not None else float(costs_of_plant(problem, policy, x0).mean())
     return Start(chosen, [*trials.tried, *trials.left_out], held_cost, gain_ahead)
 
 
@@ -260,10 +273,14 @@ def _cheapest(candidates: Sequence[Candidate]) -> Candidate:
 
 
 class _Trials:
-    """Tries the candidates and collects their results."""
+    """Tries the candidates, with noise all on the same paths of it, and collects their results."""
 
     def __init__(self, learner: Learner, x0: State, report: StageReport, known: Callable[[Candidate], None]):
         self.learner, self.x0, self.report, self.known = learner, x0, report, known
+        noise, horizon, self.increments = learner.problem.noise, learner.problem.horizon, None
+        if noise is not None:
+            self.x0 = x0.repeat(PATHS_UNDER_NOISE, 1)
+            self.increments = noise.draw(horizon.steps, horizon.dt, self.x0, stream(0, START, 9))
         self.began, self.tried, self.left_out = time.perf_counter(), list[Candidate](), list[Candidate]()
         self.notes = dict[str, str]()
 
@@ -274,7 +291,7 @@ class _Trials:
     def roll_out(self, name: str, learner: Learner | None = None) -> Candidate:
         """Compute the cost of a learner's closed loop with its current V."""
         self.report(f"closed loops from {name}")
-        cost = (learner or self.learner).path_from(self.x0).cost
+        cost = (learner or self.learner).path_from(self.x0, self.increments).cost
         share = float(cost.isfinite().double().mean())
         seconds = time.perf_counter() - self.began
         candidate = Candidate(name, float(cost.mean()), share, seconds, note=self.notes.get(name, ""))

@@ -193,7 +193,7 @@ def _noise_fact(problem: Problem, noise: Noise) -> Fact:
     found = f"{_format_count(noise.sources, 'source')}; per √s at {place}: {listed or 'none'}"
     if problem.has_goal and not isinstance(around := riccati_or_reason(problem), Missing):
         found += f"; from the goal it costs {float(around.value[0]):.4g} up to T"
-    return Fact("noise", f"{found}; costs of starts, below, are those without noise")
+    return Fact("noise", f"{found}; costs of starts, below, are those under noise")
 
 
 def _goal_fact(problem: Problem, around: Linearisation, precision: torch.dtype) -> Fact:

@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from lyapnet.loop.programs import LyapunovProgram, ValueProgram
 from lyapnet.loop.rollout import Rollout
-from lyapnet.loop.rollout.expectations import expected_value
+from lyapnet.loop.rollout.expectations import MOST_SOURCES, expected_value, sampled_value
 from lyapnet.loop.rollout.integration import NoisyTrajectory
 from lyapnet.loop.rollout.runge_kutta import Step
 from lyapnet.task.cost import QuadraticCost
@@ -251,3 +251,54 @@ def test_increments_of_another_shape_or_without_noise_are_refused():
         quiet(x0, drawn(task, x0))
     with pytest.raises(ValueError, match="take discrete"):
         Rollout(task, SampledPolicy(task, V), gradient="backprop")(x0, drawn(task, x0))
+
+
+class Coupled(Linear):
+    """Ten states, each with a source of noise that grows with it."""
+
+    def noise(self, x: Tensor) -> Tensor:
+        return torch.diag_embed(0.3 + 0.1 * x)
+
+
+@pytest.mark.parametrize("constant", [True, False])
+@pytest.mark.parametrize("wrong", [0.0, 0.05])
+def test_many_sources_leave_no_residual_of_the_value_function_either(constant, wrong):
+    n = MOST_SOURCES + 2
+    system = (Linear if constant else Coupled)((torch.ones(n, n) / n - torch.eye(n)).tolist(), torch.eye(n).tolist())
+    cost = QuadraticCost(torch.diag(torch.linspace(0.1, 3, n)), torch.eye(n), torch.eye(n))
+    box, noise = Box([-1.0] * n, [1.0] * n), StateNoise([0.4] * n) if constant else None
+    task = Problem(system, cost, Unbounded(), box, Horizon(N, DT), noise=noise)
+    V, x0 = value_of(task, 1 + wrong), initial_states(task)
+    seen = Rollout(task, SampledPolicy(task, V), gradient="discrete")(x0, drawn(task, x0)).compensated()
+    output = ValueProgram(constraint=1, cost_to_go=1, normalise=False)(seen)
+    for name in ("constraint", "cost_to_go"):
+        assert (output.terms[name].item() < 1e-18) == (wrong == 0)
+
+
+class Fourth(ValueFunction):
+    """Σ x_i⁴, of which no model of the curvature is known, or a wrong one."""
+
+    def __init__(self, modelled: bool):
+        super().__init__()
+        self.modelled = modelled
+
+    def forward(self, t: Tensor, x: Tensor) -> Tensor:
+        return (x**4).sum(-1)
+
+    def curvature(self, t: Tensor) -> Tensor | None:
+        return torch.eye(10).expand(*t.shape, 10, 10) if self.modelled else None
+
+
+@pytest.mark.parametrize("modelled", [True, False])
+def test_a_sampled_expectation_is_unbiased_for_the_fourth_degree_too(modelled):
+    x, sigma = torch.linspace(-1, 1, 10), 0.5
+    noise, many = StateNoise([sigma] * 10), 20_000
+    draws = math.sqrt(DT) * torch.randn(3, many, 10, generator=torch.Generator().manual_seed(0))
+    at = x.expand(many, -1)
+    found = sampled_value(Fourth(modelled), noise, torch.zeros(()), at, at, list(draws), DT)
+    s = sigma**2 * DT
+    exact = float((x**4 + 6 * s * x**2 + 3 * s**2).sum())
+    error = 4 * float(found.std()) / math.sqrt(many)
+    assert abs(float(found.mean()) - exact) < error
+    points = expected_value(Fourth(modelled), noise, torch.zeros(()), x, x, DT)
+    assert abs(float(points) - exact) > error  # 2k points are exact for the third degree alone

@@ -1,15 +1,19 @@
 """What noise adds to V along a path: its unpredicted part in each step, of mean zero."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from lyapnet.base.linear_algebra import apply
+from lyapnet.base.types import Noise as NoiseMatrix
 from lyapnet.base.types import PerState, State, StatePath, StepPath, Time, Times, ValuePath
 from lyapnet.task.noise import Increments, Noise
 from lyapnet.value.calculus import ValueFunction
 
+MOST_SOURCES = 8  # sources of noise up to which an expectation is one over 2k points
+DIRECTIONS = 4  # pairs of random points with more sources
 STATES_PER_BLOCK = 4096  # states at which V is evaluated at once without a gradient; their hidden layers fit a cache
 
 
@@ -22,17 +26,55 @@ def expected_value(V: ValueFunction, noise: Noise, t: Time, mean: State, x: Stat
     return V(t, torch.cat([mean + columns, mean - columns])).mean(0)
 
 
+def sampled_value(
+    V: ValueFunction, noise: Noise, t: Time, mean: State, x: State, increments: Sequence[Tensor], dt: float
+) -> PerState:
+    """An unbiased sample of E V(t, mean + σ(x)ΔW) over ΔW, for noise of many sources.
+
+    It is the mean over some ΔW_i of ½ V(mean + σΔW_i) + ½ V(mean − σΔW_i) − ½ (σΔW_i)ᵀH(σΔW_i), plus ½ Δt tr(σᵀHσ),
+    with H V's own model of its curvature, or 0 if it has none: the expectation itself for a V with this curvature.
+
+    Args:
+        increments: some ΔW_i, each (*batch, k).
+    """
+    sigma = noise(x)
+    steps = torch.stack([apply(sigma, each) for each in increments])
+    return V(t, torch.cat([mean + steps, mean - steps])).mean(0) - _sampling_error(V, t, sigma, steps, dt)
+
+
+@torch.no_grad()
+def _sampling_error(V: ValueFunction, t: Time, sigma: NoiseMatrix, steps: Tensor, dt: float) -> Tensor:
+    """Mean of ½ ΔᵀHΔ over sampled displacements Δ (r, *batch, n), less its expectation ½ Δt tr(σᵀHσ)."""
+    H = V.curvature(t)
+    if H is None:
+        return torch.zeros_like(steps[0, ..., 0])
+    # a σ that is the same at all states, expanded to them, needs one product
+    one = sigma[tuple(slice(1) if stride == 0 else slice(None) for stride in sigma.stride()[:-2])]
+    return ((apply(H, steps) * steps).sum(-1).mean(0) - dt * ((H @ one) * one).sum((-2, -1))) / 2
+
+
 def surprises(
     V: ValueFunction, noise: Noise, t: Times, x: StatePath, value: ValuePath, increments: Increments
 ) -> StepPath:
-    """D_n = V(t_{n+1}, x_{n+1}) − E[V(t_{n+1}, x_{n+1}) | x_n] of each step, of mean zero, with its gradient."""
+    """D_n = V(t_{n+1}, x_{n+1}) − E[V(t_{n+1}, x_{n+1}) | x_n] of each step, of mean zero, with its gradient.
+
+    With more than MOST_SOURCES sources the expectation is a sample of it, from the increments of the same step of
+    DIRECTIONS paths of the batch, which are independent of this one's state: its own, and those of the next ones.
+    """
     dt = float(t[1] - t[0])
 
-    def expected(later: Tensor, x: State, following: State, increments: Tensor) -> Tensor:
-        return expected_value(V, noise, later, following - noise.displacement(x, increments), x, dt)
+    def expected(later: Tensor, x: State, following: State, increments: Tensor, *others: Tensor) -> Tensor:
+        mean = following - noise.displacement(x, increments)
+        if not others:
+            return expected_value(V, noise, later, mean, x, dt)
+        return sampled_value(V, noise, later, mean, x, others, dt)
 
     later = t[1:].reshape(-1, *[1] * (x.ndim - 2))
-    return value[1:] - _in_blocks(expected, later, x[:-1], x[1:], increments)
+    others = list[Tensor]()
+    if noise.sources > MOST_SOURCES:
+        flat = increments.flatten(1, -2)
+        others = [flat.roll(i, 1).reshape(increments.shape) for i in range(min(DIRECTIONS, flat.shape[1]))]
+    return value[1:] - _in_blocks(expected, later, x[:-1], x[1:], increments, *others)
 
 
 @torch.no_grad()
@@ -52,5 +94,5 @@ def _in_blocks(function: Callable[..., Tensor], *columns: Tensor) -> Tensor:
     """A function of columns over the steps; without a gradient in blocks of STATES_PER_BLOCK states."""
     if torch.is_grad_enabled():
         return function(*columns)
-    steps = max(1, STATES_PER_BLOCK // max(1, columns[-1][0, ..., 0].numel()))
+    steps = max(1, STATES_PER_BLOCK // max(1, columns[1][0, ..., 0].numel()))
     return torch.cat([function(*block) for block in zip(*(column.split(steps) for column in columns), strict=True)])

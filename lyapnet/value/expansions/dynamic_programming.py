@@ -58,15 +58,17 @@ class Optimum(NamedTuple):
         return Optimum(self.path.member(rows), self.expansion.member(rows), self.replaced[rows])
 
 
-class _Backward(NamedTuple):
+class Backward(NamedTuple):
+    """What a backward pass finds: the law u + k + K(x − x̄), and V along the path."""
+
     k: ControlPath
     K: Tensor  # (N, *batch, m, n)
     expansion: Expansion
     replaced: Tensor  # (N + 1, *batch), whether a missing derivative was replaced
 
-    def member(self, rows: Tensor) -> "_Backward":
+    def member(self, rows: Tensor) -> "Backward":
         """The trajectories with some indices."""
-        return _Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.replaced[:, rows])
+        return Backward(self.k[:, rows], self.K[:, rows], self.expansion.member(rows), self.replaced[:, rows])
 
 
 def riccati(problem: Problem) -> Expansion:
@@ -86,7 +88,7 @@ def regulator(problem: Problem) -> tuple[ControlPath, Tensor]:
     return problem.rest.double().cpu() + backward.k, backward.K
 
 
-def _at_goal(problem: Problem) -> "_Backward":
+def _at_goal(problem: Problem) -> "Backward":
     """The backward pass at x*, without control limits."""
     problem, N = in_float64(problem).replaced(controls=Unbounded()), problem.horizon.steps
     x, u = problem.goal.expand(N + 1, -1), problem.rest.expand(N, -1)
@@ -177,7 +179,7 @@ class _Descent:
         self._gained, self._expected = (
             (GAIN_TOLERANCE, EXPECTED_TOLERANCE) if curved else (ROUGH_TOLERANCE, ROUGH_TOLERANCE)
         )
-        self.now, self._passes = now, list[tuple[Tensor, _Backward]]()  # (settled rows, their last backward pass)
+        self.now, self._passes = now, list[tuple[Tensor, Backward]]()  # (settled rows, their last backward pass)
 
     def run(self, iterations: int, rivals: bool, progress: Callable[[int], None], until: float) -> None:
         """Iterate; see optimal_trajectories."""
@@ -225,7 +227,7 @@ class _Descent:
         replaced = torch.cat([backward.replaced for _, backward in passes], 1)[:, order].sum(0)
         return Optimum(self.now, Expansion(*(torch.cat(each, 1)[:, order] for each in parts)), replaced)
 
-    def _pass(self, rows: Tensor, damping: Tensor | None = None, noise: Noise | None = None) -> tuple[Path, _Backward]:
+    def _pass(self, rows: Tensor, damping: Tensor | None = None, noise: Noise | None = None) -> tuple[Path, Backward]:
         """Some of the trajectories, and the backward pass along them."""
         path = self.now.member(rows)
         return path, _backward(self.programs.problem, self.programs, path.x, path.u, damping, self.curved, noise)
@@ -256,7 +258,7 @@ def without_penalty(problem: Problem, expansion: Expansion) -> Expansion:
     return Expansion(expansion.x, expansion.value - value, expansion.gradient - gradient, expansion.hessian - hessian)
 
 
-def _line_search(problem: Problem, programs: StepPrograms, now: Path, backward: _Backward) -> Path:
+def _line_search(problem: Problem, programs: StepPrograms, now: Path, backward: Backward) -> Path:
     """The cheapest closed loop under u + αk + K(x' − x) over the step sizes α, for each trajectory."""
     tried = path_of(problem, *programs.search(now.x, now.u, backward.k, backward.K))
     best, each = tried.cost.argmin(0), torch.arange(now.x.shape[1])
@@ -271,7 +273,7 @@ def _backward(
     damping: Tensor | None = None,
     curved: bool = True,
     noise: Noise | None = None,
-) -> _Backward:
+) -> Backward:
     """The backward pass along x, which need not be a trajectory: V_{n+1} is expanded at F(x_n, u_n).
 
     The second derivatives of F enter as those of pᵀF, which needs only n + m derivatives of a single sum. p is the
@@ -289,12 +291,12 @@ def _backward(
     steps = steps_along(derivatives, problem.cost.terminal, x, u)
     if curved:
         steps = with_curvature(derivatives, steps, costates(steps))
-    return _recursion(problem, x, u, steps, damping, noise)
+    return backward_recursion(problem, x, u, steps, damping, noise)
 
 
-def _recursion(
+def backward_recursion(
     problem: Problem, x: StatePath, u: ControlPath, steps: Steps, damping: Tensor | None, noise: Noise | None
-) -> _Backward:
+) -> Backward:
     """The recursion of V_n(δ) = ½ (1, δ)ᵀW_n(1, δ) backwards from W_N, with c, p and H in W = [[2c, pᵀ], [p, H]]."""
     n = x.shape[-1]
     least = 2 * problem.horizon.dt * torch.linalg.eigvalsh(problem.cost.R(x[:-1]))[..., 0]
@@ -317,7 +319,7 @@ def _recursion(
         gains.append(gain)
     W, gain = torch.stack(nodes[::-1]), torch.stack(gains[::-1])
     expansion = Expansion(x, W[..., 0, 0] / 2, W[..., 1:, 0], W[..., 1:, 1:])
-    return _Backward(gain[..., 0], gain[..., 1:], expansion, steps.replaced)
+    return Backward(gain[..., 0], gain[..., 1:], expansion, steps.replaced)
 
 
 def _noise_maps(problem: Problem, noise: Noise, x: StatePath) -> Tensor:

@@ -127,7 +127,6 @@ TASKS = {
     "hjb_lq": Task(folder("hjb_lq"), logarithm(1, 0, 2**0.5, 30), 4.590162),
     "distant_target": Task(folder("distant_target"), logarithm(1000, 3, 0.4 * 2**0.5, 40), -401.882),
     "quadcopter": Task(folder("quadcopter")),
-    "planar_quadrotor": Task(folder("planar_quadrotor")),
     "van_der_pol": Task(folder("van_der_pol"), on_grid([-4, -5], [4, 5], 101, np.linspace(-10, 10, 41))),
     "pendulum": Task(CONF / "pendulum_noise.yaml", on_grid([-1.5, -8], [4.5, 4], 101, np.linspace(-16, 10, 40))),
     "gap": Task(folder("gap"), on_grid([0, -2.5], [2.02, 2], 181, np.linspace(-8, 8, 41))),

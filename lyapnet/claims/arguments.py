@@ -59,7 +59,7 @@ def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tu
             raise UsageError(f"Expected noise of {', '.join(names)}, got '{name}={strength:g}'; {hint}")
         strengths[names.index(name)] = strength
     loop = copied(loop)
-    loop.noise = StateNoise(strengths).double()
+    loop.noise = StateNoise(strengths, torch.float64)
     return loop, problem.replaced(noise=loop.noise)
 
 

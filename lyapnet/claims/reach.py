@@ -80,6 +80,7 @@ class ProvedReach:
     constraints: Sequence[str] = ()
     set_up: float = 0.0  # seconds of the budget before the first box
     assumed: str = ""  # a sentence on what is assumed of u; empty if nothing is
+    noise: Mapping[str, float] | None = None  # σ by states, per √s; None: that of the task
     left_out: Sequence[int] = ()  # ignorable states: none here
 
     def reach_probability(self, value: PerState) -> PerState:
@@ -201,6 +202,7 @@ def prove_reach(
         rho=rho, wanted=wanted, largest=condition.largest, least=largest_sample(condition.V, X0) + condition.gap,
         lowest=lowest, rim=rim, volume_share=share, proof=proof, seconds=time.monotonic() - started,
         constraints=names_of(problem.constraints), set_up=set_up, assumed=assumed,
+        noise=None if named is None else dict(named),
     )  # fmt: skip
 
 
@@ -259,18 +261,19 @@ def choose(
     """
     least_rate = LEAST_RATE * max(abs(largest), 1e-6) / duration
     risks = [risk] if risk is not None else (RISKS / max(abs(largest), 1e-6)).tolist()
-    best = (math.inf, risks[len(risks) // 2], least_rate)
+    best = (math.inf, risks[len(risks) // 2], least_rate if rate is None else rate)
     for box in boxes:
         V, mean, variance, rim = _sampled(condition, box)
         possible = list[tuple[float, float, float]]()
         for each in risks:
-            condition.aim(each, rate or least_rate, largest)
+            condition.aim(each, least_rate if rate is None else rate, largest)
             inside = condition.level >= V
             if not bool(inside.any()):
                 continue
             falls = -(mean + (1 + ROOM) * each / 2 * variance)[inside]
             failing = float((falls < condition.rate).double().mean())
-            found = (failing, each, rate or max(SHARE_OF_RATE * float(falls.min()), least_rate))
+            allowed = max(SHARE_OF_RATE * float(falls.min()), least_rate)
+            found = (failing, each, allowed if rate is None else rate)
             if not failing and condition.level < rim:
                 possible.append(found)
             best = min(best, found, key=lambda one: one[0])

@@ -35,6 +35,7 @@ class ReachCertificate(Certificate):
     labels: ClassVar[Mapping[str, str]] = {
         "reason": "why",
         "probability": "probability of reaching the target",
+        "noise": "σ of the noise, per √s",
         "target": "target",
         "avoided": "boxes not met before",
         "set": "D",
@@ -66,6 +67,13 @@ class ReachCertificate(Certificate):
         value = self.controller.value(0.0, x0).double()
         return value[self.claim.reach_probability(value) >= self.claim.probability]
 
+    @property
+    def _noise(self) -> str:
+        """σ in words."""
+        if self.claim.noise is None:
+            return "that of the task"
+        return ", ".join(f"{name}: {strength!r}" for name, strength in self.claim.noise.items())
+
     def numbers(self) -> dict[str, Any]:
         claim, value, found = self.claim, self._values, self.claim.counterexample
         proved, proof = claim.rho > -math.inf, claim.proof
@@ -74,7 +82,7 @@ class ReachCertificate(Certificate):
             "mean_time": float(claim.mean_time(value).max()),
         }  # fmt: skip
         return {
-            "probability": claim.probability, "target": sides(claim.target),
+            "probability": claim.probability, "noise": self._noise, "target": sides(claim.target),
             "avoided": [sides(box) for box in claim.avoided], "set": sides(claim.states), "risk": claim.risk,
             "rate": claim.rate, "rho_wanted": claim.wanted, "rho": claim.rho if proved else None, "rim": claim.rim,
             "lowest": claim.lowest, "volume_share": claim.volume_share, **means,
@@ -91,8 +99,9 @@ class ReachCertificate(Certificate):
         avoided = ", or meets one of the boxes to avoid" if claim.avoided else ""
         constraints = f", or violates a constraint ({'; '.join(claim.constraints)})" if claim.constraints else ""
         return (
-            "Under dx = (f + gu) dt + σ(x) dW with u = u(0, x) at every t, in continuous time, without end and for "
-            f"this model: a closed loop from x₀ ∈ D with V(0, x₀) ≤ {claim.rho!r} reaches the target before it leaves "
+            f"Under dx = (f + gu) dt + σ(x) dW with u = u(0, x) at every t and this σ: {self._noise}; in continuous "
+            f"time, without end and for this model: a closed loop from x₀ ∈ D with V(0, x₀) ≤ {claim.rho!r} reaches "
+            "the target before it leaves "
             f"D{avoided}{constraints}, with a probability bounded as below; from at least "
             f"{floored(claim.volume_share)} of X₀ by volume that is at least {claim.probability!r}. The mean time "
             "until it does, or leaves {V(0, ·) ≤ ρ}, is bounded as below. Nothing is claimed about what follows then. "
@@ -108,8 +117,8 @@ class ReachCertificate(Certificate):
         boxes = "".join(f";  to avoid: {sides(box)}" for box in claim.avoided)
         return [
             f"𝓛V + ½ {claim.risk!r} ‖σᵀV_x‖² ≤ −{claim.rate!r}  at each x ∈ D outside of the interior of G with "
-            f"V(0, x) ≤ {rho}, 𝓛V = V_xᵀ(f + g u) + ½ tr(σσᵀV_xx), V = V(0, x), u = u(0, x); G = "
-            f"{sides(claim.target)}{boxes}",
+            f"V(0, x) ≤ {rho}, 𝓛V = V_xᵀ(f + g u) + ½ tr(σσᵀV_xx), V = V(0, x), u = u(0, x); σ: "
+            f"{self._noise}; G = {sides(claim.target)}{boxes}",
             f"V > {rho} on the boundary of D{avoided}{constraints}",
             f"P(x(t) reaches G before it leaves {{x ∈ D: V(0, x) ≤ {rho}}}) ≥ 1 − exp(−{claim.risk!r} ({rho} − "
             f"V(0, x₀)))  from each x₀ ∈ D with V(0, x₀) ≤ {rho}",

@@ -17,7 +17,7 @@ from lyapnet.task.constraints import Constraints
 from lyapnet.task.sets import Box
 from lyapnet.value.calculus import noise_derivative
 
-WITHIN = 1 - 1e-9  # of a target's half widths: points that are inside of it whatever the rounding
+WITHIN = 1 - 1e-9  # of a target's half widths: points that are a little inside of it; boxes are rounded outward besides
 
 
 class ReachDecrease(DecreaseCondition):
@@ -52,6 +52,8 @@ class ReachDecrease(DecreaseCondition):
                 "Expected a task with noise for a reach certificate, got one without; name the noise (--noise "
                 "velocity=0.1), or prove a region of attraction: lyapnet certify region."
             )
+        if not 0 < probability < 1:
+            raise UsageError(f"Expected 0 < probability < 1, got {probability}; noise allows no other.")
         self.noise, self.probability, self.named = closed_loop.noise, probability, named
         self.target, self.avoided = target, list(avoided)
         self.risk, self.rate, self.largest, self.level = 0.0, 0.0, math.nan, math.inf

@@ -49,6 +49,7 @@ class StateNoise(Noise):
 
     Args:
         strengths: standard deviation of each state per √s, (n,); 0 for a state without noise.
+        dtype: that of σ; None: torch's default.
 
     Raises:
         ValueError: a strength is negative or not finite, or all are zero.
@@ -56,7 +57,7 @@ class StateNoise(Noise):
 
     sigma: Float[Tensor, "n sources"]
 
-    def __init__(self, strengths: Sequence[float]):
+    def __init__(self, strengths: Sequence[float], dtype: torch.dtype | None = None):
         super().__init__()
         if not all(0 <= s < math.inf for s in strengths) or not any(strengths):
             raise ValueError(
@@ -64,7 +65,7 @@ class StateNoise(Noise):
             )
         noisy = [i for i, s in enumerate(strengths) if s]
         self.sources = len(noisy)
-        self.register_buffer("sigma", torch.diag(torch.tensor(strengths))[:, noisy], persistent=False)
+        self.register_buffer("sigma", torch.diag(torch.tensor(strengths, dtype=dtype))[:, noisy], persistent=False)
         if not self.sigma.any(0).all():
             raise ValueError(f"Expected strengths above rounding, got {[*strengths]}; leave noise out if none.")
 

@@ -56,8 +56,7 @@ def choose_start(
 
     The candidates are V = 0, each expansion, and a network that is fitted to optimal trajectories. The closed loop of
     each candidate is rolled out from states of X₀ that neither training nor evaluation uses, under noise if there is
-    some. Where the lookahead law
-    costs much less with the chosen V, V is fitted again for that law.
+    some. Where the lookahead law costs much less with the chosen V, V is fitted again for that law.
 
     Args:
         report: called with each stage of the work.

@@ -16,6 +16,7 @@ from scipy.integrate import quad
 import lyapnet
 from lyapnet.base.errors import UsageError
 from lyapnet.claims import reach_decrease
+from lyapnet.claims.arguments import under_noise
 from lyapnet.claims.checking import check
 from lyapnet.claims.reach import prove_reach
 from lyapnet.controller.controller import Controller
@@ -312,11 +313,22 @@ def test_a_controller_is_certified_from_python():
     assert certificate.verdict == "certified"
     words = "\n".join([certificate.in_words(), *certificate.in_formulas(), certificate.verdict_text()])
     assert "½ tr(σσᵀV_xx)" in words
+    assert words.count("x2: 0.3") == 2
+    assert certificate.result["noise"] == "x2: 0.3"
     assert "Nothing is claimed about what follows" in words
     assert certificate.options["avoid"] == ["1.5:2.5,2:5"]
     assert certificate.options["target"] == "-0.3:0.3,-0.7:0.7"
     assert 0 < certificate.result["miss_probability"] < 0.01
     certificate.figure()
+
+
+def test_the_noise_of_the_claim_is_not_rounded():
+    loop, _ = under_noise({"x2": 0.3}, noiseless())
+    assert float(loop.noise.sigma[1, 0]) == 0.3
+
+
+def test_a_rate_that_is_asked_for_is_kept_where_no_sample_says_what_is_possible():
+    assert prove(target=box([-3.0, -6.0], [3.0, 6.0]), avoided=(), rate=0.5, boxes=10).rate == 0.5
 
 
 FORGED = {

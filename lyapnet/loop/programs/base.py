@@ -102,7 +102,7 @@ class Program(ABC):
         else:
             terms["trajectory_cost"] = J
         loss = torch.stack([weight * terms[name] for name, weight in self.weights.items() if weight]).sum()
-        return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory).mean(), J)
+        return ProgramOutput(loss, terms, self.constraint_loss(values, trajectory)[on_model].mean(), J)
 
     def unit(self, name: str, cost: PerState, mean_cost: Tensor) -> Tensor:
         """The unit of a term: J̄ to the power of the degree.

@@ -39,7 +39,7 @@ def expansion_under_noise(
     generator: torch.Generator,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Expansion | None:
-    """The cheapest expansion around loops under noise from random states of X₀; None if no such loop is finite.
+    """The cheapest expansion around loops under noise from random states of X₀; None if one of them is not finite.
 
     Args:
         law: an expansion whose law gives the first loops, unless the control at rest costs less; None: there is none.

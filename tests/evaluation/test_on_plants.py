@@ -64,7 +64,7 @@ def test_the_figure_has_a_panel_for_each_parameter():
     assert figure.axes[0].get_ylabel() == "cost / optimum of the same plant"
 
 
-@pytest.mark.gate
+@pytest.mark.nightly
 def test_training_on_plants_lowers_their_cost(tmp_path, capsys):
     """With lengths ±40 % a law that saw the plants is cheaper on them, and dearer with the model."""
     short = {"iterations": 40, "least_gain": 0}

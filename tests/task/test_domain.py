@@ -271,7 +271,7 @@ def written_to(tmp_path, **changes):
     return str(tmp_path / "task.yaml")
 
 
-@pytest.mark.gate
+@pytest.mark.nightly
 def test_a_training_to_the_border_of_the_domain(tmp_path, brief, capsys):
     assert main(["train", "--config", written_to(tmp_path), "rollout.gradient=backprop"]) == 0
     result = json.loads((tmp_path / "logs/economy/version_0/evaluation.json").read_text())

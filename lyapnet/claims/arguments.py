@@ -32,13 +32,22 @@ def disturbance_of(disturbance: Mapping[str, float] | None, controller: Controll
     Raises:
         UsageError: a name is not the name of a state.
     """
-    names, w = controller.system.state_names, torch.zeros(controller.system.n, dtype=torch.float64)
-    for name, bound in (disturbance or {}).items():
+    w = _of_states("a disturbance", disturbance or {}, controller)
+    return torch.tensor(w, dtype=torch.float64) if disturbance else None
+
+
+def _of_states(what: str, given: Mapping[str, float], controller: Controller) -> list[float]:
+    """A number for each state, 0 for those that are not named.
+
+    Raises:
+        UsageError: a name is not the name of a state.
+    """
+    names = controller.system.state_names
+    for name, value in given.items():
         if name not in names:
             hint = did_you_mean(name, names, "name one of them.")
-            raise UsageError(f"Expected a disturbance of {', '.join(names)}, got '{name}={bound:g}'; {hint}")
-        w[names.index(name)] = bound
-    return w if disturbance else None
+            raise UsageError(f"Expected {what} of {', '.join(names)}, got '{name}={value:g}'; {hint}")
+    return [given.get(name, 0.0) for name in names]
 
 
 def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tuple[ClosedLoop, Problem]:
@@ -47,19 +56,13 @@ def under_noise(noise: Mapping[str, float] | None, controller: Controller) -> tu
     Raises:
         UsageError: a name is not the name of a state, or the task has a noise of its own.
     """
-    loop, problem, names = controller.closed_loop, controller.problem, controller.system.state_names
+    loop, problem = controller.closed_loop, controller.problem
     if not noise:
         return loop, problem
     if problem.noise is not None:
         raise UsageError("Expected no noise beside that of the task, got some; leave it out.")
-    strengths = [0.0] * len(names)
-    for name, strength in noise.items():
-        if name not in names:
-            hint = did_you_mean(name, names, "name one of them.")
-            raise UsageError(f"Expected noise of {', '.join(names)}, got '{name}={strength:g}'; {hint}")
-        strengths[names.index(name)] = strength
     loop = copied(loop)
-    loop.noise = StateNoise(strengths, torch.float64)
+    loop.noise = StateNoise(_of_states("noise", noise, controller), torch.float64)
     return loop, problem.replaced(noise=loop.noise)
 
 

@@ -227,7 +227,7 @@ def reach(
     figure, panels = _panels_of(claim, initial_states)
     handles: dict[str, Artist] = {}
     proved = claim.rho > -float("inf")
-    name = "V(0, x) ≤ ρ: left before the target" + f" with probability ≤ {1 - claim.probability:.3g} from X₀"
+    name = f"V(0, x) ≤ ρ: left before the target with probability ≤ {1 - claim.probability:.3g} from X₀"
     levels = [Level(0.0, claim.rho, BLUE, name if claim.verdict == "certified" else "V(0, x) ≤ ρ", proved=proved)]
     if claim.verdict != "certified":
         wanted = Level(0.0, claim.wanted, GREY, "V(0, x) ≤ ρ for all of X₀, not proved", proved=False)

@@ -140,7 +140,7 @@ def prove_noisy_funnel(
     constants = list(loop.system.constants)
     require_smooth(condition, over_time(problem.initial_states, duration))
 
-    kept = None if keep is None or not keep.exists() else _kept_largest(keep)
+    kept = kept_largest(keep, condition)
 
     def level_of(found: float, X0: Box) -> float:
         largest = found if kept is None else max(found, kept)  # a bound that is a little higher is a bound too
@@ -187,13 +187,17 @@ def prove_noisy_funnel(
     )  # fmt: skip
 
 
-def _kept_largest(path: Path) -> float:
+def kept_largest(path: Path | None, condition: DecreaseCondition) -> float | None:
     """The bound of max V(0, ·) on X₀ in a file, which may be the result of fewer boxes than there is time for now.
+
+    None without a file, or before it exists.
 
     Raises:
         UsageError: the file holds another proof.
     """
-    content = part_of(read_proofs(path), NoisyDecrease.proves, path, "take a new file")
+    if path is None or not path.exists():
+        return None
+    content = part_of(read_proofs(path), condition.proves, path, "take a new file")
     with refusing(path):
         return float(content["of"][0]["largest"])
 

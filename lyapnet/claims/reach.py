@@ -22,14 +22,13 @@ from lyapnet.claims.funnel import (
     share_of,
 )
 from lyapnet.claims.noisy_decrease import require_smooth
-from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES, levels_of_constraints
+from lyapnet.claims.noisy_funnel import LARGER, RISKS, ROOM, SAMPLES, kept_largest, levels_of_constraints
 from lyapnet.claims.preconditions import at_time, over_time
 from lyapnet.claims.reach_decrease import OutsideBox, ReachDecrease
 from lyapnet.loop.rollout.closed_loop import ClosedLoop
 from lyapnet.prover.boxes import faces
 from lyapnet.prover.branch_and_bound import Budget, just_above, just_below, minimum
 from lyapnet.prover.counterexamples import Counterexample
-from lyapnet.prover.kept_proofs import part_of, read_proofs, refusing
 from lyapnet.prover.proof import Progress, Proof
 from lyapnet.prover.verdict import Verdict, time_spent, verdict_on
 from lyapnet.task.constraints import names_of
@@ -167,7 +166,7 @@ def prove_reach(
     condition = ReachDecrease(copied(closed_loop).requires_grad_(False), target, avoided, probability, named)
     require_smooth(condition, over_time(problem.initial_states, 0.0))
     goal, duration = problem.goal.double(), problem.horizon.duration
-    kept = None if keep is None or not keep.exists() else _kept_largest(keep)
+    kept = kept_largest(keep, condition)
 
     def level_of(found: float, X0: Box) -> float:
         largest = found if kept is None else max(found, kept)  # a bound that is a little higher is a bound too
@@ -216,17 +215,6 @@ def _of_states(box: Box, n: int) -> Box:
 def _require_interior(target: Box) -> None:
     if not bool((target.widths > 0).all()):
         raise UsageError("Expected a target with an interior, got lower = upper; noise never meets a point.")
-
-
-def _kept_largest(path: Path) -> float:
-    """The bound of max V(0, ·) on X₀ in a file, which may be the result of fewer boxes than there is time for now.
-
-    Raises:
-        UsageError: the file holds another proof.
-    """
-    content = part_of(read_proofs(path), ReachDecrease.proves, path, "take a new file")
-    with refusing(path):
-        return float(content["of"][0]["largest"])
 
 
 def _level_on(condition: ReachDecrease, avoided: Box, states: Box, budget: Budget, enough: float, unit: float) -> float:

@@ -16,6 +16,7 @@ from lyapnet.claims.claim import Claim, flag_of
 from lyapnet.claims.kinds import Funnel, LowerBound, NoisyFunnel, Reach, Region, Sampled, Statistical, Tube
 from lyapnet.cli.by_kind import ByKind
 from lyapnet.cli.claims import (
+    Keep,
     Law,
     Output,
     Refining,
@@ -73,7 +74,7 @@ def noisy(
     claim: NoisyFunnel,
     search: SearchAnywhere,
     output: Output,
-    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None,
+    keep: Keep = None,
     debug: Debug = False,
 ) -> None:
     """A funnel that noise leaves with a small probability, and the expected cost: proved."""
@@ -87,7 +88,7 @@ def reach(
     claim: Reach,
     search: SearchAnywhere,
     output: Output,
-    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None,
+    keep: Keep = None,
     debug: Debug = False,
 ) -> None:
     """Closed loops under noise reach a target and avoid other sets, with a probability: proved."""

@@ -20,6 +20,7 @@ Value = Annotated[
     typer.Option(help="ONNX file of a V(x) made elsewhere; CKPT is then a config: its task.", metavar="FILE"),
 ]
 Law = Annotated[Path | None, typer.Option(help="ONNX file of its u(x).", metavar="FILE")]
+Keep = Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")]
 Workers = Annotated[int, typer.Option(min=1, max=THREADS, help="Processes that bound boxes side by side.")]
 
 
@@ -57,7 +58,7 @@ class Refining:
     overrides: Annotated[
         list[str] | None, typer.Argument(help="With --refine: changes to the config, as key.sub=value.")
     ] = None
-    keep: Annotated[str | None, typer.Option(help="Keep the proof there, and go on from it.", metavar="FILE")] = None
+    keep: Keep = None
     refine: Annotated[
         int, typer.Option(min=0, help="Train on with what failed, so many times at most.", metavar="ROUNDS")
     ] = 0

@@ -70,22 +70,23 @@ def choose_start(
     x0 = problem.initial_states.sample(TRIAL_STATES, stream(0, START)).to(problem.goal)
     drawn = [copy.deepcopy(network.state_dict()) for network in networks]
     trials, expansions = _Trials(learners[0], x0, report, known), dict[str, Expansion]()
-    for name, expansion in expansions_of(problem, report, trials.note):
-        if isinstance(expansion, Missing):
-            trials.leave_out(name, expansion)
-            continue
+
+    def attempt(name: str, expansion: Expansion) -> None:
         expansions[name] = expansion
         start_from(learners[0], expansion, x0)
         trials.roll_out(name)
         networks[0].load_state_dict(drawn[0])
+
+    for name, expansion in expansions_of(problem, report, trials.note):
+        if isinstance(expansion, Missing):
+            trials.leave_out(name, expansion)
+        else:
+            attempt(name, expansion)
     if problem.noise is not None:
         best = expansions[_cheapest(trials.tried).name] if trials.tried else None
         progress = partial(report, LOOPS_UNDER_NOISE)
         if (expansion := expansion_under_noise(problem, best, stream(0, START, 8), progress)) is not None:
-            expansions[LOOPS_UNDER_NOISE] = expansion
-            start_from(learners[0], expansion, x0)
-            trials.roll_out(LOOPS_UNDER_NOISE)
-            networks[0].load_state_dict(drawn[0])
+            attempt(LOOPS_UNDER_NOISE, expansion)
     if not problem.horizon.stationary or not expansions:
         trials.roll_out(ZERO_VALUE)
     base = _cheapest([each for each in trials.tried if each.name != ZERO_VALUE or not expansions])

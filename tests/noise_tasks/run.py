@@ -22,7 +22,7 @@ from lyapnet.experiment.assembly import build_problem, parts_of
 from lyapnet.experiment.config import load_config
 from tests.noise_tasks.exact import Exact
 from tests.noise_tasks.tasks import TASKS, Task
-from tests.tasks_without_goal.run import train
+from tests.tasks_without_goal.run import load, train
 from tests.tasks_without_goal.tasks import inside
 
 STATES, PATHS, SEED = 256, 40, 1000  # states of X₀; paths of the noise from each; seed of both
@@ -97,20 +97,6 @@ def cost_under(problem: lyapnet.Problem, x0: Tensor, noise: Tensor, law: Control
 def interval(samples: Tensor) -> tuple[float, float]:
     """(mean, half-width of its 95 % interval) of samples (paths, states), the states being given."""
     return float(samples.mean()), TWO_SIDED * float((samples.var(0) / len(samples)).mean() / samples.shape[1]) ** 0.5
-
-
-def load(folder: Path, changes: Sequence[str]) -> Controller:
-    """The controller of the newest best.ckpt in a folder.
-
-    Raises:
-        FileNotFoundError: there is none.
-    """
-    checkpoints = sorted(folder.glob("logs/**/best.ckpt"), key=lambda path: path.stat().st_mtime)
-    if not checkpoints:
-        raise FileNotFoundError(f"Expected best.ckpt under {folder / 'logs'}, got none; read train.out there.")
-    with inside(folder):
-        parts = parts_of(load_config(Path("task.yaml"), list(changes)))
-        return lyapnet.load(checkpoints[-1], system=parts.system, cost=parts.cost)
 
 
 def prepare(folder: Path, task: Task, without_noise: bool = False) -> None:

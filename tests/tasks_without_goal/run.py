@@ -20,6 +20,7 @@ import psutil
 import torch
 
 import lyapnet
+from lyapnet.controller import Controller
 from lyapnet.experiment.assembly import parts_of
 from lyapnet.experiment.config import load_config
 from tests.tasks_without_goal.tasks import HERE, KEPT, WORKING, inside, optima_of, simulate
@@ -76,8 +77,8 @@ def task_of(name: str) -> Task:
     return Task(HERE / name, kept["states"], kept["optima"])
 
 
-def measure(folder: Path, task: Task) -> dict[str, float]:
-    """Regret, ratio, violation and how far controls exceed their limits, of the newest best.ckpt in a folder.
+def load(folder: Path, changes: Sequence[str]) -> Controller:
+    """The controller of the newest best.ckpt in a folder.
 
     Raises:
         FileNotFoundError: there is none.
@@ -86,8 +87,17 @@ def measure(folder: Path, task: Task) -> dict[str, float]:
     if not checkpoints:
         raise FileNotFoundError(f"Expected best.ckpt under {folder / 'logs'}, got none; read train.out there.")
     with inside(folder):
-        parts = parts_of(load_config(Path("task.yaml"), list(task.changes)))
-        controller = lyapnet.load(checkpoints[-1], system=parts.system, cost=parts.cost)
+        parts = parts_of(load_config(Path("task.yaml"), list(changes)))
+        return lyapnet.load(checkpoints[-1], system=parts.system, cost=parts.cost)
+
+
+def measure(folder: Path, task: Task) -> dict[str, float]:
+    """Regret, ratio, violation and how far controls exceed their limits, of the newest best.ckpt in a folder.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    controller = load(folder, task.changes)
     problem, optima = controller.problem, torch.tensor(task.optima, dtype=torch.float64)
     J, h, u = simulate(problem, task.states, lambda k, x: controller.policy(k * problem.horizon.dt, x))
     low, high = problem.controls.limits
